@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
@@ -14,6 +15,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.collision.checker import NEEDLE_IN_PATIENT, CellChecker, Contact, FirstContact
 from puncture_twin.planning.collision.kernels.segment_parts import Room, segment_room
+from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES_OUTSIDE
 from puncture_twin.planning.collision.never_touching import without_neighbours
 from puncture_twin.planning.collision.proofs import Motion, Proofs
 from puncture_twin.planning.collision.segments import SegmentChecker
@@ -54,7 +56,8 @@ class FastChecker(CellChecker):
     ) -> None:
         super().__init__(model, tool, boxes, patient, outside=outside, padding_mm=padding_mm)
         self._swept_full = SweptBodies.of(model, tool, padding_mm)
-        self._proofs = Proofs(model, self._checks, boxes, self._surface, cache)
+        skin_triangles = 0 if patient is None else len(patient.faces)
+        self._proofs = Proofs(model, self._checks, boxes, self._surface, skin_triangles, cache)
         self._tested = without_neighbours(model, self._checks, self._proofs, cache)
         self._still = (np.zeros((1, 7)), np.zeros((1, 6)))
         needle = np.array([check.contact == NEEDLE_IN_PATIENT for check in self._tested])
@@ -73,10 +76,10 @@ class FastChecker(CellChecker):
         frames, mask = link_poses(self.model, states), self._masks[needle_may_touch_patient]
         found: list[Contact | None] = [None] * len(states)
         begins = np.zeros(len(states), dtype=np.int64)
-        while (open_at := self._proofs.unproven_at_each(frames, begins, mask)).max(initial=-1) >= 0:
-            begins = np.where(open_at < 0, len(self._tested), open_at + 1)
-            for row in np.flatnonzero(open_at >= 0).tolist():
-                found[row] = self._tested[open_at[row]].contact_at(frames[row])
+        while (left := self._proofs.first_not_clear(frames, begins, mask)).checks.max(initial=-1) >= 0:
+            begins = np.where(left.checks < 0, len(self._tested), left.checks + 1)
+            for row in np.flatnonzero(left.checks >= 0).tolist():
+                found[row] = self._contact_of(int(left.checks[row]), int(left.answers[row]), frames[row])
                 if found[row] is not None:
                     begins[row] = len(self._tested)
         return found
@@ -89,11 +92,21 @@ class FastChecker(CellChecker):
         open_at = self._proofs.first_unproven(motion, 0, mask)
         while open_at >= 0:
             index, check = divmod(open_at, len(self._tested))
-            contact = self._tested[check].contact_at(motion.frames[index])
+            frames = motion.frames[index]
+            contact = self._contact_of(check, self._proofs.settled_at(check, frames), frames)
             if contact is not None:
                 return FirstContact(index, contact)
             open_at = self._proofs.first_unproven(motion, open_at + 1, mask)
         return None
+
+    def _contact_of(self, check: int, answer: int, frames: Floats) -> Contact | None:
+        """What a check finds at frames (7, 4, 4): its answer, or FCL's where it has none."""
+        if answer == OPEN:
+            return self._tested[check].contact_at(frames)
+        if answer == CLEAR:
+            return None
+        contact = self._tested[check].contact
+        return contact._replace(other=OUTSIDE_BODY) if answer == TOUCHES_OUTSIDE else contact
 
     def segment_contact(self, start: Floats, end: Floats) -> Contact | None:
         """A contact on the straight joint segment between states (6,), rad; None if free. See :class:`SegmentChecker`.

@@ -11,10 +11,12 @@ from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.collision.bodies.prisms import finer_prism
 from puncture_twin.planning.collision.check import Check
-from puncture_twin.planning.collision.kernels import proofs as proof_kernels
+from puncture_twin.planning.collision.kernels import proofs as proof_kernels, settled as settled_kernels
 from puncture_twin.planning.collision.kernels.proofs import ProofScene, scratch
-from puncture_twin.planning.collision.packed.hulls import WORKCELL_FRAME, PackedHulls, packed_trees
+from puncture_twin.planning.collision.kernels.surfaces import STACK
+from puncture_twin.planning.collision.packed.hulls import ROUND, WORKCELL_FRAME, PackedHulls, packed_trees
 from puncture_twin.planning.collision.packed.movers import joint_levers, packed_movers
 from puncture_twin.planning.collision.packed.skin import packed_skin
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -37,6 +39,15 @@ class Around(NamedTuple):
     """Shape (m, k): the checks open about each state."""
 
 
+class NotClear(NamedTuple):
+    """Of each state the first check that is not proven clear."""
+
+    checks: Ints
+    """Shape (m,); -1 where all is clear."""
+    answers: Ints
+    """Shape (m,): what it comes to, see :mod:`puncture_twin.planning.collision.kernels.settled`."""
+
+
 class Proofs:
     """The checks of one cell, ready to be proven. Not for several threads: the scratch is shared.
 
@@ -46,19 +57,28 @@ class Proofs:
         model: The arm.
         checks: The questions, in order.
         boxes: The workcell's boxes.
-        patient: The skin, or None.
+        patient: The skin, and behind it what the CT shows besides; or None.
+        skin_triangles: How many of its triangles are skin.
         cache: Where enclosures are kept: they depend on arm and tool alone.
     """
 
     def __init__(
-        self, model: UrModel, checks: Sequence[Check], boxes: Sequence[Box], patient: TriangleMesh | None, cache: Cache
+        self,
+        model: UrModel,
+        checks: Sequence[Check],
+        boxes: Sequence[Box],
+        patient: TriangleMesh | None,
+        skin_triangles: int,
+        cache: Cache,
     ) -> None:
         hulls, rows = PackedHulls(boxes), []
         roots, spheres = packed_trees([check.second_body for check in checks if check.hulls is None], cache)
         for check in checks:
             frame = check.second_body.frame
             if check.hulls is None:
-                row = (proof_kernels.SKIN, -1, roots[check.second_body.name], WORKCELL_FRAME, frame)
+                body = check.second_body
+                about = hulls.add(finer_prism(body.full.hulls[0]), body) if body.name in ROUND else -1
+                row = (proof_kernels.SKIN, about, roots[body.name], WORKCELL_FRAME, frame)
             elif check.first_body is None:
                 second = hulls.add(check.hulls[1], check.second_body)
                 row = (proof_kernels.BOX, hulls.box(check.contact.other), second, WORKCELL_FRAME, frame)
@@ -68,7 +88,9 @@ class Proofs:
                 row = (proof_kernels.PAIR, *pair, check.first_body.frame, frame)
             rows.append(row)
         packed = hulls.packed(cache)
-        self.scene = ProofScene(np.array(rows, dtype=np.int64), packed_skin(patient, cache), spheres, *packed)
+        skin = packed_skin(patient, skin_triangles, cache)
+        self.scene = ProofScene(np.array(rows, dtype=np.int64), skin, spheres, *packed)
+        self._beside = settled_kernels.beside_triangle(self.scene.hulls, STACK)
         self._levers = np.array([joint_levers(model, check) for check in checks])
         self.movers = packed_movers(checks)
         self._work = scratch(len(rows), len(self.scene.hulls.radii))
@@ -103,17 +125,21 @@ class Proofs:
         arguments = (self.scene, self._levers, tuple(motion), self._work, self._proven, *at, tested, clear_mm)
         return int(proof_kernels.first_unproven(*arguments))
 
-    def unproven_at_each(self, frames: Floats, begins: Ints, tested: Bools) -> Ints:
-        """Of each state by itself the first check that is not proven, at or after one; -1 for none.
+    def first_not_clear(self, frames: Floats, begins: Ints, tested: Bools) -> NotClear:
+        """Of each state by itself the first check that is not proven clear, at or after one.
 
         Args:
             frames: Shape (m, 7, 4, 4), mm.
             begins: Shape (m,): where to begin; ``len(self)`` to pass a state over.
             tested: Shape (k,): which checks.
         """
-        found = np.empty(len(frames), dtype=np.int64)
-        proof_kernels.unproven_at_each(self.scene, frames, self._work, tested, begins, found)
+        found = NotClear(np.empty(len(frames), np.int64), np.empty(len(frames), np.int64))
+        settled_kernels.first_not_clear(self.scene, frames, self._work, self._beside, tested, begins, *found)
         return found
+
+    def settled_at(self, check: int, frames: Floats) -> int:
+        """What a check comes to at frames (7, 4, 4), see :mod:`puncture_twin.planning.collision.kernels.settled`."""
+        return int(settled_kernels.settled_at(self.scene, self._work, self._beside, check, frames))
 
     def clear_about(self, frames: Floats, turns: Floats, tested: Bools) -> Around:
         """Prove checks clear all about some states.

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from puncture_twin.planning.arm.insertion import first_stop
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import away_from_singularities
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.reach.answer import ReachAnswer
 from puncture_twin.planning.reach.branch_paths import every_branch
 from puncture_twin.planning.reach.survey import Surveyed
@@ -36,11 +36,12 @@ def _refusal_of_kinematics(model: UrModel, found: Surveyed) -> ReachAnswer:
     """The refusal of a direction along which kinematics allows no motion."""
     if (found.stop_at < 0).any():
         return ReachAnswer.refused(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
-    paths = every_branch(model, found.line, found.distances)
-    reached = away_from_singularities(model, paths[:, 0])
+    reached = away_from_singularities(model, found.starts)
     if not reached.any():
-        T_base_flange = flange_poses(found.line.target, found.line.outward, found.distances[0])[0]
+        R, target, outward = found.line
+        T_base_flange = pose(R, target + found.distances[0] * outward)
         return ReachAnswer.refused(Reason.UNREACHABLE, None, why_unreachable(model, T_base_flange))
+    paths = every_branch(model, found.line, found.distances)
     stops = [first_stop(model, path, found.depths) for path in paths[reached]]
     deepest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
     return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)

@@ -14,16 +14,26 @@ PRISM_SIDES = 24
 """Of the prism about a cylinder: 0.9 % fuller than it."""
 
 
-def prism(radius_mm: float, length_mm: float) -> Floats:
-    """Corners of a prism about a cylinder along z, centred: shape (2 ``PRISM_SIDES``, 3), mm."""
-    turn = 2.0 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
-    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / PRISM_SIDES)
+FINE_SIDES = 96
+"""Of the prism about a cylinder that is held against triangles: 0.05 % fuller than it."""
+
+
+def prism(radius_mm: float, length_mm: float, sides: int = PRISM_SIDES) -> Floats:
+    """Corners of a prism about a cylinder along z, centred: shape (2 ``sides``, 3), mm; those of one end first."""
+    turn = 2.0 * np.pi * np.arange(sides) / sides
+    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / sides)
     ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     half = length_mm / 2.0 + SLACK_MM
     return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
 
 
+def finer_prism(corners: Floats) -> Floats:
+    """Corners of a prism of ``FINE_SIDES`` about the cylinder that :func:`prism` gave these corners about, as there."""
+    radius_mm = float(np.hypot(corners[:, 0], corners[:, 1]).max()) * np.cos(2.0 * np.pi / len(corners))
+    return prism(radius_mm, float(np.ptp(corners[:, 2])), FINE_SIDES)
+
+
 def inscribed_prism(corners: Floats) -> Floats:
     """Corners of a prism inside the cylinder that :func:`prism` gave the corners about, along z of any frame."""
     middle, inside = corners.mean(axis=0), 1.0 - INSIDE
-    return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(np.pi / PRISM_SIDES)] + [inside]))
+    return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(2.0 * np.pi / len(corners))] + [inside]))

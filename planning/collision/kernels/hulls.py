@@ -181,7 +181,8 @@ def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
             of the lower bound.
         at: Shape (2,): a corner of either hull, where to begin; replaced by where it ended.
         needed: A gap above this will do, mm, 0 or more.
-        S: Shape (4, 3): scratch.
+        S: Shape (4, 3): scratch. Where the hulls overlap, four differences of a point of the one and a point of the
+            other; NaN in the last where there are fewer.
     """
     x, y, z = axis[0], axis[1], axis[2]
     lower, upper, count = -math.inf, math.inf, 0
@@ -211,6 +212,8 @@ def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
         before, squared = upper, vx * vx + vy * vy + vz * vz
         if p < 0 or squared <= ROUNDING_MM2:
             lower, upper = TOUCHING, 0.0
+            if count < 3:
+                S[3, 0] = math.nan
             break
         upper = math.sqrt(squared)
         if upper >= before * ONWARD:
@@ -220,6 +223,25 @@ def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
         x, y, z = -vx / upper, -vy / upper, -vz / upper
     at[0], at[1] = i, j
     return lower, upper
+
+
+@nb.njit(cache=True)
+def deep(S, mm):
+    """Whether the origin lies within the tetrahedron of all four rows, farther than ``mm`` from each face; not if NaN.
+
+    Of differences of points of two convex bodies: then the bodies share a point, and one has to move by more to part.
+    """
+    for opposite in range(4):
+        p, q, r = (opposite + 1) % 4, (opposite + 2) % 4, (opposite + 3) % 4
+        ax, ay, az = S[p, 0], S[p, 1], S[p, 2]
+        ux, uy, uz = S[q, 0] - ax, S[q, 1] - ay, S[q, 2] - az
+        vx, vy, vz = S[r, 0] - ax, S[r, 1] - ay, S[r, 2] - az
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        height = nx * (S[opposite, 0] - ax) + ny * (S[opposite, 1] - ay) + nz * (S[opposite, 2] - az)
+        origin, size = -(nx * ax + ny * ay + nz * az), math.sqrt(nx * nx + ny * ny + nz * nz)
+        if not (origin if height > 0.0 else -origin) > mm * size:
+            return False
+    return True
 
 
 @nb.njit(cache=True, fastmath={"nnan", "ninf", "nsz", "reassoc", "contract"})

@@ -42,14 +42,16 @@ class SkinTree(NamedTuple):
     """Shape (i, j, k), mm: distances of the middles of cells; NaN where nobody has computed yet."""
     origin: Floats
     """Shape (3,), mm: the lowest corner of the field."""
+    outside: NDArray[np.bool_]
+    """Shape (leaves, k): which of the tree's triangles are no skin but what the CT shows besides."""
 
 
 class ProofScene(NamedTuple):
     """The checks of a cell and what they are about."""
 
     checks: Ints
-    """Shape (k, 5): kind, first, second, and the frames of both. For ``SKIN`` the second is the row of the body's root
-    among the spheres, else both are rows of hulls."""
+    """Shape (k, 5): kind, first, second, and the frames of both. Both are rows of hulls; for ``SKIN`` the first is that
+    of a round body, -1 for others, and the second the row of the body's root among the spheres."""
     skin: SkinTree
     spheres: tuple[Floats, Floats, Ints]
     """Centres, radii and children of all bodies' trees of bounding spheres, each in the frame of its body."""
@@ -149,7 +151,7 @@ def near_gap(scene, work, at, frames, enough, far, needed):
 
 
 @nb.njit(cache=True, inline="always")
-def _gap(scene, work, at, frames, enough, far, needed):
+def state_gap(scene, work, at, frames, enough, far, needed):
     """Lower bound as of :func:`near_gap`, sooner where the spheres about two hulls are ``enough`` apart.
 
     The spheres stand where :func:`place_spheres` has put them.
@@ -202,37 +204,12 @@ def first_unproven(scene, levers, motion, work, proven, state, check, tested, cl
             if stood < row:
                 stood = row
                 place_spheres(scene.hulls, frames[row], work.spheres)
-            gap = _gap(scene, work, at, frames[row], enough, far, clear_mm)
+            gap = state_gap(scene, work, at, frames[row], enough, far, clear_mm)
             if gap <= clear_mm:
                 proven[at] = -math.inf
                 return row * count + at
             proven[at] = path + gap - clear_mm
     return -1
-
-
-@nb.njit(cache=True)
-def unproven_at_each(scene, frames, work, tested, begins, found):
-    """At each of some states that have nothing to do with one another, the first check that the bounds do not prove.
-
-    Args:
-        scene: See :class:`ProofScene`.
-        frames: Shape (m, 7, 4, 4), mm: the states.
-        work: See :class:`ProofScratch`.
-        tested: Shape (k,): which checks.
-        begins: Shape (m,): the first check at each state; k to pass it over.
-        found: Shape (m,), filled; -1 where all from there on is clear.
-    """
-    for row in range(len(frames)):
-        found[row] = -1
-        if begins[row] < len(scene.checks):
-            place_spheres(scene.hulls, frames[row], work.spheres)
-        for at in range(begins[row], len(scene.checks)):
-            if (
-                tested[at]
-                and not _gap(scene, work, at, frames[row], MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM) > MIN_GAP_MM
-            ):
-                found[row] = at
-                break
 
 
 @nb.njit(cache=True)

@@ -106,7 +106,7 @@ def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
     by ``needed`` ends the search, and then the answer is no bound, only no more than ``needed``. Both stacks are
     scratch.
     """
-    tree, field, origin = skin
+    tree, field, origin = skin.tree, skin.field, skin.origin
     centres, radii, children = spheres
     best = far
     stack[0], top = root, 1

@@ -52,6 +52,7 @@ class PackedHulls:
 
     def __init__(self, boxes: Sequence[Box]) -> None:
         self._rows: dict[int, int] = {}
+        self._added: list[Floats] = []  # kept, so that no other array takes the id of one of them
         self._boxes = list(boxes)
         self._names = {box.name: row for row, box in enumerate(boxes)}
         self._corners = [box.corners for box in boxes]
@@ -66,6 +67,7 @@ class PackedHulls:
         """Row of a hull of a body, which is added if it is new."""
         row = self._rows.setdefault(id(corners), len(self._corners))
         if row == len(self._corners):
+            self._added.append(corners)
             self._corners.append(in_frame(corners, body))
             self._rounded.append(body.name in ROUND)
             self._frames.append(body.frame)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
@@ -24,11 +25,13 @@ class TriangleTree:
         lows: Shape (nodes, 3), mm: lowest corner of each node's box.
         highs: Shape (nodes, 3), mm.
         corners: Shape (leaves, k, 3, 3), mm: the triangles of each leaf; some stand in two, so that all have k.
+        rows: Shape (leaves, k): which of the mesh's triangles they are.
     """
 
     lows: Floats
     highs: Floats
     corners: Floats
+    rows: NDArray[np.int32]
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> TriangleTree:
@@ -51,7 +54,8 @@ class TriangleTree:
         for _ in range(levels):
             lows.insert(0, lows[0].reshape(-1, 2, 3).min(axis=1))
             highs.insert(0, highs[0].reshape(-1, 2, 3).max(axis=1))
-        return cls(np.concatenate(lows), np.concatenate(highs), np.ascontiguousarray(corners))
+        boxes = np.concatenate(lows), np.concatenate(highs)
+        return cls(*boxes, np.ascontiguousarray(corners), order.astype(np.int32))
 
 
 FIELD_MARGIN_MM = 500.0
@@ -61,11 +65,17 @@ MOST_CELLS = 4_000_000
 """Of that field (16 MB): a larger skin gets a narrower margin."""
 
 
-def packed_skin(patient: TriangleMesh | None, cache: Cache) -> SkinTree:
-    """The skin's tree and its field, of which nothing is known yet; or some that no check wants."""
+def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache) -> SkinTree:
+    """The skin's tree and its field, of which nothing is known yet; or some that no check wants.
+
+    Args:
+        patient: The skin, and behind it what the CT shows besides.
+        skin_triangles: How many of the triangles are skin.
+        cache: Where the tree is kept.
+    """
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
-        return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3))
+        return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3), np.zeros((1, 1), np.bool_))
     made_from, (low, high) = {"what": "skin", "surface": patient.digest}, patient.bounds
     kept = cache.arrays(made_from, lambda: vars(TriangleTree.of(patient)), by=__name__)
     margin = FIELD_MARGIN_MM
@@ -74,4 +84,5 @@ def packed_skin(patient: TriangleMesh | None, cache: Cache) -> SkinTree:
         if margin == 0.0:
             cells = np.ones(3, np.int64)
             break
-    return SkinTree((kept["lows"], kept["highs"], kept["corners"]), np.full(cells, np.nan, np.float32), low - margin)
+    tree, field = (kept["lows"], kept["highs"], kept["corners"]), np.full(cells, np.nan, np.float32)
+    return SkinTree(tree, field, low - margin, kept["rows"] >= skin_triangles)

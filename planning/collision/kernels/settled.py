@@ -1,0 +1,263 @@
+"""Compiled answers to single checks: clear, or surely a contact; the reference is queried where neither is proven.
+
+What of the bounds of :mod:`puncture_twin.planning.collision.kernels.proofs` proves nothing is looked at once more: two
+hulls overlap surely where some of their corners' differences enclose the origin, and holder and needle are held
+against each triangle of the skin that is near them.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+# numba infers the types
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.collision.kernels.hulls import TOUCHING, Hulls, deep, distance_bounds
+from puncture_twin.planning.collision.kernels.proofs import MIN_GAP_MM, SKIN, near_gap, place_spheres, state_gap
+
+CLEAR, OPEN, TOUCHES, TOUCHES_OUTSIDE = 0, 1, 2, 3
+"""What a check came to: no contact, the reference is to be queried, a contact, one with what the CT shows besides the
+skin while the skin itself is clear."""
+
+DEEP_MM = 1e-3
+"""Two bodies surely touch where they overlap by more: far above the rounding of these sums (1e-10 mm) and FCL's
+tolerance."""
+
+
+class Triangle(NamedTuple):
+    """All corners of :class:`Hulls` and behind them the three of a triangle, which takes part as one more hull."""
+
+    corners: Floats
+    """Shape (n + 3, 3), mm; the last three are filled in turn."""
+    inner: Floats
+    """Shape (n + 3, 3), mm, likewise: see :class:`Hulls`."""
+    starts: Ints
+    ends: Ints
+    """Of each corner the neighbours, see :class:`Hulls`."""
+    axis: Floats
+    at: Ints
+    S: Floats
+    """Scratch, see :func:`distance_bounds`."""
+    stack: Ints
+
+
+def beside_triangle(hulls: Hulls, stack: int) -> Triangle:
+    """Room for a triangle beside the hulls, and for a descent as deep as ``stack``."""
+    count, spare = len(hulls.corners), np.zeros((3, 3))
+    starts = np.concatenate([hulls.neighbour_starts, hulls.neighbour_starts[-1] + np.array([2, 4, 6])])
+    ends = np.concatenate([hulls.neighbours, count + np.array([1, 2, 0, 2, 0, 1])])
+    corners, inner = np.concatenate([hulls.corners, spare]), np.concatenate([hulls.inner, spare])
+    scratch = np.zeros(3), np.zeros(2, np.int64), np.zeros((4, 3)), np.empty(stack, np.int64)
+    return Triangle(corners, inner, starts, ends, *scratch)
+
+
+@nb.njit(cache=True)
+def _far(low, high, line, reach):
+    """Whether a box is farther than ``reach`` from a segment, told by the box and by the sphere about it.
+
+    ``line`` holds the segment's middle, its unit direction and half of its length.
+    """
+    (mx, my, mz), (ux, uy, uz), half = line
+    ex, ey, ez = (high[0] - low[0]) / 2.0, (high[1] - low[1]) / 2.0, (high[2] - low[2]) / 2.0
+    x, y, z = low[0] + ex - mx, low[1] + ey - my, low[2] + ez - mz
+    if (
+        abs(x) > ex + half * abs(ux) + reach
+        or abs(y) > ey + half * abs(uy) + reach
+        or abs(z) > ez + half * abs(uz) + reach
+    ):
+        return True
+    along = min(half, max(-half, x * ux + y * uy + z * uz))
+    x, y, z = x - along * ux, y - along * uy, z - along * uz
+    return x * x + y * y + z * z > (reach + math.sqrt(ex * ex + ey * ey + ez * ez)) ** 2
+
+
+@nb.njit(cache=True)
+def _beyond_plane(t, line, reach):
+    """Whether a segment lies on one side of the plane of a triangle (3, 3), farther than ``reach`` from it."""
+    (mx, my, mz), (ux, uy, uz), half = line
+    ax, ay, az = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
+    bx, by, bz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    height = abs((mx - t[0, 0]) * nx + (my - t[0, 1]) * ny + (mz - t[0, 2]) * nz)
+    return height - half * abs(ux * nx + uy * ny + uz * nz) > reach * math.sqrt(nx * nx + ny * ny + nz * nz)
+
+
+@nb.njit(cache=True)
+def _axis(hulls, hull, T):
+    """The axis of the round body in a hull that stands at ``T`` (4, 4): see :func:`_far`; and a radius that holds it.
+
+    The hull is a prism: the corners of one end come before those of the other.
+    """
+    begin, end = hulls.starts[hull], hulls.starts[hull + 1]
+    middle = (begin + end) // 2
+    a, b = np.zeros(3), np.zeros(3)
+    for row in range(begin, end):
+        for i in range(3):
+            if row < middle:
+                a[i] += hulls.corners[row, i] / (middle - begin)
+            else:
+                b[i] += hulls.corners[row, i] / (end - middle)
+    radius = 0.0
+    for row in range(begin, end):
+        squared = 0.0
+        for i in range(3):
+            squared += (hulls.corners[row, i] - (a[i] if row < middle else b[i])) ** 2
+        radius = max(radius, math.sqrt(squared))
+    length = math.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2)
+    x, y, z = (b[0] - a[0]) / length, (b[1] - a[1]) / length, (b[2] - a[2]) / length
+    u = (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
+    )
+    x, y, z = (a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0, (a[2] + b[2]) / 2.0
+    m = (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+    return (m, u, length / 2.0), radius + MIN_GAP_MM
+
+
+@nb.njit(cache=True)
+def _gap_along(hulls, hull, M, triangle, x, y, z):
+    """The gap between a triangle (3, 3) and a hull that stands at ``M``, along a direction, by all corners."""
+    far = -math.inf
+    for k in range(3):
+        far = max(far, triangle[k, 0] * x + triangle[k, 1] * y + triangle[k, 2] * z)
+    bx = M[0, 0] * x + M[1, 0] * y + M[2, 0] * z
+    by = M[0, 1] * x + M[1, 1] * y + M[2, 1] * z
+    bz = M[0, 2] * x + M[1, 2] * y + M[2, 2] * z
+    near = math.inf
+    for row in range(hulls.starts[hull], hulls.starts[hull + 1]):
+        near = min(near, hulls.corners[row, 0] * bx + hulls.corners[row, 1] * by + hulls.corners[row, 2] * bz)
+    return near + M[0, 3] * x + M[1, 3] * y + M[2, 3] * z - far
+
+
+@nb.njit(cache=True)
+def against_triangle(hulls, hull, M, triangle, line, room):
+    """Whether the round body in a hull touches a triangle: ``CLEAR``, ``TOUCHES``, or ``OPEN`` where that is not told.
+
+    Args:
+        hulls: See :class:`Hulls`.
+        hull: Row of the body's prism.
+        M: Shape (3, 4) or (4, 4), mm: where its frame stands.
+        triangle: Shape (3, 3), mm: its corners.
+        line: The body's axis, see :func:`_far`.
+        room: See :class:`Triangle`.
+    """
+    count, axis, at = len(hulls.corners), room.axis, room.at
+    (mx, my, mz), (ux, uy, uz), half = line
+    for k in range(3):
+        for i in range(3):
+            room.corners[count + k, i], room.inner[count + k, i] = triangle[k, i], triangle[k, i]
+    x = mx - (triangle[0, 0] + triangle[1, 0] + triangle[2, 0]) / 3.0
+    y = my - (triangle[0, 1] + triangle[1, 1] + triangle[2, 1]) / 3.0
+    z = mz - (triangle[0, 2] + triangle[1, 2] + triangle[2, 2]) / 3.0
+    along = min(half, max(-half, -(x * ux + y * uy + z * uz)))
+    x, y, z = x + along * ux, y + along * uy, z + along * uz
+    size = math.sqrt(x * x + y * y + z * z)
+    axis[0], axis[1], axis[2] = (x / size, y / size, z / size) if size > MIN_GAP_MM else (ux, uy, uz)
+    at[0], at[1] = count, hulls.starts[hull]
+    lower, _ = distance_bounds(room.corners, room.starts, room.ends, M, axis, at, MIN_GAP_MM, room.S)
+    if lower > MIN_GAP_MM:
+        return CLEAR if _gap_along(hulls, hull, M, triangle, axis[0], axis[1], axis[2]) > MIN_GAP_MM else OPEN
+    if lower == TOUCHING:
+        lower, _ = distance_bounds(room.inner, room.starts, room.ends, M, axis, at, 0.0, room.S)
+    return TOUCHES if lower == TOUCHING and deep(room.S, DEEP_MM) else OPEN
+
+
+@nb.njit(cache=True)
+def on_skin(skin, hulls, hull, T, room):
+    """What the round body in a hull that stands at ``T`` (4, 4) comes to against each triangle of the skin.
+
+    It touches as soon as one triangle of the skin does. What the CT shows besides counts where all of the skin is
+    clear.
+    """
+    lows, highs, corners = skin.tree
+    line, reach = _axis(hulls, hull, T)
+    inner, stack, top = len(lows) - len(corners), room.stack, 1
+    on_it, beside = CLEAR, CLEAR
+    low, high = np.empty(3), np.empty(3)
+    stack[0] = 0
+    while top > 0:
+        top -= 1
+        node = stack[top]
+        if _far(lows[node], highs[node], line, reach):
+            continue
+        if node < inner:
+            stack[top], stack[top + 1] = 2 * node + 1, 2 * node + 2
+            top += 2
+            continue
+        for k in range(corners.shape[1]):
+            triangle, outside = corners[node - inner, k], skin.outside[node - inner, k]
+            if outside and beside == TOUCHES:
+                continue
+            for i in range(3):
+                low[i] = min(triangle[0, i], triangle[1, i], triangle[2, i])
+                high[i] = max(triangle[0, i], triangle[1, i], triangle[2, i])
+            if _far(low, high, line, reach) or _beyond_plane(triangle, line, reach):
+                continue
+            answer = against_triangle(hulls, hull, T, triangle, line, room)
+            if outside:
+                beside = max(beside, answer)
+            elif answer == TOUCHES:
+                return TOUCHES
+            else:
+                on_it = max(on_it, answer)
+    if on_it == OPEN or beside == OPEN:
+        return OPEN
+    return CLEAR if beside == CLEAR else TOUCHES_OUTSIDE
+
+
+@nb.njit(cache=True)
+def settled(scene, work, room, at, frames, gap):
+    """What a check comes to whose bound ``gap`` proves nothing, the arm standing at ``frames`` (7, 4, 4).
+
+    Of a bound that is ``TOUCHING``, ``work`` is as the bound has left it.
+    """
+    first = scene.checks[at, 1]
+    if scene.checks[at, 0] != SKIN:
+        return TOUCHES if gap == TOUCHING and deep(work.S, DEEP_MM) else OPEN
+    return OPEN if first < 0 else on_skin(scene.skin, scene.hulls, first, frames[scene.checks[at, 4]], room)
+
+
+@nb.njit(cache=True)
+def settled_at(scene, work, room, at, frames):
+    """What a check comes to, the arm standing at ``frames`` (7, 4, 4)."""
+    gap = near_gap(scene, work, at, frames, MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
+    return CLEAR if gap > MIN_GAP_MM else settled(scene, work, room, at, frames, gap)
+
+
+@nb.njit(cache=True)
+def first_not_clear(scene, frames, work, room, tested, begins, found, answers):
+    """At each of some states that have nothing to do with one another, the first check that is not proven clear.
+
+    Args:
+        scene: See :class:`ProofScene`.
+        frames: Shape (m, 7, 4, 4), mm: the states.
+        work: See :class:`ProofScratch`.
+        room: See :class:`Triangle`.
+        tested: Shape (k,): which checks.
+        begins: Shape (m,): the first check at each state; k to pass it over.
+        found: Shape (m,), filled; -1 where all from there on is clear.
+        answers: Shape (m,), filled: what the check that was found comes to; ``CLEAR`` where there is none.
+    """
+    for row in range(len(frames)):
+        found[row], answers[row] = -1, CLEAR
+        if begins[row] < len(scene.checks):
+            place_spheres(scene.hulls, frames[row], work.spheres)
+        for at in range(begins[row], len(scene.checks)):
+            if not tested[at]:
+                continue
+            gap = state_gap(scene, work, at, frames[row], MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
+            if not gap > MIN_GAP_MM:
+                answers[row] = settled(scene, work, room, at, frames[row], gap)
+                if answers[row] != CLEAR:
+                    found[row] = at
+                    break

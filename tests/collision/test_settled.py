@@ -1,0 +1,131 @@
+"""What is settled without the reference, as FCL has it: a round body against triangles, and overlaps that are deep."""
+
+from __future__ import annotations
+
+import fcl
+import numpy as np
+import trimesh
+
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.collision.bodies.prisms import FINE_SIDES, finer_prism, prism
+from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.kernels.hulls import deep
+from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES, TOUCHES_OUTSIDE, on_skin
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+UR3 = ur_model("ur3")
+TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
+AWAY = np.array([0.4, -1.9, 1.6, -1.2, -1.5, 0.3])
+"""Elbow up, needle down."""
+
+
+def lumps(radii: list[float], middle: list[float], subdivisions: int) -> TriangleMesh:
+    """A lumpy ball, mm."""
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=1.0)
+    uneven = 1.0 + 0.15 * np.sin(9.0 * ball.vertices[:, :1]) * np.cos(7.0 * ball.vertices[:, 1:2])
+    return TriangleMesh(ball.vertices * uneven * radii + middle, np.asarray(ball.faces))
+
+
+def surfaces() -> tuple[TriangleMesh, TriangleMesh]:
+    """A patient of small triangles; a table that touches it, of triangles that are up to 4 m long."""
+    skin = lumps([160.0, 260.0, 110.0], [380.0, 40.0, 60.0], 4)
+    slab = trimesh.creation.box((500.0, 4000.0, 30.0)).subdivide_to_size(800.0)
+    return skin, TriangleMesh(slab.vertices + [380.0, 0.0, 40.0], np.asarray(slab.faces))
+
+
+def cell(kind: type[CellChecker]) -> CellChecker:
+    """Both, with a box, around a UR3."""
+    skin, outside = surfaces()
+    T = np.eye(4)
+    T[:3, 3] = (150.0, 250.0, 420.0)
+    return kind(UR3, TOOL, [Box("lamp", T, (120.0, 80.0, 60.0))], skin, outside=outside, padding_mm=5.0)
+
+
+def test_the_finer_prism_encloses_the_same_cylinder_more_closely() -> None:
+    """In every direction it reaches at least as far as the round body, and nowhere as far as the coarse one's edges."""
+    u = np.random.default_rng(2).normal(size=(2000, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    cylinder = 15.0 * np.hypot(u[:, 0], u[:, 1]) + 40.0 * np.abs(u[:, 2])
+    fine = finer_prism(prism(15.0, 80.0))
+    reach = (fine @ u.T).max(axis=0)
+    assert fine.shape == (2 * FINE_SIDES, 3)
+    assert (reach >= cylinder).all() and (reach <= cylinder * 1.0006 + 1e-4).all()
+
+
+def test_a_round_body_is_settled_as_fcl_settles_it() -> None:
+    """Needle and holder anywhere about the patient and, most, within 3 mm of touching: FCL agrees, little is left open.
+
+    Each of the two surfaces is queried by itself: the skin's contact comes first.
+    """
+    fast, rng = cell(FastChecker), np.random.default_rng(3)
+    assert isinstance(fast, FastChecker) and fast._patient is not None and fast._patient.outside is not None
+    skin, outside = surfaces()
+    trees = [fcl.CollisionObject(surface(mesh)) for mesh in (skin, outside)]
+    scene, room = fast._proofs.scene, fast._proofs._beside
+    bodies = {body.name: body for body in fast._bodies}
+    rows = {"holder": None, "needle": None}
+    for check, row in zip(fast._tested, scene.checks, strict=True):
+        if check.contact.other == "patient" and check.contact.body in rows:
+            rows[check.contact.body] = int(row[1])
+    met = {CLEAR: 0, OPEN: 0, TOUCHES: 0, TOUCHES_OUTSIDE: 0}
+    for trial in range(3000):
+        name = ("holder", "needle")[trial % 2]
+        body, hull = bodies[name], rows[name]
+        assert hull is not None
+        frames = np.tile(np.eye(4), (7, 1, 1))
+        frames[body.frame] = trimesh.transformations.random_rotation_matrix(rng.uniform(size=3))
+        mesh = outside if trial % 3 == 0 else skin
+        at = mesh.vertices[rng.integers(len(mesh.vertices))]
+        axis, end = frames[body.frame, :3, 2], (body.T_frame_body[:3, 3] @ [0.0, 0.0, 1.0])
+        off = rng.choice([body.radius_mm, body.radius_mm + 6.0, 20.0])
+        frames[body.frame, :3, 3] = at - axis * (end + off) + rng.normal(size=3) * rng.choice([0.3, 3.0, 40.0])
+        body.full.surface.setTransform(body.pose(frames))
+        on_it, beside = (touch(tree, body.full.surface) for tree in trees)
+        answer = on_skin(scene.skin, scene.hulls, hull, frames[body.frame], room)
+        met[answer] += 1
+        expected = TOUCHES if on_it else TOUCHES_OUTSIDE if beside else CLEAR
+        assert answer in (OPEN, expected), trial
+    assert min(met[CLEAR], met[TOUCHES], met[TOUCHES_OUTSIDE]) > 300 and met[OPEN] < 30, met
+
+
+def test_contacts_are_those_of_fcl_with_a_table_beside_the_patient() -> None:
+    """At each of many states the same contact, whichever of skin and table it is with; in a path the same first one."""
+    slow, fast, rng = cell(CellChecker), cell(FastChecker), np.random.default_rng(5)
+    spread = rng.choice([0.05, 0.2, 0.6], (3000, 1))
+    states = AWAY + rng.normal(size=(3000, 6)) * spread
+    expected = slow.contacts(states, needle_may_touch_patient=False)
+    assert fast.contacts(states, needle_may_touch_patient=False) == expected
+    others = [contact.other for contact in expected if contact is not None]
+    assert min(others.count("patient"), others.count(OUTSIDE_BODY), others.count("base")) > 10
+    ends = [q for q, contact in zip(states, expected, strict=True) if contact is None][:60]
+    for start, end in zip(ends[:30], ends[30:], strict=True):
+        path = start + np.linspace(0.0, 1.0, 30)[:, None] * (end - start)
+        found = (kind.first_contact(path, needle_may_touch_patient=False) for kind in (slow, fast))
+        assert next(found) == next(found)
+
+
+def test_contacts_are_hardly_ever_left_to_fcl() -> None:
+    """At states anywhere, of two bodies of the arm that are not proven clear: nearly all surely touch."""
+    fast, rng = cell(FastChecker), np.random.default_rng(6)
+    assert isinstance(fast, FastChecker)
+    frames = link_poses(UR3, rng.uniform(-np.pi, np.pi, (2000, 6)))
+    found = fast._proofs.first_not_clear(frames, np.zeros(2000, np.int64), np.ones(len(fast._tested), np.bool_))
+    between = fast._proofs.joint_spans[found.checks, 0] > 0
+    assert (found.answers[between] == OPEN).mean() < 0.02 and between.sum() > 500
+
+
+def test_only_an_origin_well_within_a_tetrahedron_is_deep() -> None:
+    """Not outside, not next to a face, not in a flat one, and not where a corner is missing."""
+    corners = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+    inside = 1.0 / np.sqrt(3.0)
+    assert deep(corners, 1e-3) and deep(corners[[1, 0, 2, 3]].copy(), inside - 1e-6)
+    assert not deep(corners, inside + 1e-6)
+    assert not deep(corners + [2.0, 0.0, 0.0], 0.0)
+    assert not deep(corners * [1.0, 1.0, 0.0], 0.0)
+    lost = corners.copy()
+    lost[3, 0] = np.nan
+    assert not deep(lost, 0.0)
