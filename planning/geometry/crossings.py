@@ -104,6 +104,8 @@ def _visit(corners, directions, order, starts, length, ray, depth, face):  # typ
     found = 0
     for f in range(len(corners)):
         a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+        if _beyond(a, b, c, length):
+            continue
         center, radius = _cone(a, b, c)
         first_row, last_row = 0, POLAR_BINS - 1
         polar = np.arccos(min(1.0, max(-1.0, center[2])))
@@ -111,10 +113,13 @@ def _visit(corners, directions, order, starts, length, ray, depth, face):  # typ
             first_row = max(0, int((polar - radius) * (POLAR_BINS / np.pi)))
             last_row = min(POLAR_BINS - 1, int((polar + radius) * (POLAR_BINS / np.pi)))
         low, high = _azimuths(center, polar, radius)
+        if radius >= 1.5:  # all bins, each once: in one piece, since most of them hold no ray
+            first_row, last_row, low, high = 0, 0, 0, 0
         for row in range(first_row, last_row + 1):
             for column in range(low, high + 1):
                 cell = row * 2 * POLAR_BINS + column % (2 * POLAR_BINS)
-                for k in range(starts[cell], starts[cell + 1]):
+                begin, end = (0, len(order)) if radius >= 1.5 else (starts[cell], starts[cell + 1])
+                for k in range(begin, end):
                     t = _cross(a, b, c, directions[order[k]])
                     if 0.0 <= t <= length:
                         if found < len(ray):
@@ -124,21 +129,41 @@ def _visit(corners, directions, order, starts, length, ray, depth, face):  # typ
 
 
 @nb.njit(cache=True)
+def _beyond(a, b, c, length):  # type: ignore[no-untyped-def]  # numba infers
+    """Whether no ray from the origin crosses a triangle at a length or less, told by its corners' distances.
+
+    No point is nearer than the first corner less the longer side from it; two points are no farther apart than twice
+    that side, which is what rounding can do to the depth of a ray that grazes the triangle's plane.
+    """
+    to_b = _length(b[0] - a[0], b[1] - a[1], b[2] - a[2])
+    to_c = _length(c[0] - a[0], c[1] - a[1], c[2] - a[2])
+    return _length(a[0], a[1], a[2]) - 3.0 * max(to_b, to_c) > length + SAME_CROSSING_MM
+
+
+@nb.njit(cache=True)
 def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
     """Axis and half-angle of a cone about the origin that holds a triangle; half-angle pi where none is narrow."""
-    na, nb_, nc = np.sqrt(a @ a), np.sqrt(b @ b), np.sqrt(c @ c)
-    axis = np.array([0.0, 0.0, 1.0])
+    na, nb_, nc = _length(a[0], a[1], a[2]), _length(b[0], b[1], b[2]), _length(c[0], c[1], c[2])
     if min(na, nb_, nc) == 0.0:
-        return axis, np.pi
-    total = a / na + b / nb_ + c / nc
-    norm = np.sqrt(total @ total)
+        return (0.0, 0.0, 1.0), np.pi
+    x = a[0] / na + b[0] / nb_ + c[0] / nc
+    y = a[1] / na + b[1] / nb_ + c[1] / nc
+    z = a[2] / na + b[2] / nb_ + c[2] / nc
+    norm = _length(x, y, z)
     if norm < 0.3:
-        return axis, np.pi
-    axis = total / norm
-    cosine = min(axis @ a / na, axis @ b / nb_, axis @ c / nc)
+        return (0.0, 0.0, 1.0), np.pi
+    x, y, z = x / norm, y / norm, z / norm
+    to_a, to_b = (x * a[0] + y * a[1] + z * a[2]) / na, (x * b[0] + y * b[1] + z * b[2]) / nb_
+    cosine = min(to_a, to_b, (x * c[0] + y * c[1] + z * c[2]) / nc)
     if cosine < 0.2:
-        return axis, np.pi
-    return axis, np.arccos(min(1.0, cosine)) + CONE_SLACK + 1e-7
+        return (0.0, 0.0, 1.0), np.pi
+    return (x, y, z), np.arccos(min(1.0, cosine)) + CONE_SLACK + 1e-7
+
+
+@nb.njit(cache=True)
+def _length(x, y, z):  # type: ignore[no-untyped-def]  # numba infers
+    """Of a vector."""
+    return np.sqrt(x * x + y * y + z * z)
 
 
 @nb.njit(cache=True)

@@ -86,10 +86,12 @@ class TriangleMesh:
         """What vertices and faces hold."""
         return self.vertices.nbytes + self.faces.nbytes
 
-    @property
+    @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the axis-aligned box, shape (2, 3), mm."""
-        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        bounds = np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        bounds.setflags(write=False)
+        return bounds
 
     def transformed(self, T_b_a: NDArray[np.float64]) -> TriangleMesh:
         """The same surface in frame b.

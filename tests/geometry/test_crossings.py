@@ -73,6 +73,20 @@ def test_length_cuts_off(ball):
     assert (crossings(mesh, np.zeros(3), FULL, 51).count == 1).all()
 
 
+@pytest.mark.parametrize(("spread", "size"), [(60, 10), (60, 100), (3, 3), (40, 4), (100, 2000)])
+def test_a_length_leaves_out_what_lies_beyond_and_nothing_else(rng, spread, size):
+    """Of small and huge triangles the crossings of a length are those of no length that are no deeper, to the bit."""
+    mesh = soup(rng, 400, spread, size)
+    directions = rng.normal(size=(150, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    every = crossings(mesh, np.zeros(3), directions)
+    assert len(every.depth) > 5
+    for length in (*np.quantile(every.depth, [0.05, 0.3, 0.7]), every.depth[0]):
+        found, kept = crossings(mesh, np.zeros(3), directions, length), every.depth <= length
+        for name in ("ray", "depth", "face"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(every, name)[kept])
+
+
 def test_first_crossing_is_the_nearest(ball):
     """Of two nested spheres the inner one is first."""
     both = TriangleMesh(
