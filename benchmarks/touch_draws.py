@@ -24,7 +24,7 @@ from scipy.special import ndtr
 from benchmarks.timing import least_seconds
 from benchmarks.trust import Scene, punctures, scenes
 from puncture_twin.planning.clearance.near_faces import NearFaces
-from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.limits import demanding

@@ -7,7 +7,8 @@ import numpy as np
 
 from benchmarks.experiment.row import Row
 from puncture_twin.meshes import folder
-from puncture_twin.planning.geometry.rigid import exp_rotation, pose
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.twin.guidance.ct.pivot import pivot_calibration

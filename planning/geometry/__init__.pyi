@@ -13,14 +13,16 @@ from .frames import (
 from .mesh import TriangleMesh as TriangleMesh
 from .rigid import (
     apply as apply,
-    exp_rotation as exp_rotation,
     exp_twist as exp_twist,
     inverse as inverse,
-    left_jacobian as left_jacobian,
-    log_rotation as log_rotation,
     log_twist as log_twist,
     pose as pose,
     rotated_about as rotated_about,
+)
+from .rotations import (
+    exp_rotation as exp_rotation,
+    left_jacobian as left_jacobian,
+    log_rotation as log_rotation,
     skew as skew,
 )
 from .spaces import Space as Space, Unit as Unit, parse_space as parse_space, parse_unit as parse_unit, to_lps as to_lps

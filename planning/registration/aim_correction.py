@@ -21,7 +21,8 @@ from dataclasses import replace
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
+from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.fit_map import carried, design
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty

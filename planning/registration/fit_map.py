@@ -12,7 +12,8 @@ from collections.abc import Callable
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import apply, log_rotation, skew
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rotations import log_rotation, skew
 
 NUDGE_MM = 1e-4
 """Of central differences of a method that has no formula of its own; their error is 1e-9 of the map."""

@@ -20,7 +20,8 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import home_configuration
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, plan_approach
 from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.motion.path_check import dense_states

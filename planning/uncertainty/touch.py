@@ -18,7 +18,7 @@ from scipy.special import ndtr, stdtr
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.geometry.rigid import skew
+from puncture_twin.planning.geometry.rotations import skew
 
 
 @dataclass(frozen=True, eq=False)

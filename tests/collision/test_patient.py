@@ -11,7 +11,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.collision.patient import PART_TRIANGLES, FclSkin
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation
 
 
 def ball(subdivisions: int) -> TriangleMesh:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.geometry import frames, rigid
+from puncture_twin.planning.geometry import frames, rigid, rotations
 
 SEED = 20260122
 ANGLES = (0.0, 1e-12, 1e-8, 0.99e-6, 1.01e-6, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-8)
@@ -22,7 +22,7 @@ def rotation_vectors(angle):
 def poses(n=20):
     """Random poses (n, 4, 4), mm."""
     rng = np.random.default_rng(SEED)
-    return rigid.pose(rigid.exp_rotation(rng.normal(size=(n, 3))), rng.normal(0.0, 300.0, (n, 3)))
+    return rigid.pose(rotations.exp_rotation(rng.normal(size=(n, 3))), rng.normal(0.0, 300.0, (n, 3)))
 
 
 def units(n=20):
@@ -40,18 +40,18 @@ def assert_rotation(R):
 def test_skew_is_the_cross_product():
     """[v]x a = v x a, for many vectors at once."""
     v, a = np.random.default_rng(SEED).normal(size=(2, 20, 3))
-    np.testing.assert_allclose((rigid.skew(v) @ a[..., None])[..., 0], np.cross(v, a), atol=1e-15)
+    np.testing.assert_allclose((rotations.skew(v) @ a[..., None])[..., 0], np.cross(v, a), atol=1e-15)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_exponential_is_a_rotation_about_its_vector(angle):
     """It keeps its axis, its inverse is the exponential of the opposite, and Rodrigues' formula gives the same."""
     for w in rotation_vectors(angle):
-        R = rigid.exp_rotation(w)
+        R = rotations.exp_rotation(w)
         assert_rotation(R)
         np.testing.assert_allclose(R @ w, w, atol=1e-14)
-        np.testing.assert_allclose(R @ rigid.exp_rotation(-w), np.eye(3), atol=1e-14)
-        W = rigid.skew(w)
+        np.testing.assert_allclose(R @ rotations.exp_rotation(-w), np.eye(3), atol=1e-14)
+        W = rotations.skew(w)
         sine, versine = (np.sin(angle) / angle, 2 * (np.sin(angle / 2) / angle) ** 2) if angle else (1.0, 0.5)
         np.testing.assert_allclose(R, np.eye(3) + sine * W + versine * W @ W, atol=1e-14)
 
@@ -60,25 +60,25 @@ def test_exponential_is_a_rotation_about_its_vector(angle):
 def test_logarithm_undoes_the_exponential(angle):
     """To rounding, near the identity and near a half turn."""
     w = rotation_vectors(angle)
-    np.testing.assert_allclose(rigid.log_rotation(rigid.exp_rotation(w)), w, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(rotations.log_rotation(rotations.exp_rotation(w)), w, rtol=1e-9, atol=1e-14)
 
 
 def test_exponential_undoes_the_logarithm_at_a_half_turn():
     """There the vector's sign is free, the rotation is not."""
-    R = rigid.exp_rotation(rotation_vectors(np.pi))
-    w = rigid.log_rotation(R)
+    R = rotations.exp_rotation(rotation_vectors(np.pi))
+    w = rotations.log_rotation(R)
     np.testing.assert_allclose(np.linalg.norm(w, axis=1), np.pi, atol=1e-7)
-    np.testing.assert_allclose(rigid.exp_rotation(w), R, atol=1e-7)
+    np.testing.assert_allclose(rotations.exp_rotation(w), R, atol=1e-7)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_left_jacobian_is_the_slope_of_the_exponential(angle):
     """Log(Exp(w + h e) Exp(w)^T) / h by central differences."""
     for w in rotation_vectors(angle):
-        R = rigid.exp_rotation(w)
-        ends = [rigid.log_rotation(rigid.exp_rotation(w + h * np.eye(3)) @ R.T) for h in (STEP, -STEP)]
+        R = rotations.exp_rotation(w)
+        ends = [rotations.log_rotation(rotations.exp_rotation(w + h * np.eye(3)) @ R.T) for h in (STEP, -STEP)]
         slope = (ends[0] - ends[1]).T / (2 * STEP)
-        np.testing.assert_allclose(rigid.left_jacobian(w), slope, atol=1e-9)
+        np.testing.assert_allclose(rotations.left_jacobian(w), slope, atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -119,7 +119,7 @@ def test_a_turn_about_a_point_leaves_it():
         moved = rigid.rotated_about(T, center, np.concatenate([w, shift]))
         there = rigid.apply(rigid.inverse(T), center)
         np.testing.assert_allclose(rigid.apply(moved, there), center + shift, atol=1e-11)
-        np.testing.assert_allclose(moved[:3, :3], rigid.exp_rotation(w) @ T[:3, :3], atol=1e-14)
+        np.testing.assert_allclose(moved[:3, :3], rotations.exp_rotation(w) @ T[:3, :3], atol=1e-14)
 
 
 def test_frames_from_axes_keep_the_first_and_lean_to_the_second():

@@ -6,7 +6,8 @@ from scipy.optimize import least_squares
 from uncertainty_world import declared, world
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose
+from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
 from puncture_twin.planning.registration.fits.weighted import fit_joint, fit_weighted
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs

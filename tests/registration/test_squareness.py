@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
+from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.registration.checks.squareness import PLANES, check_squareness
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs

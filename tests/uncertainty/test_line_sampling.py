@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.uncertainty.lines.refined_touch import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
 

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.search.chances.joint import joint_touch_chance
 from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
 

@@ -10,7 +10,7 @@ from puncture_twin.planning.arm.erring_arm import dh_step
 from puncture_twin.planning.arm.error_jacobian import FREE_D, N_PARAMETERS, PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation
 
 NEWTON_STEPS = 4
 """Of a tip moved onto a point: errors of an arm are millimetres, and each step squares what is left of them."""

@@ -10,7 +10,8 @@ import numpy as np
 from puncture_twin.planning.arm.urdf.document import UrdfDocument, UrdfJoint, UrdfLink
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import exp_rotation, pose
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.rotations import exp_rotation
 
 JOINT_COUNT = 6
 

@@ -15,7 +15,8 @@ from puncture_twin.planning.arm.urdf.chain import ArmChain
 from puncture_twin.planning.arm.urdf.document import UrdfDocument
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import apply, log_rotation
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rotations import log_rotation
 
 SQUARE_RAD = 1e-4
 """How far an axis may be from where a UR has it: 1.5708 for a right angle is off by 4e-6, 1.57 by 8e-4."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import exp_rotation, pose
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.registration.fit_map import design_blocks
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.frames import frame_about
-from puncture_twin.planning.geometry.rigid import skew
+from puncture_twin.planning.geometry.rotations import skew
 from puncture_twin.planning.uncertainty.lines.displaced_needle import FARTHEST
 
 Problem = tuple[Floats, Floats, Floats, Floats, Floats, float, float]

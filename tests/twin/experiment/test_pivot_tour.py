@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.touch.pivot_planner import plan_pivot, spread_poses
 from puncture_twin.run_twin import app

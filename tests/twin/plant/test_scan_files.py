@@ -12,7 +12,8 @@ import SimpleITK as sitk  # noqa: N813
 from puncture_twin.planning.formats.dicom.ct_series import parse_series
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
+from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.twin.plant.scanner.dicom_writer import write_series
 from puncture_twin.twin.plant.scanner.image import ScanSettings, scan_solids
 from puncture_twin.twin.plant.scanner.nifti_writer import write_nifti

@@ -6,11 +6,11 @@ from scipy.optimize import least_squares
 from selfcal_world import as_estimate
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import log_rotation
+from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import direction_from_plane, mean_direction
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, covariances
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine

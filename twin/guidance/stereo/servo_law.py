@@ -19,7 +19,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import log_rotation
+from puncture_twin.planning.geometry.rotations import log_rotation
 
 CHARACTERISTIC_MM = 300.0
 """Length by which millimetres are made comparable with radians: about half of a UR3's reach."""

@@ -20,7 +20,8 @@ from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.frames import frame_yz
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotated_about
+from puncture_twin.planning.geometry.rigid import apply, pose, rotated_about
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair, tangent_axes
 from puncture_twin.twin.guidance.stereo.declared_errors import CameraErrors
 from puncture_twin.twin.guidance.stereo.joint.needle_outcome import TrueNeedle

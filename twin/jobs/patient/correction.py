@@ -8,7 +8,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.geometry.rigid import apply, log_rotation
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.planning.registration.placement import default_method
 from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm, pose_error

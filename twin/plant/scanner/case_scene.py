@@ -16,7 +16,8 @@ from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
+from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
 from puncture_twin.twin.plant.beside.beside import Beside, lay_beside

@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import jacobians, link_frames
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import skew
+from puncture_twin.planning.geometry.rotations import skew
 from puncture_twin.twin.world.units import MM_PER_M
 
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.geometry.gauss_newton import System
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotated_about
+from puncture_twin.planning.geometry.rigid import apply, pose, rotated_about
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
 from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors

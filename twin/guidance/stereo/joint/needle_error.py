@@ -21,7 +21,8 @@ from scipy.special import chdtri
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rotations import exp_rotation, left_jacobian
 from puncture_twin.planning.uncertainty.hit import hit_in_mesh, rays_to_ball
 from puncture_twin.twin.guidance.stereo.joint.joint_model import FLOOR_MM
 from puncture_twin.twin.guidance.stereo.joint.optimum import Adjusted

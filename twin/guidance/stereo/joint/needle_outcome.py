@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import log_rotation
+from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.twin.guidance.stereo.joint.needle_error import REGION, NeedleError
 
 LEAST_VARIANCE = 1e-12

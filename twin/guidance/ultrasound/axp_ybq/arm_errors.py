@@ -26,7 +26,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 N_ARM = PARAMETERS["joint"].stop

@@ -8,10 +8,11 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import log_rotation
+from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import PARAMETERS, T_Q, Estimate, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.small_sample import SmallSample
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import PARAMETERS, T_Q
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import linearised_tip, tip_residuals

@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import skew
+from puncture_twin.planning.geometry.rotations import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import nearest_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import (
     LENGTH_MM,
     T_Q,
     T_X,
     T_Y,
     W_X,
     W_Y,
-    Estimate,
     parameter_units,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording

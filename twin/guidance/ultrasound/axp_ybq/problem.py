@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.geometry.rigid import skew
+from puncture_twin.planning.geometry.rotations import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import ArmErrors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import HALF_NORMAL
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import DIRECTION
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import (
     across,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import (
     LEAST_RATIO,

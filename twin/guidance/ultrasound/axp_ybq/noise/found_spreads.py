@@ -6,11 +6,11 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import Fitted, RobustFit, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.likelihood import by_likelihood
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.parts import WIDEST_RATIO, ResidualSpreads
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers.settled import settled
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import DIRECTION
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import LEAST_MM, Problem, Spread
 
 SPREAD_ROUNDS = 2

@@ -10,15 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.geometry.rigid import skew
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
-    DIRECTION,
-    N_PARAMETERS,
-    W_X,
-    W_Y,
-    Estimate,
-    tangent_basis,
-)
+from puncture_twin.planning.geometry.rotations import skew
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import DIRECTION, N_PARAMETERS, W_X, W_Y
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import Linearised
 

@@ -13,17 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import skew
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
-    N_PARAMETERS,
-    SCALE,
-    T_Q,
-    T_X,
-    T_Y,
-    W_X,
-    W_Y,
-    Estimate,
-)
+from puncture_twin.planning.geometry.rotations import skew
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import N_PARAMETERS, SCALE, T_Q, T_X, T_Y, W_X, W_Y
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 
@@ -33,7 +25,7 @@ class Linearised(NamedTuple):
     residuals: Floats
     """Shape (n, k)."""
     jacobian: Floats
-    """Shape (n, k, 19), by the parameters of ``estimate.PARAMETERS``."""
+    """Shape (n, k, 19), by the parameters of ``parameters.PARAMETERS``."""
 
 
 def linearised_tip(estimate: Estimate, recording: Recording) -> Linearised:
