@@ -19,6 +19,8 @@ from puncture_twin.planning.geometry.rigid import inverse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.calibrate_case import calibrate_case
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 
 Reading = Callable[[Recording], Recording]
 
@@ -37,20 +39,20 @@ LEAST_REACH_MM = 20.0
 ALLOWED = "A = T_base1_end1 and B = T_base2_end2 in mm, rotations by rows, P in mm"
 
 
-def checked_calibration(recording: Recording, fit: Callable[[], Calibration], where: Path) -> Calibration:
+def checked_calibration(recording: Recording, case: SelfcalCase | None, where: Path) -> Calibration:
     """A calibration of a recording from outside, if the recording was read as it was meant.
 
     Args:
         recording: As its file gives it.
-        fit: Calibrates it.
+        case: As `calibrate_case` takes it.
         where: Its file.
 
     Raises:
-        InputError: Another reading fits and this one does not, or none does; or what ``fit`` refuses.
+        InputError: Another reading fits and this one does not, or none does; or what `calibrate_case` refuses.
     """
     _check_reach(recording, where)
     try:
-        found = fit()
+        found = calibrate_case(recording, case)
     except InputError:
         _refuse_slip(recording, np.inf, where)
         raise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,12 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.input_file import read_input, unfinished_warnings
 from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.planning.base.provenance import Input, content_input
-from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, acquire, choice_noise
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.calibrate_case import calibrate_case
 from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
@@ -127,7 +126,7 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
         content = read_input(file, max_bytes=MAX_BYTES, where=str(file))
         recording = parse_recording(content, file)
     with stages.time("calibrate"):
-        calibration = checked_calibration(recording, partial(calibrate_case, recording, case), file)
+        calibration = checked_calibration(recording, case, file)
     inputs = (content_input("recording", file.name, content), *(() if case is None else case.inputs))
     warnings = (*unfinished_warnings(content, file.name), *calibration.declaration_doubts())
     if case is not None and calibration.arms is None:
@@ -169,14 +168,6 @@ def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisi
 
     sets = [rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS)]
     return Choice(expected(rows), tuple(expected(some) for some in sets))
-
-
-def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:
-    """Calibrate with what the case says of noise and needle; pixels are solved for where the recording has them."""
-    noise = None if case is None or case.content.noise is None else case.content.noise.noise()
-    length = case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
-    arms = None if case is None or recording.q_probe is None else case.declared_arms
-    return calibrate(recording, noise=noise, needle_length_mm=length, scale=recording.pixels, arms=arms)
 
 
 def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
