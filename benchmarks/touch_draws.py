@@ -55,8 +55,8 @@ def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
     """Rows: by draws, then as in `NAMES`, seconds of lines; of each direction, structure and threshold."""
     case, anatomy, engine, rng = scene.context.case, scene.context.anatomy, scene.context.engine, _rng()
     columns, lengths = demanding(anatomy.checked), axis_lengths(case, anatomy.checked)
-    cov_ct, rows = model.error.covariance_ct(scene.q), []
-    near = model.passing(scene.outward_ct, cov_ct)
+    needles, rows = model.needles(scene.outward_ct, scene.q), []
+    cov_ct, near = needles.cov_ct, needles.near
     for i, outward in enumerate(scene.outward_ct):
         errors = rng.multivariate_normal(np.zeros(6), cov_ct[i], draws, method="eigh")
         origins, along = case.target_ct + errors[:, :3], exp_rotation(errors[:, 3:]) @ outward

@@ -51,6 +51,7 @@ from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, hit_model
 from puncture_twin.planning.uncertainty.limits import demanding
 from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.planning.uncertainty.refined_chances import refined_chances
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -284,7 +285,7 @@ def _predicted(of: Scene, error: PoseError, puncture: Puncture, freedom: int | N
     for size in SIZES if freedom else (1.0,):
         asked = _believed(of, error, size, freedom)
         first = asked.chances(outward, q)
-        touch.append(asked.refined(outward, q, first, np.ones(first.touch.shape, bool)).touch[0])
+        touch.append(refined_chances(asked, outward, q, first, np.ones(first.touch.shape, bool)).touch[0])
     for size in np.geomspace(*FOUND, 8 * len(SIZES)) if freedom else (1.0,):
         told = _believed(of, error, size, freedom).error
         cov, tip = told.covariance_ct(q), told.tip_covariance(q)

@@ -17,7 +17,7 @@ class AxisDistances:
         distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they meet.
         depth: Shape (n, k), distance from the target, along the axis, of the axis point nearest to the structure;
             where they meet, of the first meeting point.
-        nearest: Shape (n, k), a triangle of the structure that is as near, by the engine's own count.
+        nearest: Shape (n, k), a triangle of the structure that is as near, a row of the engine's `triangles`.
     """
 
     distance: Floats
@@ -36,6 +36,11 @@ class ClearanceEngine(Protocol):
     decided by the target alone, because every axis starts there (see `puncture_twin.planning.clearance.measure`).
     """
 
+    @property
+    def triangles(self) -> tuple[Floats, ...]:
+        """Of each structure, shape (m, 9), corners in rows, mm: what `AxisDistances.nearest` counts."""
+        ...
+
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
     ) -> AxisDistances:
@@ -43,14 +48,6 @@ class ClearanceEngine(Protocol):
 
         ``length`` is one number or shape (k,), mm: as long is an axis for each structure. Without ``shown`` no progress
         is told: the same axes are tested again.
-        """
-        ...
-
-    def normals(self, target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
-        """From where measured axes are nearest, shape (n, k, 3): unit, from the structure to the axis; NaN on contact.
-
-        ``axes`` are what this engine measured from ``target_ct`` along ``outward_ct``; nothing is searched again. Where
-        several points of a structure are equally near, it is any one of them.
         """
         ...
 

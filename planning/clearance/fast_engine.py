@@ -18,7 +18,6 @@ from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED
 from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
-from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.clearance.one_structure import measure_structure
 from puncture_twin.planning.clearance.placed_surface import PlacedSurface, placed_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -66,6 +65,11 @@ class FastEngine:
         self._progress = progress
         self.counts = np.zeros(len(COUNTED), np.int64)
 
+    @property
+    def triangles(self) -> tuple[Floats, ...]:
+        """Of each structure, in blocks; see `ClearanceEngine`."""
+        return tuple(blocks.triangles for blocks in self._blocks)
+
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
     ) -> AxisDistances:
@@ -90,11 +94,6 @@ class FastEngine:
                 self._progress(done * len(outward), len(self._blocks) * len(outward))
         self.counts += counts.sum(axis=0)
         return AxisDistances(distance.T, depth.T, nearest.T)
-
-    def normals(self, target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
-        """From where measured axes are nearest; see `ClearanceEngine`."""
-        triangles = [blocks.triangles for blocks in self._blocks]
-        return normals_of(triangles, target_ct, outward_ct, axes)
 
     def _seen_from(self, target: Floats) -> tuple[PlacedSurface, ...]:
         """The surfaces as seen from a target; those of the last target are kept."""

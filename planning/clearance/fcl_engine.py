@@ -13,7 +13,6 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.kernels.blocks import pack
 from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
-from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.crossings import first_crossing
 from puncture_twin.planning.geometry.frames import frame_about
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -38,6 +37,11 @@ class FclEngine:
         self._objects = tuple(fcl.CollisionObject(_tree(mesh.vertices, mesh.faces)) for mesh in self._meshes)
         self._progress = progress
 
+    @property
+    def triangles(self) -> tuple[Floats, ...]:
+        """Of each structure, as its mesh has them; see `ClearanceEngine`."""
+        return tuple(mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in self._meshes)
+
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
     ) -> AxisDistances:
@@ -60,11 +64,6 @@ class FclEngine:
         """Of one axis from all k structures, shape (k,), 0 on contact: `measure` without where it is nearest."""
         found = self._one_direction(target_ct, outward_ct, np.full(len(self._objects), length))[0]
         return np.maximum(np.array(found, dtype=np.float64), 0.0)
-
-    def normals(self, target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
-        """From where measured axes are nearest; see `ClearanceEngine`."""
-        triangles = [mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in self._meshes]
-        return normals_of(triangles, target_ct, outward_ct, axes)
 
     def _one_direction(
         self, tip: Floats, outward: Floats, lengths: Floats

@@ -16,8 +16,10 @@ from puncture_twin.planning.geometry.triangle_distance import nearest_point
 def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
     """Of n axes and k surfaces, shape (n, k, 3): unit, from the surface to the axis; NaN where they meet.
 
+    Nothing is searched again. Where several points of a surface are equally near, it is any one of them.
+
     Args:
-        triangles: Of each surface, shape (m, 9), corners in rows, mm.
+        triangles: Of the engine that measured: of each surface, shape (m, 9), corners in rows, mm.
         target_ct: Shape (3,), where the axes start.
         outward_ct: Shape (n, 3), unit.
         axes: Measured from there, their ``nearest`` rows of ``triangles``.

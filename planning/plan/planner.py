@@ -23,6 +23,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
+from puncture_twin.planning.uncertainty.refined_chances import keeps_limits
 
 MAX_TRIES = 20
 """Candidates to which an approach is sought; what none of the best twenty allows is a matter of the workcell."""
@@ -137,7 +138,7 @@ def _within_limits(
         return goals
     q = np.array([goal.insertion_q[-1] for goal in goals])
     outward = np.tile(candidates.outward_ct[row], (len(goals), 1))
-    kept = context.chance.keeps_limits(outward, q)
+    kept = keeps_limits(context.chance, outward, q)
     if not kept.any():
         raise NoAnswerError("no configuration that an approach may end in keeps search.min_hit and max_touch")
     return [goal for goal, keeps in zip(goals, kept, strict=True) if keeps]

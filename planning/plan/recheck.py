@@ -19,6 +19,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
+from puncture_twin.planning.uncertainty.refined_chances import keeps_limits
 
 SAME_DIRECTION = 1e-6
 """Largest difference of two unit vectors that name one direction: degrees in the file are rounded to 1e-15."""
@@ -84,7 +85,7 @@ def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:
     """Refuse a plan that ends in a configuration beyond the case's limits of chances: the search's may be another."""
     if context.chance is None:
         return
-    if not context.chance.keeps_limits(plan.outward_ct[None], plan.insertion.q[-1:]).all():
+    if not keeps_limits(context.chance, plan.outward_ct[None], plan.insertion.q[-1:]).all():
         what = "the configuration in which it ends does not keep search.min_hit and max_touch"
         raise InputError(what, where=path, allowed="plan again")
 

@@ -72,12 +72,6 @@ class Verdict(Columns):
         """Those of some rows."""
         return Verdict(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
-    def rejected(self, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Verdict:
-        """These candidates with some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
-        arrays = {field.name: getattr(self, field.name).copy() for field in fields(self)}
-        arrays["reason"][rows], arrays["structure"][rows], arrays["amount"][rows] = reason.value, structure, amount
-        return Verdict(**arrays)
-
 
 @dataclass(frozen=True, eq=False)
 class Path(Columns):

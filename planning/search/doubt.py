@@ -188,7 +188,7 @@ def doubt_of(model: ChanceModel, chances: Chances, outward_ct: Floats, q: Floats
         q: Shape (6,), rad, the tip on the target.
     """
     touch = dict(zip(chances.structures, map(float, chances.touch[0]), strict=True))
-    near = model.passing(outward_ct[None], model.error.covariance_ct(q[None]))
+    near = model.needles(outward_ct[None], q[None]).near
     needle = shrinkable(model, near, q)
     return Doubt(
         float(chances.hit[0]),

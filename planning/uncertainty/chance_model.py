@@ -1,27 +1,28 @@
-"""The chances of any needles that reach a case's target, to hit, to touch and to break margins, and the case's limits.
+"""The chances of any needles that reach a case's target, to hit, to touch and to break margins, to first order.
 
-To first order, or by line sampling where it is wanted. The model is made once for a case; whoever asks has needles
-alone: directions, and how the arm stands with the tip on the target.
+The model is made once for a case; whoever asks has needles alone: directions, and how the arm stands with the tip on
+the target. Line sampling refines them where it is wanted (`refined_chances`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
+from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_model
 from puncture_twin.planning.uncertainty.limits import demanding, touch_limit
-from puncture_twin.planning.uncertainty.lines.refined_touch import Needles, Surroundings, refined
+from puncture_twin.planning.uncertainty.lines.refined_touch import Needles
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.planning.uncertainty.touch import Proximity, proximity, touch_chance, touching_any
+from puncture_twin.planning.uncertainty.touch import proximity, touch_chance, touching_any
 
 TAKEN = frozenset({"any", "joint"})
 """Names whose column ``p_touch_<name>`` says something else than one structure's chance."""
@@ -76,21 +77,16 @@ class ChanceModel:
         margins = np.array([self.anatomy.checked[column].margin_mm for column in self.columns], dtype=np.float64)
         return self.case.needle.radius_mm + margins
 
-    def passing(self, outward_ct: Floats, cov_ct: Floats, axes: AxisDistances | None = None) -> Proximity:
-        """How some needles (n, 3) of given Sigma6 (n, 6, 6), CT axes, pass them; ``axes`` as in `chances`."""
-        case, columns = self.case, self.columns
-        if axes is None:
-            lengths = axis_lengths(case, self.anatomy.checked)
-            axes = self.engine.measure(case.target_ct, outward_ct, lengths, shown=False)
-        normal = self.engine.normals(case.target_ct, outward_ct, axes)[:, columns]
-        distance, depth = axes.distance[:, columns], axes.depth[:, columns]
-        return proximity(distance, depth, normal, outward_ct, cov_ct, self.error.surface_mm)
-
     def needles(self, outward_ct: Floats, q: Floats, axes: AxisDistances | None = None) -> Needles:
-        """Some needles and the doubt about them; arguments as of `chances`."""
-        cov_ct = self.error.covariance_ct(q)
-        near = self.passing(outward_ct, cov_ct, axes)
-        return Needles(outward_ct, cov_ct, near, self.error.surface_mm, self.error.freedom)
+        """Some needles, the doubt about them, and how they pass the structures; arguments as of `chances`."""
+        target, columns = self.case.target_ct, self.columns
+        if axes is None:
+            axes = self.engine.measure(target, outward_ct, axis_lengths(self.case, self.anatomy.checked), shown=False)
+        normal = normals_of(self.engine.triangles, target, outward_ct, axes)[:, columns]
+        distance, depth = axes.distance[:, columns], axes.depth[:, columns]
+        cov_ct, surface_mm = self.error.covariance_ct(q), self.error.surface_mm
+        near = proximity(distance, depth, normal, outward_ct, cov_ct, surface_mm)
+        return Needles(outward_ct, cov_ct, near, surface_mm, self.error.freedom)
 
     def chances(self, outward_ct: Floats, q: Floats, axes: AxisDistances | None = None) -> Chances:
         """The chances of some needles to first order, the joint one unknown.
@@ -117,38 +113,6 @@ class ChanceModel:
             lateral_mm=np.sqrt(np.maximum(np.trace(tip, axis1=1, axis2=2) - along, 0.0)),
             depth_mm=np.sqrt(along),
         )
-
-    def refined(self, outward_ct: Floats, q: Floats, first: Chances, wanted: Bools | None = None) -> Chances:
-        """Chances to touch, to break a margin and to touch any, by line sampling; the others as they are.
-
-        Args:
-            outward_ct: Shape (n, 3), as in `chances`.
-            q: Shape (n, 6).
-            first: Of these needles, to first order.
-            wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
-        """
-        every = np.ones(first.touch.shape, bool)
-        around = Surroundings(self.engine, self.columns, self.lengths, self.case.target_ct)
-        needles = self.needles(outward_ct, q)
-        touch = refined(around, needles, self.touching, first.touch, every if wanted is None else wanted)
-        margin = first.margin if wanted is not None else refined(around, needles, self.breaking, first.margin, every)
-        return replace(first, touch=touch, margin=margin, touch_any=touching_any(touch))
-
-    def keeps_limits(self, outward_ct: Floats, q: Floats) -> Bools:
-        """Whether needles keep the case's limits, shape (n,), in any configurations that reach the target.
-
-        Args:
-            outward_ct: Shape (n, 3), unit.
-            q: Shape (n, 6), rad, the tip on the target.
-        """
-        kept, least, limits = np.ones(len(q), bool), self.case.search.min_hit, self.limits
-        if least is not None:
-            kept &= self.hit.chance(self.error, self.error.covariance_ct(q)) >= least
-        if not np.isfinite(limits).any():
-            return kept
-        first = self.chances(outward_ct, q)
-        touch = self.refined(outward_ct, q, first, np.broadcast_to(np.isfinite(limits), first.touch.shape)).touch
-        return np.asarray(kept & (np.where(np.isnan(touch), np.inf, touch) <= limits).all(axis=1))
 
 
 def chance_model(case: Case, anatomy: Anatomy, engine: ClearanceEngine, error: PoseError | None) -> ChanceModel | None:

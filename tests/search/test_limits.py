@@ -13,6 +13,7 @@ from puncture_twin.planning.search.chances import joint, refined
 from puncture_twin.planning.search.chances.limited import limited
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.uncertainty.chances import Chances
+from puncture_twin.planning.uncertainty.refined_chances import keeps_limits, refined_chances
 from puncture_twin.planning.uncertainty.touch import proximity, touch_bound, touch_chance
 
 CASE = """schema = 2
@@ -137,7 +138,7 @@ def test_limits_are_kept_in_a_configuration_or_not_as_the_search_says(tmp_path, 
     case = replace(context.case, search=replace(context.case.search, **{limit: value}))
     said = limited(case, found).safe[rows]
     q = found.arm.q_insertion[rows]
-    kept = replace(context.chance, case=case).keeps_limits(found.outward_ct[rows], q)
+    kept = keeps_limits(replace(context.chance, case=case), found.outward_ct[rows], q)
     assert said.any() and not said.all()
     np.testing.assert_array_equal(kept, said)
 
@@ -220,7 +221,7 @@ def test_what_may_decide_is_line_sampled(tmp_path, monkeypatch, limited):
     rows = np.flatnonzero(np.isfinite(found.chances.hit))
     outward, q = found.outward_ct[rows], found.arm.q_insertion[rows]
     first = context.chance.chances(outward, q)
-    lines = context.chance.refined(outward, q, first, np.ones(first.touch.shape, bool)).touch
+    lines = refined_chances(context.chance, outward, q, first, np.ones(first.touch.shape, bool)).touch
     table = found.chances.touch[rows]
     near = (first.touch >= limit / 3) & (first.touch <= 3 * limit)
     must = near & limited

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.uncertainty.lines.refined_touch import Needles, Surroundings, refined
@@ -35,7 +36,7 @@ def chances(mesh, cov, surface=0.0, freedom=None, threshold=RADIUS):
     """First order and refined, of one needle along z from the origin."""
     engine = FastEngine([mesh])
     axes = engine.measure(np.zeros(3), UP[None], LENGTH)
-    normal = engine.normals(np.zeros(3), UP[None], axes)
+    normal = normals_of(engine.triangles, np.zeros(3), UP[None], axes)
     near = proximity(axes.distance, axes.depth, normal, UP[None], cov[None], surface)
     first = touch_chance(near, threshold, freedom)
     around = Surroundings(engine, np.array([0]), np.array([LENGTH]), np.zeros(3))

@@ -7,6 +7,7 @@ from scipy.special import ndtr
 
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.search.chances.joint import joint_touch_chance
@@ -39,7 +40,7 @@ def near(meshes, cov, surface=0.0):
     """One needle along z from the origin past some meshes."""
     engine = FastEngine(meshes)
     axes = engine.measure(np.zeros(3), UP[None], LENGTH)
-    normal = engine.normals(np.zeros(3), UP[None], axes)
+    normal = normals_of(engine.triangles, np.zeros(3), UP[None], axes)
     return proximity(axes.distance, axes.depth, normal, UP[None], cov[None], surface)
 
 
@@ -123,9 +124,9 @@ def test_both_engines_say_from_where_an_axis_is_nearest(rng):
     outward /= np.linalg.norm(outward, axis=1)[:, None]
     fast, fcl = (kind(meshes) for kind in (FastEngine, FclEngine))
     axes = fast.measure(np.zeros(3), outward, LENGTH)
-    normals = fast.normals(np.zeros(3), outward, axes)
+    normals = normals_of(fast.triangles, np.zeros(3), outward, axes)
     np.testing.assert_allclose(
-        normals, fcl.normals(np.zeros(3), outward, fcl.measure(np.zeros(3), outward, LENGTH)), atol=1e-9
+        normals, normals_of(fcl.triangles, np.zeros(3), outward, fcl.measure(np.zeros(3), outward, LENGTH)), atol=1e-9
     )
     assert np.isnan(normals).any(axis=2).sum() == (axes.distance == 0).sum() > 0
     for column, mesh in enumerate(meshes):
@@ -142,8 +143,8 @@ def test_normals_of_some_measured_axes_are_those_of_all(rng):
     outward = rng.normal(size=(60, 3))
     outward /= np.linalg.norm(outward, axis=1)[:, None]
     axes, rows = engine.measure(np.zeros(3), outward, LENGTH), rng.permutation(60)[:17]
-    every = engine.normals(np.zeros(3), outward, axes)
-    np.testing.assert_array_equal(engine.normals(np.zeros(3), outward[rows], axes.at(rows)), every[rows])
+    every = normals_of(engine.triangles, np.zeros(3), outward, axes)
+    np.testing.assert_array_equal(normals_of(engine.triangles, np.zeros(3), outward[rows], axes.at(rows)), every[rows])
 
 
 @pytest.mark.parametrize("kind", [FastEngine, FclEngine])
@@ -154,6 +155,6 @@ def test_of_two_points_as_near_either_is_named(kind):
     left.invert()
     engine = kind(scene(left + right))
     axes = engine.measure(np.zeros(3), UP[None], LENGTH)
-    normal = engine.normals(np.zeros(3), UP[None], axes)[0, 0]
+    normal = normals_of(engine.triangles, np.zeros(3), UP[None], axes)[0, 0]
     assert axes.distance[0, 0] == pytest.approx(2.0)
     np.testing.assert_allclose(np.abs(normal), [1.0, 0.0, 0.0], atol=1e-12)

@@ -25,6 +25,7 @@ from puncture_twin.planning.uncertainty.chance_model import chance_model
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
 from puncture_twin.planning.uncertainty.limits import demanding
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
+from puncture_twin.planning.uncertainty.refined_chances import refined_chances
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, not_modelled
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
@@ -240,7 +241,7 @@ def _measured(
     cov_ct, error_ct = believed.tip_covariance_ct(q)[0], rooms.tip_ct - rooms.target_ct
     model = chance_model(case, context.anatomy, context.engine, believed)
     assert model is not None
-    chances = model.refined(puncture.outward_ct[None], q, model.chances(puncture.outward_ct[None], q))
+    chances = refined_chances(model, puncture.outward_ct[None], q, model.chances(puncture.outward_ct[None], q))
     inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
     return Distribution(

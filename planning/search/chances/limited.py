@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import Floats, Ints, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.candidates import Candidates, Verdict
 from puncture_twin.planning.uncertainty.limits import touch_limit
 
 
@@ -19,7 +20,7 @@ def limited(case: Case, found: Candidates) -> Candidates:
     if least is not None:
         rows = np.flatnonzero(found.safe & ~(chances.hit >= least))  # what is not known is not enough
         target = np.full(len(rows), case.target_structure, dtype=object)
-        found = replace(found, verdict=found.verdict.rejected(rows, Reason.HIT_UNLIKELY, target, chances.hit[rows]))
+        found = _rejected(found, rows, Reason.HIT_UNLIKELY, target, chances.hit[rows])
     limits = np.array([touch_limit(case, name) for name in chances.structures])
     touch = np.where(np.isnan(chances.touch), np.inf, chances.touch)  # nor is it little enough
     with np.errstate(invalid="ignore"):  # without a limit both may be infinite
@@ -27,5 +28,11 @@ def limited(case: Case, found: Candidates) -> Candidates:
     rows = np.flatnonzero(found.safe & (beyond > 0).any(axis=1))
     worst = beyond[rows].argmax(axis=1) if len(rows) else rows
     names = np.array(chances.structures, dtype=object)[worst]
-    amounts = chances.touch[rows, worst]
-    return replace(found, verdict=found.verdict.rejected(rows, Reason.TOUCH_LIKELY, names, amounts))
+    return _rejected(found, rows, Reason.TOUCH_LIKELY, names, chances.touch[rows, worst])
+
+
+def _rejected(found: Candidates, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Candidates:
+    """With some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
+    arrays = {field.name: getattr(found.verdict, field.name).copy() for field in fields(found.verdict)}
+    arrays["reason"][rows], arrays["structure"][rows], arrays["amount"][rows] = reason.value, structure, amount
+    return replace(found, verdict=Verdict(**arrays))

@@ -11,16 +11,17 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.chances.limited import limited
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
+from puncture_twin.planning.uncertainty.refined_chances import refined_chances
 
 BEST = 200
 """Of the ranked candidates: how many get the dearer chances."""
 
 
 def with_refined(found: Candidates, model: ChanceModel, rows: Ints, wanted: Bools | None = None) -> Candidates:
-    """Refine some rows; ``wanted`` as in `ChanceModel.refined`."""
+    """Refine some rows; ``wanted`` as in `refined_chances`."""
     chances = found.chances
     assert chances is not None
-    better = model.refined(found.outward_ct[rows], found.arm.q_insertion[rows], chances.at(rows), wanted)
+    better = refined_chances(model, found.outward_ct[rows], found.arm.q_insertion[rows], chances.at(rows), wanted)
     return replace(found, chances=chances.put(rows, better))
 
 
