@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,21 +233,16 @@ def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
     """A target must lie inside the skin and its own structure, and inside nothing that is to be avoided."""
     low, high = (np.array([structure.mesh.bounds[end] for structure in structures]) for end in (0, 1))
     in_box = np.all((low <= case.target_ct) & (case.target_ct <= high), axis=1)
-    point = point_text(case.target_ct, case.space)
     if side_of(skin.mesh, case.target_ct) is Side.OUTSIDE:
         hint = readings_inside(case.target_ct, case.space, partial(_holds, skin.mesh))
-        what = f"target ({point}) lies outside the skin{hint}"
-        raise InputError(what, where=case.path, allowed="a point in the body, in mm, in the case's space")
+        _refuse_target(case, f"outside the skin{hint}", "a point in the body, in mm, in the case's space")
     for structure, near in zip(structures, in_box, strict=True):
         if structure.name != case.target_structure and not near:
             continue
         side = side_of(structure.mesh, case.target_ct)
         if structure.role is Role.AVOID and side is Side.INSIDE:
-            raise InputError(
-                f"target ({point}) lies inside '{structure.name}', which is to be avoided",
-                where=case.path,
-                allowed="a target outside every 'avoid' structure",
-            )
+            what = f"inside '{structure.name}', which is to be avoided"
+            _refuse_target(case, what, "a target outside every 'avoid' structure")
         if structure.name != case.target_structure:
             continue
         if structure.role is not Role.TARGET:
@@ -257,11 +253,13 @@ def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
             )
         if side is Side.OUTSIDE and (gap := surface_distance(structure.mesh, case.target_ct)) > ON_SURFACE_MM:
             hint = readings_inside(case.target_ct, case.space, partial(_holds, structure.mesh), "inside")
-            raise InputError(
-                f"target ({point}) lies {gap:.1f} mm outside its structure '{structure.name}'{hint}",
-                where=case.path,
-                allowed="a point inside target.structure",
-            )
+            what = f"{gap:.1f} mm outside its structure '{structure.name}'{hint}"
+            _refuse_target(case, what, "a point inside target.structure")
+
+
+def _refuse_target(case: Case, lies: str, allowed: str) -> NoReturn:
+    what = f"target ({point_text(case.target_ct, case.space)}) lies {lies}"
+    raise InputError(what, where=case.path, allowed=allowed)
 
 
 def _holds(mesh: TriangleMesh, point_ct: Floats) -> bool:

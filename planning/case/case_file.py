@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BeforeValidator, Field, Strict, model_validator
+from pydantic import Field, Strict, model_validator
 
 from puncture_twin.planning.base.text_names import unprintable_texts
 from puncture_twin.planning.case.sections.tool_section import ToolSection
@@ -30,7 +30,7 @@ from puncture_twin.planning.case.tables.structures_section import (
 )
 from puncture_twin.planning.case.tables.surroundings_section import GantrySection, ObstacleSection
 from puncture_twin.planning.case.tables.target_section import TargetSection
-from puncture_twin.planning.case.toml_types import Name, Section, Text
+from puncture_twin.planning.case.toml_types import CaseSchema, Name, Section, Text
 
 COUNT_KEY = "structures = N"
 """The name under which the count at the top reaches the model: TOML knows ``structures`` as an array of tables too."""
@@ -73,16 +73,6 @@ def count_difference(stated: int, found: int) -> str:
     if stated == found:
         return ""
     return f"structures = {stated} is stated, and the case has {found}, the skin among them; was the file cut?"
-
-
-def _known(value: object) -> object:
-    if isinstance(value, bool) or value not in (1, 2):
-        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1 and schema = 2")
-    return value
-
-
-CaseSchema = Annotated[int, BeforeValidator(_known)]
-"""The key ``schema``: 1 or 2."""
 
 
 class EndSection(Section):

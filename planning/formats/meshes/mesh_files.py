@@ -93,8 +93,9 @@ def parse_mesh(
     name = str(path)
     reader = _reader(path)
     with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite or NaN here, the guard refuses
+        in_text = _stated_space(data)
         raw = reader(data, name)
-        stated = raw.space or _stated_space(data)
+        stated = raw.space or in_text
         actual = space if stated is None else _actual_space(stated, space, default=space_is_default, where=name)
         vertices = to_lps(raw.vertices, actual) * (unit.mm if stretch is None else unit.mm * stretch)
     return guard_mesh(vertices, raw.faces, where=name)
