@@ -102,14 +102,14 @@ class CellChecker:
             check_hanging(tool.body, self._bodies)
         self.swept = SweptBodies.of(model, tool)
         self.boxes = tuple(boxes)
-        self._boxes = _boxes(boxes, {PATIENT, *(body.name for body in self._bodies)})
-        self._bounds = {box.name: box.bounds for box in boxes}
         self._surface = patient if patient is None or outside is None else joined([patient, outside])
         self._patient = None if patient is None else FclPatient.of(patient, outside)
+        self._boxes = _boxes(boxes, {PATIENT, *(body.name for body in self._bodies)})
+        self._bounds = {box.name: box.bounds for box in boxes}
+        self._checks = (*self._workcell_checks(), *self._self_checks())
         if patient is not None and self._surface is not None and self._patient is not None:
             self._bounds[PATIENT] = self._surface.bounds
             refuse_base_in(model, self._bodies[0], self._patient, patient, outside)
-        self._checks = tuple(self._workcell_checks()) + tuple(self._self_checks())
 
     @property
     def patient_closed(self) -> bool:

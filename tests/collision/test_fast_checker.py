@@ -18,14 +18,14 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.prisms import inscribed_prism, prism
+from puncture_twin.planning.collision.bodies.prisms import prism
 from puncture_twin.planning.collision.bodies.shapes import convex
 from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
 from puncture_twin.planning.collision.kernels.surfaces import ROUGH, STACK, to_surface
-from puncture_twin.planning.collision.packed.hulls import coarse_hull, neighbours
+from puncture_twin.planning.collision.packed.hulls import coarse_hull, inscribed_prism, neighbours
 from puncture_twin.planning.collision.packed.skin import TriangleTree
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh

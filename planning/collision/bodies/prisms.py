@@ -1,4 +1,4 @@
-"""Prisms about cylinders and within them."""
+"""Prisms about cylinders."""
 
 from __future__ import annotations
 
@@ -6,9 +6,6 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies.sphere_tree import SLACK_MM
-
-INSIDE = 1e-5
-"""By this fraction a prism within a cylinder is smaller still: more than the slack of any cylinder of 1 mm or more."""
 
 PRISM_SIDES = 24
 """Of the prism about a cylinder: 0.9 % fuller than it."""
@@ -31,9 +28,3 @@ def finer_prism(corners: Floats) -> Floats:
     """Corners of a prism of ``FINE_SIDES`` about the cylinder that :func:`prism` gave these corners about, as there."""
     radius_mm = float(np.hypot(corners[:, 0], corners[:, 1]).max()) * np.cos(2.0 * np.pi / len(corners))
     return prism(radius_mm, float(np.ptp(corners[:, 2])), FINE_SIDES)
-
-
-def inscribed_prism(corners: Floats) -> Floats:
-    """Corners of a prism inside the cylinder that :func:`prism` gave the corners about, along z of any frame."""
-    middle, inside = corners.mean(axis=0), 1.0 - INSIDE
-    return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(2.0 * np.pi / len(corners))] + [inside]))

@@ -18,7 +18,7 @@ from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.collision.bodies.body import Body
-from puncture_twin.planning.collision.bodies.prisms import PRISM_SIDES, inscribed_prism
+from puncture_twin.planning.collision.bodies.prisms import PRISM_SIDES
 from puncture_twin.planning.collision.bodies.sphere_tree import (
     CENTRE_STEPS,
     LEAF_RADIUS_MM,
@@ -36,6 +36,9 @@ NO_BOX = -1.0
 
 ROUND = ("holder", "needle")
 """Bodies that are cylinders: their hulls are prisms about them."""
+
+INSIDE = 1e-5
+"""By this fraction a prism within a cylinder is smaller still: more than the slack of any cylinder of 1 mm or more."""
 
 Axes = tuple[Floats, Floats, Floats]
 
@@ -76,6 +79,7 @@ class PackedHulls:
     def packed(self, cache: Cache) -> tuple[Hulls, Floats, Floats]:
         """``hulls``, ``T_box_base`` and ``halves`` of :class:`ProofScene`."""
         corners, pieces = np.concatenate(self._corners), zip(self._corners, self._rounded, strict=True)
+        axes = by_axes(corners)
         inner = np.concatenate([inscribed_prism(piece) if about else piece for piece, about in pieces])
         count = len(self._boxes)
         boxes, bodies = enclosed(self._corners[:count]), self._corners[count:]
@@ -90,10 +94,14 @@ class PackedHulls:
         starts, around = row_starts([len(piece) for piece in self._corners]), np.array(self._rounded)
         few_axes, frames = (by_axes(few), row_starts(sizes)), np.array(self._frames, dtype=np.int64)
         links = (row_starts(degrees), neighbours)
-        hulls = Hulls(
-            by_axes(corners), starts, *few_axes, slack, corners, inner, around, *links, centres, radii, frames
-        )
+        hulls = Hulls(axes, starts, *few_axes, slack, corners, inner, around, *links, centres, radii, frames)
         return hulls, poses, halves
+
+
+def inscribed_prism(corners: Floats) -> Floats:
+    """Corners of a prism inside the cylinder that `prism` gave the corners about, along z of any frame."""
+    middle, inside = corners.mean(axis=0), 1.0 - INSIDE
+    return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(np.pi / PRISM_SIDES)] + [inside]))
 
 
 def row_starts(sizes: Sequence[int] | Ints) -> Ints:
@@ -109,9 +117,10 @@ def by_axes(points: Floats) -> Axes:
 
 def enclosed(hulls: Sequence[Floats]) -> Arrays:
     """Of each convex hull a sphere about it and a coarse hull: their numbers, one array each."""
-    spheres, coarse = [enclosing_sphere(corners) for corners in hulls], [coarse_hull(corners) for corners in hulls]
-    edges, first = [neighbours(corners) for corners in hulls], row_starts([len(corners) for corners in hulls])
+    coarse, edges = [coarse_hull(corners) for corners in hulls], [neighbours(corners) for corners in hulls]
+    first = row_starts([len(corners) for corners in hulls])
     rows = [hull.rows + start for hull, start in zip(edges, first[:-1], strict=True)]
+    spheres = [enclosing_sphere(corners) for corners in hulls]
     return {
         "centres": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
         "radii": np.array([sphere.radius for sphere in spheres]),
