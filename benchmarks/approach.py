@@ -28,7 +28,8 @@ from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool, home_configuration
+from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool, home_configuration
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.motion import approach
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, Approach, plan_approach

@@ -13,13 +13,11 @@ from .fast_checker import FastChecker as FastChecker
 from .patient import FclPatient as FclPatient, FclSkin as FclSkin
 from .segments import halving_order as halving_order
 from .state_checker import PATIENT as PATIENT
+from .surroundings import case_boxes as case_boxes, check_gantry as check_gantry, with_surroundings as with_surroundings
 from .workcell import (
     ARM_PADDING_MM as ARM_PADDING_MM,
-    case_boxes as case_boxes,
     case_checker as case_checker,
     case_tool as case_tool,
-    check_gantry as check_gantry,
     home_configuration as home_configuration,
     patient_surface as patient_surface,
-    with_surroundings as with_surroundings,
 )

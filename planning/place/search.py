@@ -18,13 +18,8 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.mount import mount_pose
 from puncture_twin.planning.case.tables.robot_section import MountSection
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.workcell import (
-    ARM_PADDING_MM,
-    case_boxes,
-    case_tool,
-    home_configuration,
-    outside_surface,
-)
+from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool, home_configuration, outside_surface
 from puncture_twin.planning.place.arm_spheres import Surroundings
 from puncture_twin.planning.place.directions import wanted_directions
 from puncture_twin.planning.place.estimate import Estimator, ReachEstimate

@@ -25,7 +25,8 @@ from puncture_twin.planning.clearance.cross_check import CrossChecked, cross_che
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.collision.workcell import case_checker, with_surroundings
+from puncture_twin.planning.collision.surroundings import with_surroundings
+from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.arm_reach import ArmReach

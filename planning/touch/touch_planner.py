@@ -14,7 +14,8 @@ from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.workcell import case_boxes, case_tool, outside_surface
+from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.workcell import case_tool, outside_surface
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import aim_at

@@ -27,7 +27,8 @@ from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
 from puncture_twin.planning.collision.kernels.surfaces import ROUGH, STACK, to_surface
 from puncture_twin.planning.collision.packed.hulls import coarse_hull, inscribed_prism, neighbours
 from puncture_twin.planning.collision.packed.skin import TriangleTree
-from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
+from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import to_triangle
 from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach_all

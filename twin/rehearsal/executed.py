@@ -16,7 +16,8 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.collision.workcell import case_boxes, case_tool
+from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan

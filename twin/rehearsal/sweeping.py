@@ -10,7 +10,8 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.collision.workcell import case_boxes, case_tool
+from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.sweep.sweep_plan import SweepPlan
 from puncture_twin.twin.rehearsal.executed import steps
 from puncture_twin.twin.world.client import TIME_STEP_S

@@ -12,7 +12,8 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.workcell import case_boxes, case_tool, patient_surface
+from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.workcell import case_tool, patient_surface
 from puncture_twin.planning.touch.straight_approach import ApproachCheckers
 from puncture_twin.planning.touch.touch_plan import TouchTour
 from puncture_twin.twin.plant.touch_truth import TouchTruth

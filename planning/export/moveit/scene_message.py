@@ -10,7 +10,8 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.collision.workcell import case_boxes, case_tool, patient_surface
+from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.workcell import case_tool, patient_surface
 from puncture_twin.planning.export.moveit.messages import (
     RosFrames,
     box_message,

@@ -12,7 +12,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Obstacle
-from puncture_twin.planning.collision.workcell import GANTRY, case_checker
+from puncture_twin.planning.collision.surroundings import GANTRY
+from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach

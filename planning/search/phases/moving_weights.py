@@ -12,7 +12,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.collision.workcell import OF_CASE_FILE
+from puncture_twin.planning.collision.surroundings import OF_CASE_FILE
 
 SAFE_WHEN = (
     "breathing: a safe direction is safe {when}: checked at {count} positions, and clearances between them; a needle "

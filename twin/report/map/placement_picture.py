@@ -22,7 +22,7 @@ from scipy.spatial import ConvexHull
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.case.mount import mount_pose
-from puncture_twin.planning.collision.workcell import case_boxes
+from puncture_twin.planning.collision.surroundings import case_boxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.place.mounts import Region
