@@ -34,8 +34,8 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_mesh
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.cache.array_cache import Arrays
-from puncture_twin.planning.formats.guard import fits
 from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.mesh_guard import fits
 from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply

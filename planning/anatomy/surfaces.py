@@ -13,10 +13,10 @@ import numpy as np
 from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_ct, skin_from_label
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
-from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of, segment_names
 from puncture_twin.planning.formats.labels.mask_folder import mask_label
+from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
 from puncture_twin.planning.geometry.mesh import TriangleMesh

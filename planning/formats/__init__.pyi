@@ -1,11 +1,13 @@
 from .guard import (
     MAX_COORDINATE_MM as MAX_COORDINATE_MM,
-    MAX_TRIANGLES as MAX_TRIANGLES,
     ROTATION_TOLERANCE as ROTATION_TOLERANCE,
-    fits as fits,
-    guard_mesh as guard_mesh,
     guard_points as guard_points,
     guard_transform as guard_transform,
+)
+from .mesh_guard import (
+    MAX_TRIANGLES as MAX_TRIANGLES,
+    fits as fits,
+    guard_mesh as guard_mesh,
     twice_areas as twice_areas,
 )
 from .raw_mesh import (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.guard import MAX_TRIANGLES
+from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
 from puncture_twin.planning.geometry.spaces import Space
 
 MAX_TOKEN_LENGTH = 64

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from slicer_files import vtk_model
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.guard import guard_mesh
+from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.meshes.mesh_warnings import mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
+from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply

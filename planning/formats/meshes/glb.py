@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.formats.guard import MAX_TRIANGLES
+from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
 from puncture_twin.planning.formats.meshes.glb_document import (
     TRIANGLES,
     Accessor,

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
-from puncture_twin.planning.formats.guard import twice_areas
+from puncture_twin.planning.formats.mesh_guard import twice_areas
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.guard import MAX_TRIANGLES
+from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
 from puncture_twin.planning.formats.meshes.vtk_arrays import Encoding, array_values
 from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join, refuse, triangulate
 from puncture_twin.planning.geometry.spaces import Space

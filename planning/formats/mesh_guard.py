@@ -1,0 +1,133 @@
+"""The gate for meshes before compiled code: one that passes is finite, in range, not empty and of a plausible size.
+
+Collision libraries answer "free" for a mesh with a NaN vertex, and end the process for an index out of range or an
+empty one.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, points_array, refuse
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+MIN_DIAGONAL_MM = 0.5
+"""Smallest bounding box diagonal of a structure: less than any vessel. An organ in metres is below."""
+MAX_DIAGONAL_MM = 5_000.0
+"""Largest one: a body and its table fit. A body in mm that is declared as cm or m does not."""
+MAX_TRIANGLES = 20_000_000
+"""Fifty times our finest whole body; more would only exhaust the memory (1.4 GB of corner coordinates)."""
+
+_EXTENT_ALLOWED = (
+    f"bounding box diagonal from {MIN_DIAGONAL_MM:g} to {MAX_DIAGONAL_MM:g} mm, "
+    f"coordinates within {MAX_COORDINATE_MM:g} mm"
+)
+
+
+def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> TriangleMesh:
+    """A mesh that may be trusted, or an error.
+
+    Triangles of zero area are all kept: their corners still belong to the surface, and dropping them would
+    change counts; ``mesh_files.mesh_warnings`` counts them. Only a mesh without any area is refused.
+    Vertices that no triangle uses are left out, after they were checked like the others, so that the bounds
+    are those of the surface; the order of the rest, and of the triangles, stays.
+
+    Args:
+        vertices: Shape (n, 3), mm, any frame.
+        faces: Shape (m, 3), whole numbers, indices into ``vertices``.
+        where: The file and the place in it, for the error.
+
+    Raises:
+        InputError: If it is empty, not finite, out of range, without area, or of an implausible size.
+    """
+    points = points_array(vertices, [], what="vertex", where=where)
+    indices = _index_array(faces, len(points), where=where)
+    _check_not_huge(points, where=where)
+    surface = _without_unused(points, indices)
+    _check_not_tiny(surface.points, where=where)
+    if not _any_area(surface):
+        refuse(f"none of the {len(indices)} triangles has an area", where, "at least one triangle with an area")
+    return TriangleMesh(surface.points, surface.indices)
+
+
+def fits(mesh: TriangleMesh) -> bool:
+    """Whether a mesh, mm, is no larger than one that `guard_mesh` accepts."""
+    return _diagonal(mesh.vertices) <= MAX_DIAGONAL_MM
+
+
+def twice_areas(points: NDArray[np.float64], indices: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Twice the area of each triangle, shape (m,), mm^2, for vertices (n, 3) in mm and indices (m, 3)."""
+    a, b, c = points[indices[:, 0]], points[indices[:, 1]], points[indices[:, 2]]
+    areas: NDArray[np.float64] = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return areas
+
+
+class _Surface(NamedTuple):
+    points: NDArray[np.float64]
+    indices: NDArray[np.int32]
+
+
+def _index_array(faces: ArrayLike, n_vertices: int, *, where: str | Path) -> NDArray[np.int32]:
+    allowed = f"three whole numbers from 0 to {n_vertices - 1} per triangle, 1 to {MAX_TRIANGLES} triangles"
+    try:
+        raw = np.asarray(faces)
+    except ValueError as error:  # what numpy raises for rows of different length
+        raise InputError(f"face list is ragged ({error})", where=where, allowed=allowed) from error
+    if raw.size == 0:
+        refuse("no triangle", where, allowed)
+    if raw.ndim != 2 or raw.shape[1] != 3:
+        refuse(f"face list has shape {raw.shape}", where, allowed)
+    if len(raw) > MAX_TRIANGLES:
+        refuse(f"{len(raw)} triangles", where, allowed)
+    whole = raw.dtype.kind in "iu" or (raw.dtype.kind == "f" and np.array_equal(raw, np.trunc(raw)))
+    if not whole:  # NaN differs from itself and infinity is out of range, so neither passes
+        refuse("a vertex index is not a whole number", where, allowed)
+    low, high = raw.min(), raw.max()
+    if low < 0 or high >= n_vertices:
+        bad = low if low < 0 else high
+        row = int(np.argmax((raw == bad).any(axis=1)))
+        refuse(f"triangle {row} uses vertex {bad:g}, which is out of range", where, allowed)
+    return np.ascontiguousarray(raw, dtype=np.int32)
+
+
+def _without_unused(points: NDArray[np.float64], indices: NDArray[np.int32]) -> _Surface:
+    used = np.zeros(len(points), dtype=bool)
+    used[indices.reshape(-1)] = True
+    if used.all():
+        return _Surface(points, indices)
+    renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    return _Surface(points[used], renumbered[indices])
+
+
+def _diagonal(points: NDArray[np.float64]) -> float:
+    columns = (points[:, axis] for axis in range(3))  # one by one: numpy is five times slower with axis=0
+    return float(np.linalg.norm([np.ptp(column) for column in columns]))
+
+
+def _check_not_huge(points: NDArray[np.float64], *, where: str | Path) -> None:
+    farthest = float(max(-points.min(), points.max()))
+    if farthest > MAX_COORDINATE_MM:
+        refuse(f"a coordinate lies {farthest:.6g} mm from the origin", where, _EXTENT_ALLOWED)
+    diagonal = _diagonal(points)
+    if diagonal > MAX_DIAGONAL_MM:
+        hint = "looks like mm declared as cm or m, or a stray vertex"
+        refuse(f"bounding box diagonal of {diagonal:.6g} mm: {hint}", where, _EXTENT_ALLOWED)
+
+
+def _check_not_tiny(used: NDArray[np.float64], *, where: str | Path) -> None:
+    diagonal = _diagonal(used)
+    if diagonal < MIN_DIAGONAL_MM:
+        hint = "looks like metres declared as mm" if diagonal > 0.0 else "all corners in one place"
+        refuse(f"bounding box diagonal of {diagonal:.4g} mm: {hint}", where, _EXTENT_ALLOWED)
+
+
+def _any_area(surface: _Surface) -> bool:
+    """Whether any triangle has an area: looked at in chunks, since the first nearly always answers."""
+    step = 4096
+    chunks = (surface.indices[i : i + step] for i in range(0, len(surface.indices), step))
+    return any(bool((twice_areas(surface.points, chunk) > 0.0).any()) for chunk in chunks)
