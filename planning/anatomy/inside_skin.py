@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from puncture_twin.planning.anatomy.skin import FieldOfView, Skin
+from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
+from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.geometry.crossings import settled_crossings

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_ct, skin_from_label
+from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_ct, skin_from_label
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
 from puncture_twin.planning.formats.labels.label_surface import label_mesh

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.skin import FieldOfView
+from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.certify.question import Question

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.skin import FieldOfView, Skin
+from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
+from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_mesh
+from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.geometry.crossings import NUDGE, Crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh

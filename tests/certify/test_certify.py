@@ -13,8 +13,9 @@ from scipy.optimize import nnls
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
+from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
 from puncture_twin.planning.anatomy.body.outside_body import BOX_FACES
-from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_mesh
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
-from puncture_twin.planning.anatomy.skin import FieldOfView, Skin, skin_from_mesh
+from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle, SearchSettings
