@@ -18,7 +18,8 @@ import typer
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import check_writable
-from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.twin.jobs.batch.commands import batch_app
 from puncture_twin.twin.jobs.collector import late_collection
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, exit_code_of
@@ -397,7 +398,7 @@ def pivot(
     if joints is not None:
         if any(option is not None for option in (out_dir, poses, at, seed)):
             raise InputError("touches that were read", where="pivot", allowed="JOINTS.csv alone, or the twin's options")
-        from puncture_twin.planning.case.case import load_case
+        from puncture_twin.planning.case.read_case import load_case
 
         read = pivot_case(load_case(case), joints)
         print_answer(read.summary(), pivot_text(read), as_json)
@@ -450,7 +451,7 @@ def mirror(
 ) -> None:
     """Show a running arm's needle in the CT: tip, distance to the target. Writes nothing to the robot."""
     from puncture_twin.planning.base.provenance import inputs_document
-    from puncture_twin.planning.case.case import load_case
+    from puncture_twin.planning.case.read_case import load_case
     from puncture_twin.twin.jobs.interrupt import ended_by_ctrl_c
     from puncture_twin.twin.jobs.robot.mirror import Mirror, RecordedJoints, connect, live_states, mirror_text
 

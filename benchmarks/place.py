@@ -26,7 +26,7 @@ from benchmarks.chen2019_reach import (
     our_windows,
 )
 from puncture_twin.meshes import folder
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.place.mounts import Region, Site
 from puncture_twin.planning.place.search import search_placements
 from puncture_twin.planning.registration.placement import load_placement

@@ -43,7 +43,7 @@ def load_case(path: Path | str) -> Case:
     Raises:
         InputError: One line: what is wrong, where, and what is allowed.
     """
-    from puncture_twin.planning.case.case import load_case
+    from puncture_twin.planning.case.read_case import load_case
 
     return load_case(path)
 
@@ -228,7 +228,8 @@ def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS") -> Tria
         InputError: It is cut, contradicts itself, is empty, or has coordinates that are no finite numbers.
     """
     from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
-    from puncture_twin.planning.geometry.spaces import Space, Unit
+    from puncture_twin.planning.geometry.spaces import Space
+    from puncture_twin.planning.geometry.units import Unit
 
     try:
         known = Unit(unit), Space(space)

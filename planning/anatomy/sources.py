@@ -21,7 +21,8 @@ from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, Ru
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, parse_space, parse_unit
+from puncture_twin.planning.geometry.spaces import Space, parse_space
+from puncture_twin.planning.geometry.units import parse_unit
 
 UNNAMED_SHOWN = 8
 """Labels that a warning lists; a person looks at the map for the rest."""

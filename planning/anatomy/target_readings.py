@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.spaces import Space, Unit, to_lps
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.units import Unit
 
 
 def readings_inside(

@@ -1,6 +1,6 @@
 from .angle_grid import AngleGrid as AngleGrid
 from .bed import bed_frame as bed_frame
-from .case import Case as Case, load_case as load_case
+from .case import Case as Case
 from .case_file import count_difference as count_difference
 from .entry import (
     ANATOMICAL_LPS as ANATOMICAL_LPS,
@@ -14,6 +14,7 @@ from .entry import (
 )
 from .errors import ArmUncertainty as ArmUncertainty, ErrorModel as ErrorModel
 from .mount import Axis as Axis, axes_frame as axes_frame, mount_pose as mount_pose
+from .read_case import load_case as load_case
 from .settings import Gantry as Gantry, Needle as Needle, Obstacle as Obstacle
 from .tables.place_section import MountBounds as MountBounds, MountName as MountName
 from .tables.robot_section import MountSection as MountSection

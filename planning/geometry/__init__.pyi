@@ -25,7 +25,8 @@ from .rotations import (
     log_rotation as log_rotation,
     skew as skew,
 )
-from .spaces import Space as Space, Unit as Unit, parse_space as parse_space, parse_unit as parse_unit, to_lps as to_lps
+from .spaces import Space as Space, parse_space as parse_space, to_lps as to_lps
 from .triangle_distance import farthest_from as farthest_from, squared_distance as squared_distance
+from .units import Unit as Unit, parse_unit as parse_unit
 from .voxelize import voxels_inside as voxels_inside
 from .winding import odd_fraction as odd_fraction, winding_number as winding_number

@@ -1,9 +1,9 @@
-"""In which space and unit a file speaks, and the way from there to mm and LPS.
+"""In which space a file speaks, and the way from there to LPS.
 
 Patient spaces differ in the sign of two axes: LPS counts toward the patient's left and posterior, RAS toward
 right and anterior; both count toward superior. Neither is guessed: a file states its space, or the case does.
 
-The command line reads the names of spaces and units from here, so numpy is not imported.
+The command line reads the names of spaces from here, so numpy is not imported.
 """
 
 from __future__ import annotations
@@ -23,19 +23,6 @@ class Space(StrEnum):
     LPS = "LPS"
     RAS = "RAS"
     LOCAL = "local"
-
-
-class Unit(StrEnum):
-    """A unit of length that a file may use."""
-
-    MM = "mm"
-    CM = "cm"
-    M = "m"
-
-    @property
-    def mm(self) -> float:
-        """How many millimetres one of this unit is."""
-        return {Unit.MM: 1.0, Unit.CM: 10.0, Unit.M: 1000.0}[self]
 
 
 def to_lps(points: Floats, space: Space) -> Floats:
@@ -68,14 +55,3 @@ def parse_space(text: str, *, where: str) -> Space:
         if text.strip().lower() == space.lower():
             return space
     raise InputError(f"unknown space {text!r}", where=where, allowed=", ".join(Space))
-
-
-def parse_unit(text: str, *, where: str) -> Unit:
-    """The unit of length that a text names.
-
-    Raises:
-        InputError: If it names none.
-    """
-    if text.strip() in tuple(Unit):
-        return Unit(text.strip())
-    raise InputError(f"unknown unit of length {text!r}", where=where, allowed=", ".join(Unit))

@@ -20,7 +20,8 @@ from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
-from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.init.file_masks import dicom_masks, layered_masks
 from puncture_twin.planning.init.label_files import Mask, Masks, label_file, mask_of
 from puncture_twin.planning.init.mesh_folder import is_mesh, mesh_folder

@@ -19,8 +19,9 @@ from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.case.case import Case, load_case
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.options import NO_OPTIONS, CaseOptions
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.clearance.cross_check import CrossChecked, cross_check
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine

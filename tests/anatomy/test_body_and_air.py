@@ -11,7 +11,7 @@ from puncture_twin.planning.anatomy.body.unscanned import BLANK_HU, measured_hu,
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.formats.volumes import voxels

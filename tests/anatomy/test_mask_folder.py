@@ -6,7 +6,7 @@ import SimpleITK as sitk  # noqa: N813
 from case_world import SKIN, case_text, image_of, structure, vessel_voxels, write_balls
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.search.context import prepare
 
 RULES = '{source}\ntarget = ["organ"]\n[structures.avoid]\n"vessel *" = 3.0\n'

@@ -14,7 +14,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.bed import bed_frame
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.collision.checker import CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.surroundings import case_boxes

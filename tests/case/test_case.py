@@ -8,7 +8,7 @@ import pytest
 from case_world import ORGAN, SKIN, case_text, changed
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.spaces import Space
 
 GOOD = case_text(

@@ -8,7 +8,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.whole_case import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
 from puncture_twin.planning.formats.labels.totalsegmentator import V2
 from puncture_twin.planning.search.context import prepare

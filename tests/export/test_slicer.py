@@ -11,12 +11,13 @@ from case_world import CASE, changed, registration_section, write_case
 from export.slicer_facts import MARKUP, POINT, SCHEMA, check_attributes, check_properties
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.export.slicer.entry_area import entry_area
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.points.point_files import read_points
 from puncture_twin.planning.geometry.rigid import apply, exp_twist
-from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import BEST, Choice

@@ -21,7 +21,8 @@ from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.meshes.mesh_warnings import mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit
 
 BALL = trimesh.creation.icosphere(1, 30.0)
 BALL.apply_translation([5.0, -7.0, 11.0])

@@ -7,7 +7,7 @@ import numpy as np
 from fuzz.output_sets import rewritten_set, whole_set
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.anatomy.beyond_labels import BEYOND_LABELS
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.whole_case import SCHEMA_ONE_NOTE
 from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.checks_file import read_checks
@@ -23,7 +23,8 @@ from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.meshes.mesh_warnings import mesh_warnings
 from puncture_twin.planning.formats.points.point_files import read_points
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
-from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import CacheWarning, InputError, InputListError, NoAnswerError
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.twin.jobs import second_process as module
 from puncture_twin.twin.jobs.second_process import Here, SecondProcess, second_process
 

@@ -21,8 +21,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.processes import map_all
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.bed import bed_frame
-from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.mount import mount_pose
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.arm_spheres import (

@@ -7,7 +7,7 @@ from case_world import write_case
 
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 

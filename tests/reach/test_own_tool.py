@@ -16,7 +16,7 @@ from puncture_twin.planning.arm.tool_body import SLABS, ToolBody
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.shapes import touch
 from puncture_twin.planning.collision.checker import CellChecker

@@ -13,7 +13,7 @@ from uncertainty_world import NO_ARM, declared, world
 from puncture_twin.planning.arm.error_jacobian import error_jacobian
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import differing_input
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
 from puncture_twin.planning.registration.aim import aim_at

@@ -12,7 +12,7 @@ import SimpleITK
 from registration.test_stated_transform import FLIP, POINTS, T_BASE_CT, slicer_file, stating
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.itk_hdf5 import HEAP_HEAD_BYTES
 from puncture_twin.planning.formats.itk_transform import parse_transform
 from puncture_twin.planning.geometry.rigid import apply

@@ -8,7 +8,7 @@ from case_world import CASE, changed, points_file, registration_section, write_c
 
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.tables.registration_section import other_readings
 from puncture_twin.planning.geometry.rigid import apply, inverse, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation

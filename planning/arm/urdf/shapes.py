@@ -16,7 +16,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, parse_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit
 
 ROUND_SIDES = 48
 """Of the prism about a cylinder: up to 0.2 % wider than it is (0.1 mm at a radius of 50 mm)."""

@@ -14,7 +14,8 @@ from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.toml_types import Number, Section
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.spaces import Space, parse_unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import parse_unit
 
 TOOL_ROLE = "tool mesh"
 """Of the file that decides a tool."""

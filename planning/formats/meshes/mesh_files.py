@@ -28,7 +28,8 @@ from puncture_twin.planning.formats.meshes.vtk_legacy import read_vtk
 from puncture_twin.planning.formats.meshes.vtp import read_vtp
 from puncture_twin.planning.formats.raw_mesh import RawMesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, Unit, to_lps
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.units import Unit
 
 MAX_FILE_BYTES = 2_000_000_000
 """Twenty million triangles of binary STL are 1 GB; a file beyond twice that is refused before it is read."""

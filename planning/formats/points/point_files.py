@@ -23,7 +23,8 @@ from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.points.points_csv import read_csv_points
 from puncture_twin.planning.formats.points.points_slicer import read_fcsv_points, read_markups_points
 from puncture_twin.planning.formats.points.raw_points import RawPoints
-from puncture_twin.planning.geometry.spaces import Space, Unit, to_lps
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.units import Unit
 
 MAX_FILE_BYTES = 10_000_000
 """A hundred thousand points; a larger file is no list of markers."""

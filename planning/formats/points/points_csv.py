@@ -12,7 +12,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import decode_text
 from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_coordinate
 from puncture_twin.planning.formats.raw_mesh import refuse
-from puncture_twin.planning.geometry.spaces import Unit, parse_unit
+from puncture_twin.planning.geometry.units import Unit, parse_unit
 
 _ALLOWED = (
     "a header name,x_mm,y_mm,z_mm (or _cm, _m; kind, and q1_deg to q6_deg, may be added), "

@@ -14,7 +14,8 @@ from puncture_twin.planning.base.input_file import decode_text
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_coordinate
 from puncture_twin.planning.formats.raw_mesh import refuse
-from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit, parse_unit
 
 _MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, defined control points"
 _LINE_POINTS = 2

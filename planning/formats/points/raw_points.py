@@ -6,7 +6,8 @@ import math
 from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit
 
 
 class RawPoints(NamedTuple):

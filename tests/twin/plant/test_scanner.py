@@ -10,13 +10,14 @@ import trimesh
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.twin.plant.scanner.case_scene import scan_frame
 from puncture_twin.twin.plant.scanner.coverage import cut_solids
 from puncture_twin.twin.plant.scanner.image import HIGHEST_HU, ScanSettings, scan_solids

@@ -19,7 +19,8 @@ from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.points import point_files as points
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, Unit
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.twin.guidance.stereo.declared_errors import (
     ServoErrors,

@@ -18,7 +18,8 @@ from puncture_twin.planning.base.errors import InputError, InputListError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.case.case import Case, load_case
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
