@@ -16,6 +16,7 @@ from itertools import combinations, product
 import fcl
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import joined
 from puncture_twin.planning.arm.tool import Box, Tool
@@ -29,7 +30,7 @@ from puncture_twin.planning.collision.bodies.shapes import surface
 from puncture_twin.planning.collision.check import Check
 from puncture_twin.planning.collision.hanging import check_hanging
 from puncture_twin.planning.collision.neighbours import joined_pieces
-from puncture_twin.planning.collision.patient import FclPatient
+from puncture_twin.planning.collision.patient import FclPatient, FclSkin
 from puncture_twin.planning.collision.state_checker import (
     DISTANCE_PAIRS,
     NEEDLE_IN_PATIENT,
@@ -103,7 +104,10 @@ class CellChecker:
         self.swept = SweptBodies.of(model, tool)
         self.boxes = tuple(boxes)
         self._surface = patient if patient is None or outside is None else joined([patient, outside])
-        self._patient = None if patient is None else FclPatient.of(patient, outside)
+        self._patient = None
+        if patient is not None:
+            beside = None if outside is None else FclSkin(outside, OUTSIDE_BODY)
+            self._patient = FclPatient(FclSkin(patient, PATIENT), beside)
         self._boxes = _boxes(boxes, {PATIENT, *(body.name for body in self._bodies)})
         self._bounds = {box.name: box.bounds for box in boxes}
         self._checks = (*self._workcell_checks(), *self._self_checks())

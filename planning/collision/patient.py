@@ -8,11 +8,9 @@ from typing import NamedTuple
 import fcl
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
-from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -86,15 +84,6 @@ class FclPatient(NamedTuple):
 
     skin: FclSkin
     outside: FclSkin | None
-
-    @classmethod
-    def of(cls, skin: TriangleMesh, outside: TriangleMesh | None) -> FclPatient:
-        """Of two surfaces.
-
-        Raises:
-            InputError: See :class:`FclSkin`.
-        """
-        return cls(FclSkin(skin, PATIENT), None if outside is None else FclSkin(outside, OUTSIDE_BODY))
 
 
 def _bounds_at(solid: fcl.CollisionObject, box: Floats) -> tuple[Floats, Floats]:
