@@ -20,8 +20,8 @@ from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty
 from puncture_twin.planning.registration.fits.least_squares import fit_triad
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.placement import default_method
-from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 GATES = (None, 0.5, 0.25, 0.1)

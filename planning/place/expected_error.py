@@ -12,8 +12,8 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import Placement, default_method
-from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import Registration, register
+from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 

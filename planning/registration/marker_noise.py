@@ -14,7 +14,8 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, check_pairs
-from puncture_twin.planning.registration.reading_noise import ReadingNoise, reading_noise
+from puncture_twin.planning.registration.reading_noise import ReadingNoise
+from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.registration.touch_poses import touching_configuration
 
 MAX_JOINTS_OFF_MM = 5.0

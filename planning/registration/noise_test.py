@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtrc, chdtri, fdtri
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.registration.fit_map import least_squares_map
+from puncture_twin.planning.registration.fits.fit_map import least_squares_map
 from puncture_twin.planning.registration.residual_test import DOUBT, Interval
 
 WARNED = 0.01

@@ -23,8 +23,8 @@ from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.fits.method import Method
 from puncture_twin.planning.registration.marker_noise import marker_noise
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs
-from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import Registration, register
+from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.straight_approach import TIP_MM, ApproachCheckers, why_not
 from puncture_twin.planning.touch.touch_plan import TouchPlan

@@ -13,8 +13,8 @@ from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.reading_noise import reading_noise
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.planning.uncertainty.touch_choice import choose_touches
 from puncture_twin.twin.phantoms import torso

@@ -12,7 +12,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.reading_noise import parameter_variances
+from puncture_twin.planning.registration.touch_noise import parameter_variances
 from puncture_twin.planning.touch.touch_plan import Touch
 from puncture_twin.twin.plant.true_needle import driven_onto
 

@@ -17,7 +17,7 @@ from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.noise_test import NoiseTest
-from puncture_twin.planning.registration.reading_noise import reading_noise
+from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite

@@ -19,7 +19,7 @@ from scipy.special import fdtrc
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fit_map import carried, design
+from puncture_twin.planning.registration.fits.fit_map import carried, design
 from puncture_twin.planning.registration.registration import Registration
 
 PLANES = ((0, 1), (0, 2), (1, 2))

@@ -7,7 +7,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.registration.fit_map import design_blocks
+from puncture_twin.planning.registration.fits.fit_map import design_blocks
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 
 STEPS = 6
