@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.speed_limits import slowed
-from puncture_twin.planning.base.arrays import Ints
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.workcell import home_configuration
@@ -18,6 +18,7 @@ from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.answer import ReachAnswer
 from puncture_twin.planning.reach.goals import approach_goals
+from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
@@ -89,18 +90,13 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     goals = _within_limits(context, candidates, row, approach_goals(checker, request, home))
     approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed, speeds=speeds)
     answer = goals[approach.goal_index]
-    error = (
-        context.placement.target_error_mm
-        if context.chance is None
-        else expected_error_mm(context.chance.error, answer.insertion_q[-1])
-    )
     plan = Plan(
         case_name=case.name,
         inputs=case.inputs,
         seed=seed,
         model=case.robot.model,
         T_base_ct=context.placement.T_base_ct,
-        expected_target_error_mm=error,
+        expected_target_error_mm=_target_error_mm(context, context.placement, answer.insertion_q[-1]),
         theta=float(candidates.theta[row]),
         beta=float(candidates.beta[row]),
         entry_ct=candidates.path.entry_ct[row],
@@ -124,6 +120,11 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     if touched is not None:
         raise NoAnswerError(touched)
     return replace(plan, clearance_mm={**phase_clearances(plan, checker), **plan.clearance_mm})
+
+
+def _target_error_mm(context: CaseContext, placement: Placement, q: Floats) -> float:
+    """Expected (rms) at the target in one configuration (6,), rad: by what is declared, else by the markers alone."""
+    return placement.target_error_mm if context.chance is None else expected_error_mm(context.chance.error, q)
 
 
 def _within_limits(
