@@ -46,11 +46,8 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
     raster = map_raster(candidates, view, 2 * PIXELS)
     rows = map_raster_rows(raster.rows[::2, ::2])
     structures = sorted({*map(str, candidates.verdict.named), *candidates.clearance.structures})
-    index = {name: i for i, name in enumerate(structures)}
-    nearest, amounts = _nearest(candidates)
     front = shown_front(candidates, view)
     reasons = [str(r) for r in np.unique(candidates.verdict.reason)]
-    sentences, sentence = np.unique(candidates.verdict.detail, return_inverse=True)
     return {
         "size": PIXELS,
         "image": _png(raster.rgba),
@@ -65,6 +62,27 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
         "arm": candidates.arm_note,
         "codes": [r or "safe" for r in reasons],
         "details": [DETAIL_UNITS.get(reason_of(r), ("", "")) for r in reasons],
+        **_directions(candidates, structures, reasons),
+        "outcome": "plan" if candidates.arm_checked else "check",
+        "file": _typed(case.path),
+        "picked": -1 if pick is None or pick.candidates is not candidates else pick.row,
+        "best": [window.best for window in windows.windows[:MOST_WINDOWS]],
+        "window": windows.of_row.tolist(),
+        "safe_cone": _rounded(np.degrees(candidates.safe_cone), 1),
+        "chosen": None if pick is None else pick.candidates.at(pick.row),
+        "pareto": front.rows.tolist(),
+        "front": front.text,
+        "not_seen": NOT_SEEN,
+        **_chances(candidates),
+    }
+
+
+def _directions(candidates: Candidates, structures: list[str], reasons: list[str]) -> dict[str, Any]:
+    """What is said of each direction, a list a column; structures, reasons and sentences by their places."""
+    index = {name: i for i, name in enumerate(structures)}
+    nearest, amounts = _nearest(candidates)
+    sentences, sentence = np.unique(candidates.verdict.detail, return_inverse=True)
+    return {
         "theta": _rounded(np.degrees(candidates.theta), 3),
         "beta": _rounded(np.degrees(candidates.beta), 3),
         "reason": [reasons.index(str(r)) for r in candidates.verdict.reason],
@@ -80,17 +98,6 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, 
         "rank": candidates.ranking.rank.tolist(),
         "reachable": candidates.arm.reachable.tolist(),
         "outward": _rounded(candidates.outward_ct.ravel(), 5),
-        "outcome": "plan" if candidates.arm_checked else "check",
-        "file": _typed(case.path),
-        "picked": -1 if pick is None or pick.candidates is not candidates else pick.row,
-        "best": [window.best for window in windows.windows[:MOST_WINDOWS]],
-        "window": windows.of_row.tolist(),
-        "safe_cone": _rounded(np.degrees(candidates.safe_cone), 1),
-        "chosen": None if pick is None else pick.candidates.at(pick.row),
-        "pareto": front.rows.tolist(),
-        "front": front.text,
-        "not_seen": NOT_SEEN,
-        **_chances(candidates),
     }
 
 
