@@ -22,7 +22,7 @@ from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, parse_space
-from puncture_twin.planning.geometry.units import parse_unit
+from puncture_twin.planning.geometry.units import Unit, parse_unit
 
 UNNAMED_SHOWN = 8
 """Labels that a warning lists; a person looks at the map for the rest."""
@@ -170,12 +170,16 @@ class StructureSources:
         if section.mesh is None or section.unit is None:
             raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
         file, by_default = self._file(section.mesh), section.space is None
-        space = parse_space(section.space or self._case.space, where=where)
+        space = parse_space(section.space, where=where) if section.space else self._case.space
         unit = parse_unit(section.unit, where=where)
         key = (__name__, self._case.files.sha256(section.mesh), file.suffix.lower(), unit, space, by_default)
-        parsed = partial(parse_mesh, path=file, unit=unit, space=space, space_is_default=by_default)
-        content = partial(self._case.files.content, section.mesh)
-        return self._cache.memory.get(key, lambda: parsed(content()), lambda mesh: mesh.nbytes)
+        return self._cache.memory.get(
+            key, partial(self._parsed, section.mesh, unit, space, by_default), lambda mesh: mesh.nbytes
+        )
+
+    def _parsed(self, name: str, unit: Unit, space: Space, by_default: bool) -> TriangleMesh:
+        content = self._case.files.content(name)
+        return parse_mesh(content, self._file(name), unit=unit, space=space, space_is_default=by_default)
 
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:
