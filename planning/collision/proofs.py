@@ -71,13 +71,15 @@ class Proofs:
         skin_triangles: int,
         cache: Cache,
     ) -> None:
+        beside_skin = [check.second_body for check in checks if check.hulls is None]
+        finer = {body.name: finer_prism(body.full.hulls[0]) for body in beside_skin if body.name in ROUND}
         hulls, rows = PackedHulls(boxes), []
-        roots, spheres = packed_trees([check.second_body for check in checks if check.hulls is None], cache)
+        roots, spheres = packed_trees(beside_skin, cache)
         for check in checks:
             frame = check.second_body.frame
             if check.hulls is None:
                 body = check.second_body
-                about = hulls.add(finer_prism(body.full.hulls[0]), body) if body.name in ROUND else -1
+                about = hulls.add(finer[body.name], body) if body.name in finer else -1
                 row = (proof_kernels.SKIN, about, roots[body.name], WORKCELL_FRAME, frame)
             elif check.first_body is None:
                 second = hulls.add(check.hulls[1], check.second_body)
