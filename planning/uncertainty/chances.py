@@ -46,11 +46,6 @@ class Chances:
         wide = [np.full((count, len(structures)), np.nan) for _ in range(2)]
         return cls(structures, blank[0], wide[0], wide[1], *blank[1:])
 
-    def at(self, rows: Ints) -> Chances:
-        """Of some candidates."""
-        values = {field.name: getattr(self, field.name)[rows] for field in fields(self) if field.name != "structures"}
-        return Chances(self.structures, **values)
-
     def put(self, rows: Ints, known: Chances) -> Chances:
         """With those of some candidates replaced."""
         values = {field.name: getattr(self, field.name).copy() for field in fields(self) if field.name != "structures"}

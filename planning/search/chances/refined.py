@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.chances.limited import limited
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
+from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.refined_chances import refined_chances
 
 BEST = 200
@@ -21,8 +22,16 @@ def with_refined(found: Candidates, model: ChanceModel, rows: Ints, wanted: Bool
     """Refine some rows; ``wanted`` as in `refined_chances`."""
     chances = found.chances
     assert chances is not None
-    better = refined_chances(model, found.outward_ct[rows], found.arm.q_insertion[rows], chances.at(rows), wanted)
+    better = refined_chances(
+        model, found.outward_ct[rows], found.arm.q_insertion[rows], _of_rows(chances, rows), wanted
+    )
     return replace(found, chances=chances.put(rows, better))
+
+
+def _of_rows(chances: Chances, rows: Ints) -> Chances:
+    """Of some candidates."""
+    names = [field.name for field in fields(chances) if field.name != "structures"]
+    return Chances(chances.structures, **{name: getattr(chances, name)[rows] for name in names})
 
 
 def with_best_refined(found: Candidates, model: ChanceModel | None) -> Candidates:
