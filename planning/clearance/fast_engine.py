@@ -43,7 +43,7 @@ class FastEngine:
 
     Args:
         meshes: The k surfaces, in the CT frame, mm.
-        progress: Called with (structures done x directions, directions x structures).
+        progress: Called with (structures done in all directions, structures).
         memory: Where packed surfaces are kept.
         threads: At most so many structures are searched side by side, and one a core; each is searched by itself, so
             the answer is the same to the bit.
@@ -91,7 +91,7 @@ class FastEngine:
         threads = self._threads if np.prod(shape) >= WORTH_THREADS else 1
         for done in on_threads(lambda k: measure_structure(target, tiles, *pieces[k]), len(pieces), threads):
             if shown and self._progress is not None:
-                self._progress(done * len(outward), len(self._blocks) * len(outward))
+                self._progress(done, len(pieces))
         self.counts += counts.sum(axis=0)
         return AxisDistances(distance.T, depth.T, nearest.T)
 

@@ -148,12 +148,12 @@ def search_placements(
         for region in regions(case, T_ct_bed)
         for x, y, z in region.lattice(case.place.step_mm)
     ]
-    estimates = map_all(coarse.estimate, sites, jobs=jobs, progress=partial(progress, "placements"))
+    estimates = map_all(coarse.estimate, sites, jobs=jobs, progress=partial(progress, "placements estimated"))
     first = tuple(zip(sites, estimates, strict=True))
     seeds = [site for site, _ in _best_apart(first, 1.5 * case.place.step_mm, SEEDS)]
-    refiner = _Refiner(fine, partial(progress, "refining"))
+    refiner = _Refiner(fine, partial(progress, "placements refined"))
     finalists = _best_apart(refiner.refine(seeds, case.place.step_mm), case.place.step_mm / 2, FINALISTS)
-    rated, own = _checked(case, check, T_ct_bed, finalists, placement, jobs, partial(progress, "checked"))
+    rated, own = _checked(case, check, T_ct_bed, finalists, placement, jobs, partial(progress, "placements checked"))
     return PlaceSearch(T_ct_bed, first, refiner.estimated, float(startable.weight.sum()), rated, own)
 
 

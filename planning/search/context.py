@@ -46,6 +46,9 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
 
+COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
+"""What each of them counts while it measures."""
+
 NO_BASE = "the case does not say where the robot's base is"
 ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]; or a check without the arm"
 
@@ -92,7 +95,7 @@ class CaseContext:
                 self.case.directions(),
                 reach=self.reach,
                 chance=self.chance,
-                progress=partial(self.watcher.count, "arm"),
+                progress=partial(self.watcher.count, "directions of the arm"),
             )
         return replace(found, arm_note=self.arm)
 
@@ -218,7 +221,7 @@ def prepare(
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
         kept = {"memory": memory} if engine == "fast" else {}
-        measurer = ENGINES[engine](meshes, partial(watcher.count, "directions"), **kept)
+        measurer = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **kept)
         reach = None
         if arm is not False and placement is not None:
             reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, memory), placement.T_base_ct)

@@ -1,12 +1,14 @@
 """The stopwatch: names, sums, and whoever is told."""
 
 import io
-import itertools
+import shutil
 
 import pytest
 
-from puncture_twin.planning.base.progress import Stages
-from puncture_twin.twin.report.progress import LineDisplay, rate_text
+from puncture_twin.meshes import folder
+from puncture_twin.planning.base.progress import Silent, Stages
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, rate_text
 
 
 def test_stages_are_announced_when_they_begin_and_added_up():
@@ -31,12 +33,86 @@ def test_a_rate_has_the_unit_in_which_it_says_something(per_second, text):
     assert rate_text(per_second) == text
 
 
-def test_there_is_no_rate_without_time_behind_it(monkeypatch):
-    """The first report starts the clock; what was done before it counts for nothing; failures are told."""
-    stream, now = io.StringIO(), itertools.count(0, 10)
-    monkeypatch.setattr("puncture_twin.twin.report.progress.LINE_EVERY_S", 5.0)
-    monkeypatch.setattr("puncture_twin.twin.report.progress.time.monotonic", lambda: float(next(now)))
+@pytest.fixture
+def now(monkeypatch):
+    """The clock of the displays, s: a list of one number, set by the test."""
+    clock = [0.0]
+    monkeypatch.setattr("puncture_twin.twin.report.progress.LINE_EVERY_S", 0.0)
+    monkeypatch.setattr("puncture_twin.twin.report.progress.time.monotonic", lambda: clock[0])
+    return clock
+
+
+def counted(now, *reports):
+    """The lines that a log gets of reports: (second, stage, done, total, failed)."""
+    stream = io.StringIO()
     with LineDisplay(stream) as display:
-        display.count("cases", 4, 10)
-        display.count("cases", 5, 10, 2)
-    assert stream.getvalue().splitlines() == ["cases: 4/10", "cases: 5/10, 2 failed, 1/min, 4 min left"]
+        for now[0], stage, done, total, failed in reports:
+            display.count(stage, done, total, failed)
+    return stream.getvalue().splitlines()
+
+
+def test_there_is_no_rate_without_time_behind_it(now):
+    """The first report starts the clock; what was done before it counts for nothing; failures are told."""
+    lines = counted(now, (0, "cases", 4, 10, 0), (0.001, "cases", 5, 10, 0), (50, "cases", 5, 10, 2))
+    assert lines == ["cases: 4/10", "cases: 5/10", "cases: 5/10, 2 failed, 1/min, 4 min left"]
+
+
+def test_a_stage_that_begins_anew_has_its_own_clock(now):
+    """Another total, or fewer done than before: the time and the work of the round before say nothing of this one."""
+    first, second = (0, "directions", 0, 9000, 0), (10, "directions", 9000, 9000, 0)
+    assert counted(now, first, second)[-1] == "directions: 9,000/9,000, 900/s, 0 s left"
+    assert counted(now, first, second, (11, "directions", 10, 9000, 0))[-1] == "directions: 10/9,000"
+    again = (11, "directions", 0, 20, 0), (21, "directions", 10, 20, 0)
+    assert counted(now, first, second, *again)[-1] == "directions: 10/20, 1/s, 10 s left"
+
+
+def test_bars_say_what_lines_say(now):
+    """Also there a rate has time behind it: of 9,000 done in a microsecond nobody knows how fast they go on."""
+    stream = io.StringIO()
+    stream.isatty = lambda: True
+    with BarDisplay(stream) as display:
+        display.count("directions", 0, 9000)
+        now[0] = 1e-6
+        display.count("directions", 5000, 9000)
+        shown = display._bars.tasks[0].fields["far"]
+        now[0] = 10.0
+        display.count("directions", 6000, 9000)
+        assert (shown, display._bars.tasks[0].fields["far"]) == ("5,000/9,000", "6,000/9,000, 600/s, 5 s left")
+        display.step("stage", "film")
+        display.step("stage", "case")
+        assert [task.fields["far"] for task in display._bars.tasks][1:] == [""]
+        assert display._bars.tasks[1].description == "stage: case"
+
+
+def test_a_stage_that_cannot_count_says_what_it_usually_takes(now):
+    """A film is waited for; what depends on the case promises nothing."""
+    stream = io.StringIO()
+    with LineDisplay(stream) as display:
+        display.step("stage", "film")
+        display.step("stage", "search")
+    assert stream.getvalue().splitlines() == ["stage: film, usually 3 s", "stage: search"]
+
+
+@pytest.mark.parametrize(("engine", "most"), [("fast", {"structures"}), ("fcl", {"directions"})])
+def test_an_engine_counts_what_a_person_counts(engine, most, tmp_path):
+    """Structures or directions, never one times the other; of the arm no more directions than there are."""
+
+    class Heard(Silent):
+        def __init__(self):
+            self.totals = {}
+
+        def count(self, stage, done, total, failed=0):
+            assert 0 < done <= total
+            self.totals.setdefault(stage, set()).add(total)
+
+    heard = Heard()
+    case = tmp_path / "carton" / "case_m.toml"
+    shutil.copytree(folder() / "carton", case.parent)
+    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 15.0"))
+    context = prepare(case, engine=engine, watcher=heard)
+    found = context.search()
+    whole = {"structures": len(context.anatomy.checked), "directions": len(found)}
+    assert {stage: totals for stage, totals in heard.totals.items() if stage in whole} == {
+        stage: {whole[stage]} for stage in most
+    }
+    assert max(heard.totals["directions of the arm"]) <= len(found)

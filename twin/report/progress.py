@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Self, TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 LINE_EVERY_S = 5.0
 """In a log one line in this time says enough."""
@@ -22,6 +22,9 @@ def progress_display(stream: TextIO | None = None) -> BarDisplay | LineDisplay:
 
 LEAST_TIME_S = 0.5
 """Of a rate: with less behind it, it says nothing."""
+
+USUALLY_S = {"map": 1.0, "scene": 1.0, "slices": 1.0, "page": 1.0, "rehearsal": 2.0, "film": 3.0}
+"""Stages that take about as long for every case, on two cores; others count, or depend on what there is to read."""
 
 
 def rate_text(per_second: float) -> str:
@@ -39,14 +42,33 @@ def duration_text(seconds: float) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
+class _Pace:
+    """How fast a stage is, since its first count, or since it began anew."""
+
+    def __init__(self) -> None:
+        self._since: dict[str, tuple[float, int, int]] = {}
+        self._last: dict[str, int] = {}
+
+    def text(self, stage: str, done: int, total: int, failed: int) -> str:
+        """How many are done of how many, how many of them failed; rate and time left, with time behind them."""
+        began, first, of = self._since.get(stage, (0.0, 0, -1))
+        if of != total or done < self._last[stage]:
+            began, first = time.monotonic(), done
+            self._since[stage] = began, first, total
+        self._last[stage] = done
+        failures = f", {failed} failed" if failed else ""
+        return f"{done:,}/{total:,}{failures}{_rate_text(done - first, time.monotonic() - began, total - done)}"
+
+
 def _rate_text(done: int, seconds: float, left: int) -> str:
     if done <= 0 or seconds < LEAST_TIME_S:
         return ""
     return f", {rate_text(done / seconds)}, {duration_text(left * seconds / done)} left"
 
 
-def _failed_text(failed: int) -> str:
-    return f", {failed} failed" if failed else ""
+def _step_text(what: str) -> str:
+    """A thing that a stage has come to, with what it usually takes where no count tells how far it is."""
+    return f"{what}, usually {duration_text(USUALLY_S[what])}" if what in USUALLY_S else what
 
 
 class LineDisplay:
@@ -54,7 +76,7 @@ class LineDisplay:
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        self._started: dict[str, tuple[float, int]] = {}
+        self._pace = _Pace()
         self._last = time.monotonic()
 
     def __enter__(self) -> Self:
@@ -67,13 +89,11 @@ class LineDisplay:
 
     def step(self, stage: str, what: str) -> None:
         """Name what a stage is at."""
-        self._write(f"{stage}: {what}")
+        self._write(f"{stage}: {_step_text(what)}")
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
         """Say how far a stage is, its rate, and how long it still takes, as soon as there is time behind a rate."""
-        since = self._started.setdefault(stage, (time.monotonic(), done))
-        spent, more = time.monotonic() - since[0], done - since[1]
-        self._write(f"{stage}: {done}/{total}{_failed_text(failed)}{_rate_text(more, spent, total - done)}")
+        self._write(f"{stage}: {self._pace.text(stage, done, total, failed)}")
 
     def note(self, line: str) -> None:
         """Write a line now: it is said once."""
@@ -94,13 +114,12 @@ class BarDisplay:
         self._bars = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[far]}"),
             console=Console(file=stream),
             transient=True,
         )
         self._tasks: dict[str, TaskID] = {}
+        self._pace = _Pace()
 
     def __enter__(self) -> Self:
         self._bars.start()
@@ -113,14 +132,12 @@ class BarDisplay:
 
     def step(self, stage: str, what: str) -> None:
         """Name what a stage is at."""
-        self._bars.update(self._task(stage, None), advance=1, description=f"{stage}: {what}")
+        self._bars.update(self._task(stage, None), advance=1, description=f"{stage}: {_step_text(what)}")
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
         """Show how far a stage is."""
-        task = self._task(stage, total)
-        speed = self._bars.tasks[task].speed
-        rate = ("" if speed is None else rate_text(speed)) + _failed_text(failed)
-        self._bars.update(task, completed=done, total=total, rate=rate)
+        far = self._pace.text(stage, done, total, failed)
+        self._bars.update(self._task(stage, total), completed=done, total=total, far=far)
 
     def note(self, line: str) -> None:
         """Write a line above the bars."""
@@ -128,5 +145,5 @@ class BarDisplay:
 
     def _task(self, stage: str, total: int | None) -> TaskID:
         if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(stage, total=total, rate="")
+            self._tasks[stage] = self._bars.add_task(stage, total=total, far="")
         return self._tasks[stage]
