@@ -21,7 +21,7 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import joined
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.base_place import refuse_base_in
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
@@ -142,8 +142,10 @@ class CellChecker:
                 return contact
         return None
 
-    def contacts(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact | None]:
-        """:meth:`contact` of many states by themselves, shape (n, 6), rad.
+    def contacts(
+        self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
+    ) -> list[Contact | None]:
+        """:meth:`contact` of many states by themselves, shape (n, 6), rad; what is known of them is checked again.
 
         Raises:
             InputError: If a state is not finite.

@@ -11,12 +11,13 @@ from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.collision.checker import NEEDLE_IN_PATIENT, CellChecker, Contact, FirstContact
 from puncture_twin.planning.collision.kernels.segment_parts import Room, segment_room
 from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES_OUTSIDE
 from puncture_twin.planning.collision.never_touching import without_neighbours
+from puncture_twin.planning.collision.packed.hulls import ROUND
 from puncture_twin.planning.collision.proofs import Motion, Proofs
 from puncture_twin.planning.collision.segments import SegmentChecker
 from puncture_twin.planning.collision.state_checker import PATIENT, require_finite
@@ -61,6 +62,7 @@ class FastChecker(CellChecker):
         self._tested = without_neighbours(model, self._checks, self._proofs, cache)
         self._still = (np.zeros((1, 7)), np.zeros((1, 6)))
         needle = np.array([check.contact == NEEDLE_IN_PATIENT for check in self._tested])
+        self._round = np.array([check.first_body is None and check.contact.body in ROUND for check in self._tested])
         self._masks = {False: np.ones_like(needle), True: ~needle}
         self._padding_mm = padding_mm
 
@@ -69,14 +71,19 @@ class FastChecker(CellChecker):
         first = self.first_contact(np.asarray(q)[None], needle_may_touch_patient=needle_may_touch_patient)
         return None if first is None else first.contact
 
-    def contacts(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact | None]:
-        """See :meth:`CellChecker.contacts`."""
+    def contacts(
+        self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
+    ) -> list[Contact | None]:
+        """See :meth:`StateChecker.contacts`."""
         states = np.asarray(q, dtype=np.float64).reshape(-1, 6)
         require_finite(states)
         frames, mask = link_poses(self.model, states), self._masks[needle_may_touch_patient]
+        tested, known = np.stack([mask, mask & ~self._round]), np.zeros(len(states), np.int64)
+        if round_clear is not None:
+            known[round_clear] = 1
         found: list[Contact | None] = [None] * len(states)
         begins = np.zeros(len(states), dtype=np.int64)
-        while (left := self._proofs.first_not_clear(frames, begins, mask)).checks.max(initial=-1) >= 0:
+        while (left := self._proofs.first_not_clear(frames, begins, tested, known)).checks.max(initial=-1) >= 0:
             begins = np.where(left.checks < 0, len(self._tested), left.checks + 1)
             for row in np.flatnonzero(left.checks >= 0).tolist():
                 found[row] = self._contact_of(int(left.checks[row]), int(left.answers[row]), frames[row])

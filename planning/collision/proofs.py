@@ -127,16 +127,17 @@ class Proofs:
         arguments = (self.scene, self._levers, tuple(motion), self._work, self._proven, *at, tested, clear_mm)
         return int(proof_kernels.first_unproven(*arguments))
 
-    def first_not_clear(self, frames: Floats, begins: Ints, tested: Bools) -> NotClear:
+    def first_not_clear(self, frames: Floats, begins: Ints, tested: Bools, of_state: Ints) -> NotClear:
         """Of each state by itself the first check that is not proven clear, at or after one.
 
         Args:
             frames: Shape (m, 7, 4, 4), mm.
             begins: Shape (m,): where to begin; ``len(self)`` to pass a state over.
-            tested: Shape (k,): which checks.
+            tested: Shape (t, k): which checks, in so many choices.
+            of_state: Shape (m,): which of the choices.
         """
         found = NotClear(np.empty(len(frames), np.int64), np.empty(len(frames), np.int64))
-        settled_kernels.first_not_clear(self.scene, frames, self._work, self._beside, tested, begins, *found)
+        settled_kernels.first_not_clear(self.scene, frames, self._work, self._beside, tested, of_state, begins, *found)
         return found
 
     def settled_at(self, check: int, frames: Floats) -> int:

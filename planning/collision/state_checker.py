@@ -10,7 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.body import BODY_NAMES
 from puncture_twin.planning.collision.sweep import SweptBodies
@@ -80,8 +80,13 @@ class StateChecker(Protocol):
     def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
         """The first contact found at ``q``, shape (6,), rad; None when the arm is clear."""
 
-    def contacts(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact | None]:
-        """Of each of many states (n, 6), rad, by itself what ``contact`` says."""
+    def contacts(
+        self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
+    ) -> list[Contact | None]:
+        """Of each of many states (n, 6), rad, by itself what ``contact`` says.
+
+        Where ``round_clear`` (n,) says so, holder and needle are known to touch neither patient nor boxes.
+        """
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """The first state of ``q_path`` (m, 6), rad, with a contact, and the contact; None when all are clear."""

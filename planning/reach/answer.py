@@ -38,11 +38,11 @@ class ReachRequest:
     def __post_init__(self) -> None:
         for name in ("target_base", "outward_base"):
             array = np.array(getattr(self, name), dtype=np.float64)
-            if array.shape != (3,) or not np.isfinite(array).all():
+            if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
                 raise InputError(f"{name} = {array}", where="reach request", allowed="three finite numbers")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
-        if abs(float(np.linalg.norm(self.outward_base)) - 1.0) > SAME_UNIT:
+        if abs(math.hypot(*self.outward_base.tolist()) - 1.0) > SAME_UNIT:
             raise InputError(f"outward_base = {self.outward_base}", where="reach request", allowed="a unit vector")
         for name in ("needle_length_mm", "standoff_mm"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):

@@ -88,15 +88,15 @@ def assess_reach_all(
 
 def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[ReachAnswer]:
     """Of each request; round by round the next motion of all that have no answer yet."""
-    searches = [FirstClear(found) for found in _surveyed(checker, requests, n_rolls)]
-    waiting = searches
-    while waiting := [search for search in waiting if search.next is not None]:
-        nexts = [(search.surveyed, search.next) for search in waiting if search.next is not None]
-        for search, tried in zip(waiting, tried_all(checker, nexts), strict=True):
-            search.take(tried)
+    surveys = _surveyed(checker, requests, n_rolls)
+    search = FirstClear(surveys)
+    while len((motions := search.next_motions()).rows):
+        clear = motions.round_clear
+        contacts = checker.contacts(motions.standoffs, needle_may_touch_patient=False, round_clear=clear)
+        search.take(checker, motions, contacts)
     return [
-        refusal(checker.model, search.surveyed, search.blocks) if search.answer is None else search.answer
-        for search in searches
+        refusal(checker.model, found, deepest) if answer is None else answer
+        for found, answer, deepest in zip(surveys, search.answers, search.deepest, strict=True)
     ]
 
 

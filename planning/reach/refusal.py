@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from puncture_twin.planning.arm.insertion import first_stop
 from puncture_twin.planning.arm.singularity import away_from_singularities
 from puncture_twin.planning.arm.ur import UrModel
@@ -16,17 +14,16 @@ from puncture_twin.planning.reach.trial import Blocked
 from puncture_twin.planning.reach.unreachable import why_unreachable
 
 
-def refusal(model: UrModel, found: Surveyed, blocks: Sequence[Blocked]) -> ReachAnswer:
+def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAnswer:
     """Of a request without a clear motion: what came farthest.
 
     Args:
         model: The arm.
         found: What kinematics says of the request.
-        blocks: What blocked the motions that it allows, the best margin first; empty if it allows none.
+        deepest: What blocked the motion that came farthest of those that it allows; None if it allows none.
     """
-    if not blocks:
+    if deepest is None:
         return _refusal_of_kinematics(model, found)
-    deepest = max(blocks, key=lambda block: block.depth_mm)  # the first of equals: the best margin
     if deepest.at_standoff:
         return ReachAnswer.refused(Reason.ARM_COLLISION, None, deepest.detail, deepest.contact)
     return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)

@@ -42,14 +42,19 @@ def tried_all(checker: StateChecker, motions: Sequence[tuple[Surveyed, Insertion
     found: list[ReachAnswer | Blocked] = []
     for motion, contact in zip(motions, checker.contacts(standoffs, needle_may_touch_patient=False), strict=True):
         if contact is None:
-            found.append(_tried(checker, *motion))
+            found.append(tried(checker, *motion))
         else:
-            detail = f"{contact.body} touches {contact.other} at standoff"
-            found.append(Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact))
+            found.append(blocked_at_standoff(contact))
     return found
 
 
-def _tried(checker: StateChecker, found: Surveyed, insertion: Insertion) -> ReachAnswer | Blocked:
+def blocked_at_standoff(contact: Contact) -> Blocked:
+    """What a contact at its standoff makes of a motion."""
+    detail = f"{contact.body} touches {contact.other} at standoff"
+    return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
+
+
+def tried(checker: StateChecker, found: Surveyed, insertion: Insertion) -> ReachAnswer | Blocked:
     """Check one motion for contacts, whose standoff is clear."""
     model = checker.model
     lengths = found.request.needle_length_mm, found.request.standoff_mm

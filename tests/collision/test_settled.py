@@ -9,6 +9,7 @@ import trimesh
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.collision.bodies.body import BODY_NAMES
 from puncture_twin.planning.collision.bodies.prisms import FINE_SIDES, finer_prism, prism
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
@@ -112,10 +113,24 @@ def test_contacts_are_hardly_ever_left_to_fcl() -> None:
     """At states anywhere, of two bodies of the arm that are not proven clear: nearly all surely touch."""
     fast, rng = cell(FastChecker), np.random.default_rng(6)
     assert isinstance(fast, FastChecker)
-    frames = link_poses(UR3, rng.uniform(-np.pi, np.pi, (2000, 6)))
-    found = fast._proofs.first_not_clear(frames, np.zeros(2000, np.int64), np.ones(len(fast._tested), np.bool_))
+    frames, nothing = link_poses(UR3, rng.uniform(-np.pi, np.pi, (2000, 6))), np.zeros(2000, np.int64)
+    found = fast._proofs.first_not_clear(frames, nothing, np.ones((1, len(fast._tested)), np.bool_), nothing)
     between = fast._proofs.joint_spans[found.checks, 0] > 0
     assert (found.answers[between] == OPEN).mean() < 0.02 and between.sum() > 500
+
+
+def test_holder_and_needle_that_are_known_to_be_clear_are_not_checked() -> None:
+    """Against patient and boxes, that is; the other contacts are those of FCL, and without knowledge all are."""
+    slow, fast, rng = cell(CellChecker), cell(FastChecker), np.random.default_rng(8)
+    states = AWAY + rng.normal(size=(4000, 6)) * rng.choice([0.05, 0.2, 0.6], (4000, 1))
+    expected = slow.contacts(states, needle_may_touch_patient=False)
+    of_round = [contact is not None and contact.body in ("holder", "needle") for contact in expected]
+    workcell = np.array(of_round) & np.array([c is not None and c.other not in BODY_NAMES for c in expected])
+    assert workcell.sum() > 30
+    assert fast.contacts(states, needle_may_touch_patient=False, round_clear=~workcell) == expected
+    passed_over = fast.contacts(states, needle_may_touch_patient=False, round_clear=np.ones(4000, np.bool_))
+    left = [contact for contact, gone in zip(passed_over, workcell, strict=True) if gone]
+    assert all(c is None or c.body not in ("holder", "needle") or c.other in BODY_NAMES for c in left) and None in left
 
 
 def test_only_an_origin_well_within_a_tetrahedron_is_deep() -> None:

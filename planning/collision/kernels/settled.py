@@ -235,7 +235,7 @@ def settled_at(scene, work, room, at, frames):
 
 
 @nb.njit(cache=True)
-def first_not_clear(scene, frames, work, room, tested, begins, found, answers):
+def first_not_clear(scene, frames, work, room, tested, of_state, begins, found, answers):
     """At each of some states that have nothing to do with one another, the first check that is not proven clear.
 
     Args:
@@ -243,7 +243,8 @@ def first_not_clear(scene, frames, work, room, tested, begins, found, answers):
         frames: Shape (m, 7, 4, 4), mm: the states.
         work: See :class:`ProofScratch`.
         room: See :class:`Triangle`.
-        tested: Shape (k,): which checks.
+        tested: Shape (t, k): which checks, in so many choices.
+        of_state: Shape (m,): which of the choices.
         begins: Shape (m,): the first check at each state; k to pass it over.
         found: Shape (m,), filled; -1 where all from there on is clear.
         answers: Shape (m,), filled: what the check that was found comes to; ``CLEAR`` where there is none.
@@ -253,7 +254,7 @@ def first_not_clear(scene, frames, work, room, tested, begins, found, answers):
         if begins[row] < len(scene.checks):
             place_spheres(scene.hulls, frames[row], work.spheres)
         for at in range(begins[row], len(scene.checks)):
-            if not tested[at]:
+            if not tested[of_state[row], at]:
                 continue
             gap = state_gap(scene, work, at, frames[row], MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
             if not gap > MIN_GAP_MM:
