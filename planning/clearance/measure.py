@@ -11,7 +11,7 @@ from puncture_twin.planning.anatomy.anatomy import Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.clearance.too_near import too_near
-from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.containment import holds
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def measure(
     distance, depth = axes.distance.copy(), axes.depth.copy()
     violated = np.zeros(distance.shape, bool)
     for column, structure in enumerate(structures):
-        if side_of(structure.mesh, target_ct) is Side.INSIDE:
+        if holds(structure.mesh, target_ct):
             distance[:, column] = depth[:, column] = 0.0
         if structure.demands_margin:
             limit = radius + structure.margin_mm

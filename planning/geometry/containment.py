@@ -41,6 +41,16 @@ def side_of(mesh: TriangleMesh, point: NDArray[np.float64]) -> Side:
     return Side.INSIDE if inside else Side.OUTSIDE
 
 
+def holds(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
+    """Whether a point (3,), mm, lies inside a closed surface, see :func:`side_of`; not if the surface is open.
+
+    Most points lie outside of a surface's box: of these nobody needs to know whether it is closed.
+    """
+    low, high = mesh.bounds
+    outside = bool(np.any(point < low) or np.any(point > high))
+    return not outside and side_of(mesh, point) is Side.INSIDE
+
+
 def inside_each(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which of many points (n, 3) lie inside a closed surface, shape (n,); those on an open one are not told apart.
 

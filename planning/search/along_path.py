@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.containment import holds
 from puncture_twin.planning.geometry.crossings import crossings
 
 STEP_MM = 1.0
@@ -78,7 +78,7 @@ def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depth
     if not np.any(np.all((low <= points) & (points <= high), axis=1)):
         return np.zeros(len(depths), bool)
     crossed = np.sort(crossings(structure.mesh, target_ct, outward_ct[None]).depth)
-    inside = side_of(structure.mesh, target_ct) is Side.INSIDE
+    inside = holds(structure.mesh, target_ct)
     return np.asarray((np.searchsorted(crossed, depths) % 2 == 1) != inside)
 
 

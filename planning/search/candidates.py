@@ -244,7 +244,8 @@ class Candidates(Columns):
 
     def counts(self) -> dict[str, int]:
         """How many candidates fell to which reason, most frequent first; "safe" among them."""
-        return dict(Counter(str(reason) or "safe" for reason in self.verdict.reason).most_common())
+        counted = Counter(self.verdict.reason.tolist()).most_common()
+        return {str(reason) or "safe": count for reason, count in counted}
 
     def at(self, row: int) -> dict[str, float]:
         """The angles of one row, degrees, rounded to what a person types."""

@@ -118,7 +118,8 @@ def truths(values: NDArray[np.bool_], known: Bools) -> pa.Array:
 
 
 def _texts(values: list[str]) -> pa.Array:
-    encoded = [value.encode() for value in values]
+    codes = {value: value.encode() for value in set(values)}  # few differ
+    encoded = [codes[value] for value in values]
     ends = np.cumsum([0, *map(len, encoded)], dtype=np.int32)
     return _of(pa.string(), np.ones(len(values), bool), pa.py_buffer(ends), pa.py_buffer(b"".join(encoded)))
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Role, Structure
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.containment import holds
 from puncture_twin.planning.geometry.crossings import crossings
 
 
@@ -33,7 +33,7 @@ def inside_length(structure: Structure, target_ct: Floats, outward_ct: Floats, p
     end where the path ends inside.
     """
     found = crossings(structure.mesh, target_ct, outward_ct)
-    starts_inside = side_of(structure.mesh, target_ct) is Side.INSIDE
+    starts_inside = holds(structure.mesh, target_ct)
     limit = np.nan_to_num(path_length, nan=0.0)
     number = np.arange(len(found.ray)) - found.first[found.ray]
     sign = np.where((number % 2 == 0) == starts_inside, 1.0, -1.0)

@@ -5,7 +5,7 @@ import pytest
 from oracles import ray_crossings
 
 from puncture_twin.planning.case.entry import grid
-from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.containment import Side, holds, side_of
 from puncture_twin.planning.geometry.crossings import crossings, first_crossing
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.winding import winding_number
@@ -110,6 +110,14 @@ def test_open_surfaces_have_no_side(ball):
     """Without one triangle a sphere has no inside that could be known."""
     mesh = ball(50)
     assert side_of(TriangleMesh(mesh.vertices, mesh.faces[1:]), np.zeros(3)) is Side.UNKNOWN
+
+
+def test_a_surface_holds_what_lies_inside_of_it(rng, ball):
+    """The points whose side is inside, in the box of a closed surface and beyond; an open one holds none."""
+    mesh, points = ball(50), rng.uniform(-70, 70, (200, 3))
+    inside = [side_of(mesh, point) is Side.INSIDE for point in points]
+    assert [holds(mesh, point) for point in points] == inside and 20 < sum(inside) < 180
+    assert not any(holds(TriangleMesh(mesh.vertices, mesh.faces[1:]), point) for point in points)
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.5, 0.9])

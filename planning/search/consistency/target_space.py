@@ -8,7 +8,7 @@ from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy
 from puncture_twin.planning.anatomy.likely_target import likely_target, slipped
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.containment import holds
 from puncture_twin.planning.geometry.spaces import Space, point_text, to_lps
 
 
@@ -35,5 +35,5 @@ def space_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
 def _holders(anatomy: Anatomy, point_ct: Floats) -> Iterator[str]:
     """The names of the structures that hold a point (3,), LPS mm; the target's own ball is none."""
     for structure in anatomy.structures:
-        if structure.source != OWN_TARGET and side_of(structure.mesh, point_ct) is Side.INSIDE:
+        if structure.source != OWN_TARGET and holds(structure.mesh, point_ct):
             yield structure.name
