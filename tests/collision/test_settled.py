@@ -9,14 +9,24 @@ import trimesh
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE
 from puncture_twin.planning.collision.bodies.body import BODY_NAMES
 from puncture_twin.planning.collision.bodies.prisms import FINE_SIDES, finer_prism, prism
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import deep
-from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES, TOUCHES_OUTSIDE, on_skin
+from puncture_twin.planning.collision.kernels.settled import (
+    CLEAR,
+    OPEN,
+    TOUCHES,
+    TOUCHES_OUTSIDE,
+    on_skin,
+    settled_at,
+)
+from puncture_twin.planning.collision.packed.skin import packed_skin
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import pose
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -91,6 +101,32 @@ def test_a_round_body_is_settled_as_fcl_settles_it() -> None:
         expected = TOUCHES if on_it else TOUCHES_OUTSIDE if beside else CLEAR
         assert answer in (OPEN, expected), trial
     assert min(met[CLEAR], met[TOUCHES], met[TOUCHES_OUTSIDE]) > 300 and met[OPEN] < 30, met
+
+
+def test_a_sliver_is_where_its_corners_are_whatever_its_normal_is() -> None:
+    """A needle across triangles whose corners are collinear but for rounding is never clear; a millimetre away it is.
+
+    The normal of such a triangle is rounding: its plane may pass far from two of the corners.
+    """
+    fast, rng = cell(FastChecker), np.random.default_rng(7)
+    assert isinstance(fast, FastChecker)
+    body = next(body for body in fast._bodies if body.name == "needle")
+    row = next(row for row, check in enumerate(fast._tested) if check.contact == ("needle", "patient"))
+    for trial in range(400):
+        a, b = rng.normal(size=(2, 3)) * 10.0 ** rng.uniform(0.0, 3.0)
+        middle = a + rng.uniform(0.2, 0.8) * (b - a)
+        sliver = TriangleMesh(np.stack([a, b, middle])[rng.permutation(3)], np.array([[0, 1, 2]], np.int32))
+        scene = fast._proofs.scene._replace(skin=packed_skin(sliver, 1, NO_CACHE))
+        edge = (b - a) / np.linalg.norm(b - a)
+        axis = np.cross(edge, rng.normal(size=3))
+        axis /= np.linalg.norm(axis)
+        beside = np.cross(axis, edge)
+        off = (1.0, body.full.hulls[0][:, 0].max() + 1.0)[trial % 2]
+        T = pose(np.stack([edge, beside, axis], axis=1), a + rng.uniform(0.05, 0.95) * (b - a) + off * beside)
+        frames = np.tile(np.eye(4), (7, 1, 1))
+        frames[body.frame] = T @ np.linalg.inv(body.T_frame_body)
+        answer = settled_at(scene, fast._proofs._work, fast._proofs._beside, row, frames)
+        assert (answer == CLEAR) == (trial % 2 == 1), trial
 
 
 def test_contacts_are_those_of_fcl_with_a_table_beside_the_patient() -> None:

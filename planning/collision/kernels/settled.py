@@ -28,6 +28,11 @@ DEEP_MM = 1e-3
 """Two bodies surely touch where they overlap by more: far above the rounding of these sums (1e-10 mm) and FCL's
 tolerance."""
 
+SLIVER = 1e-6
+"""Of the product of two edges over the sum of their squares: what is less has a normal that is mostly rounding, so its
+plane need not hold it. Of what is more, rounding (1e-16 of those squares) moves the plane by 1e-9 of the edges at most:
+a thousandth of ``MIN_GAP_MM`` for edges of a metre."""
+
 
 class Triangle(NamedTuple):
     """All corners of :class:`Hulls` and behind them the three of a triangle, which takes part as one more hull."""
@@ -78,13 +83,19 @@ def _far(low, high, line, reach):
 
 @nb.njit(cache=True)
 def _beyond_plane(t, line, reach):
-    """Whether a segment lies on one side of the plane of a triangle (3, 3), farther than ``reach`` from it."""
+    """Whether a segment lies on one side of the plane of a triangle (3, 3), farther than ``reach`` from it.
+
+    Never for a triangle that is a sliver: see ``SLIVER``.
+    """
     (mx, my, mz), (ux, uy, uz), half = line
     ax, ay, az = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
     bx, by, bz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    size = math.sqrt(nx * nx + ny * ny + nz * nz)
+    if not size > SLIVER * (ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz):
+        return False
     height = abs((mx - t[0, 0]) * nx + (my - t[0, 1]) * ny + (mz - t[0, 2]) * nz)
-    return height - half * abs(ux * nx + uy * ny + uz * nz) > reach * math.sqrt(nx * nx + ny * ny + nz * nz)
+    return height - half * abs(ux * nx + uy * ny + uz * nz) > reach * size
 
 
 @nb.njit(cache=True)
