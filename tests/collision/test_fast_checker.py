@@ -9,6 +9,7 @@ from pathlib import Path
 import fcl
 import numpy as np
 import pytest
+import scipy
 import trimesh
 from numba import typeof
 from places import ROOT
@@ -20,7 +21,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.prisms import prism
 from puncture_twin.planning.collision.bodies.shapes import convex
-from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
+from puncture_twin.planning.collision.bodies.sphere_tree import halves, sphere_tree
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
@@ -76,6 +77,33 @@ def test_leaf_balls_cover_every_body(name: str, padding: float) -> None:
             distances = np.linalg.norm(points[:, None] - tree.centres, axis=2) - tree.radii
             assert distances[:, tree.leaves].min(axis=1).max() <= 0.0, body.name
             assert distances[:, 0].max() <= 0.0
+
+
+@pytest.mark.parametrize(("radius_mm", "length_mm"), [(85.0, 300.0), (30.0, 400.0), (65.0, 305.0), (150.0, 151.0)])
+def test_leaf_balls_cover_a_stout_cylinder(radius_mm: float, length_mm: float) -> None:
+    """No point of its prism is left out beside a cut, however Qhull turns the prism's faces."""
+    rng = np.random.default_rng(0)
+    corners = prism(radius_mm, length_mm)
+    tree = sphere_tree([corners])
+    points = points_within(corners, 20000, rng)
+    distances = np.linalg.norm(points[:, None] - tree.centres[tree.leaves], axis=2) - tree.radii[tree.leaves]
+    assert distances.min(axis=1).max() <= 0.0
+
+
+@pytest.mark.parametrize("name", ["ur3", "ur10e"])
+def test_a_cut_crosses_every_edge_of_a_piece(name: str) -> None:
+    """Both parts hold all points where edges of the hull cross the plane between them."""
+    for body in arm_bodies(ur_model(name), TOOL, 5.0):
+        for corners in body.full.hulls:
+            axis = int(np.ptp(corners, axis=0).argmax())
+            cut = (corners[:, axis].min() + corners[:, axis].max()) / 2.0
+            below = corners[:, axis] < cut
+            faces = scipy.spatial.ConvexHull(corners).simplices
+            edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+            a, b = corners[edges[below[edges[:, 0]] != below[edges[:, 1]]].T]
+            crossings = a + ((cut - a[:, axis]) / (b[:, axis] - a[:, axis]))[:, None] * (b - a)
+            for part in halves(corners):
+                assert scipy.spatial.KDTree(part).query(crossings)[0].max() < 1e-9
 
 
 def test_every_ball_encloses_the_balls_parts_below_it() -> None:

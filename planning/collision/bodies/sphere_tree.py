@@ -91,7 +91,7 @@ def halves(corners: Floats) -> tuple[Floats, Floats]:
     faces = scipy.spatial.ConvexHull(corners).simplices
     below = corners[:, axis] < cut
     starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    crosses = below[starts] & ~below[ends]  # of the two faces at an edge one runs along it this way
+    crosses = below[starts] != below[ends]  # Qhull turns its faces either way round: each edge counts from both
     a, b = corners[starts[crosses]], corners[ends[crosses]]
     crossings = a + ((cut - a[:, axis]) / (b[:, axis] - a[:, axis]))[:, None] * (b - a)
     return np.concatenate([corners[below], crossings]), np.concatenate([corners[~below], crossings])
