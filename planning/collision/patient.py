@@ -10,7 +10,9 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.bodies.body import Body
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.collision.loose_parts import LooseParts, within
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -53,6 +55,26 @@ class FclSkin:
         low, high = _bounds_at(solid, box)
         near = np.all((self._bounds[:, 1] >= low) & (self._bounds[:, 0] <= high), axis=1)
         return any(touch(self._tree(part), solid) for part in np.flatnonzero(near).tolist())
+
+    def has_part_within(self, body: Body) -> bool:
+        """Whether a connected part of the surface lies within a link where it stands.
+
+        Of a link FCL sees the surface, which such a part does not touch. Holder and needle are solid for it.
+
+        Args:
+            body: One that :meth:`touches` has found to touch nothing.
+        """
+        if not body.hollow:
+            return False
+        small = self._loose.no_larger_than(float(np.linalg.norm(body.box[1] - body.box[0])))
+        solid = body.full.surface
+        points = (small.corners - solid.getTranslation()) @ solid.getRotation()
+        near = np.all((points >= body.box[0]) & (points <= body.box[1]), axis=1)
+        return bool(near.any()) and bool(within(points[near], body.half_spaces).any())
+
+    @cached_property
+    def _loose(self) -> LooseParts:
+        return LooseParts.of(self._mesh)
 
     @cached_property
     def _parts(self) -> list[Ints]:

@@ -7,10 +7,19 @@ import numpy as np
 import pytest
 import trimesh
 
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
+from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.links import joined
+from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.collision.checker import BODY_NAMES, CellChecker, Tool
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.loose_parts import LooseParts
 from puncture_twin.planning.collision.patient import PART_TRIANGLES, FclSkin
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation
 
 
@@ -82,3 +91,36 @@ def test_a_surface_that_fcl_would_misread_is_refused() -> None:
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, np.nan, 0.0]])
     with pytest.raises(InputError, match="not finite"):
         FclSkin(TriangleMesh(corners, np.array([[0, 1, 2]], np.int32)), "wall")
+
+
+@pytest.mark.parametrize("kind", [CellChecker, FastChecker])
+def test_a_loose_part_within_a_link_is_a_contact(kind: type[CellChecker]) -> None:
+    """A block on no surface of the arm: within any link's piece it touches that body; where nothing is, nothing."""
+    model, tool = ur_model("ur5"), Tool(250.0, 150.0, 1.2, 30.0)
+    skin, q = ball(2).transformed(pose(np.eye(3), [900.0, 0.0, 0.0])), np.array([0.4, -1.9, 1.6, -1.2, -1.5, 0.3])
+    frames, block = link_poses(model, q), trimesh.creation.box((6.0, 6.0, 6.0))
+    met = set()
+    for body in arm_bodies(model, tool, 5.0)[1:]:
+        for corners in body.full.hulls:
+            middle = apply(frames[body.frame] @ body.T_frame_body, corners.mean(axis=0))
+            loose = TriangleMesh(np.asarray(block.vertices) + middle, np.asarray(block.faces))
+            found = kind(model, tool, (), skin, outside=loose, padding_mm=5.0).contact(
+                q, needle_may_touch_patient=False
+            )
+            assert found is not None and found.other == OUTSIDE_BODY
+            met.add(found.body)
+    assert met == set(BODY_NAMES[1:]) - {"tool"}
+    beside = TriangleMesh(np.asarray(block.vertices) + [0.0, 900.0, 0.0], np.asarray(block.faces))
+    checker = kind(model, tool, (), skin, outside=beside, padding_mm=5.0)
+    assert checker.contact(q, needle_may_touch_patient=False) is None
+
+
+def test_the_loose_parts_of_a_surface_are_those_that_share_corners() -> None:
+    """Two balls of one mesh, and a corner that no face uses: two parts, each with the size of its ball."""
+    one, other = ball(1), ball(2).transformed(pose(np.eye(3), [400.0, 0.0, 0.0]))
+    both = joined(
+        [one, TriangleMesh(np.concatenate([np.full((1, 3), 1e3), other.vertices]), other.faces + np.int32(1))]
+    )
+    parts = LooseParts.of(both)
+    assert parts.sizes == pytest.approx(np.stack([np.ptp(m.vertices, axis=0) for m in (one, other)]))
+    assert (np.abs(parts.corners - [[0.0, 0.0, 0.0], [400.0, 0.0, 0.0]]).max(axis=1) <= 100.0).all()

@@ -13,6 +13,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.links import LINK_NAMES
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.collision.loose_parts import half_spaces
 
 BODY_NAMES = (*LINK_NAMES, "tool", "holder", "needle")
 """The bodies of the arm, from the base on; not every arm has a tool."""
@@ -75,6 +76,16 @@ class Body:
         """Shape (2, 3), mm: lowest and highest corner of a box about ``full``, in the frame of the shapes."""
         corners = np.concatenate(self.full.hulls)
         return np.array([corners.min(axis=0), corners.max(axis=0)])
+
+    @property
+    def hollow(self) -> bool:
+        """Whether FCL sees no more than its surface against the skin."""
+        return self.full.surface not in self.full.solids
+
+    @cached_property
+    def half_spaces(self) -> tuple[Floats, ...]:
+        """Of each piece of ``full`` the half spaces whose intersection it is, (m, 4), in the frame of the shapes."""
+        return tuple(half_spaces(corners) for corners in self.full.hulls)
 
     def pose(self, poses: Floats) -> fcl.Transform:
         """Where ``link_poses`` (7, 4, 4) has the body's shapes."""
