@@ -31,7 +31,8 @@ def refuse_base_in(
         InputError: It does.
     """
     centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
-    if _encloses(patient, centre) or placed.skin.touches(base.bare.surface, base.box):
+    met = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
+    if met or _encloses(patient, centre):
         raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
     if outside is not None and _encloses(joined([patient, outside]), centre):
         what = "the robot's base stands in what the CT shows outside of the body (its table?)"

@@ -115,6 +115,15 @@ def test_a_loose_part_within_a_link_is_a_contact(kind: type[CellChecker]) -> Non
     assert checker.contact(q, needle_may_touch_patient=False) is None
 
 
+def test_a_part_of_the_skin_within_the_base_is_refused() -> None:
+    """It touches no surface of the base, and encloses none of it."""
+    block = trimesh.creation.box((6.0, 6.0, 6.0))
+    loose = TriangleMesh(np.asarray(block.vertices) + [20.0, 20.0, 9.0], np.asarray(block.faces))
+    skin = joined([ball(2).transformed(pose(np.eye(3), [900.0, 0.0, 0.0])), loose])
+    with pytest.raises(InputError, match="base stands in the patient"):
+        CellChecker(ur_model("ur5"), Tool(250.0, 150.0, 1.2, 30.0), (), skin)
+
+
 def test_the_loose_parts_of_a_surface_are_those_that_share_corners() -> None:
     """Two balls of one mesh, and a corner that no face uses: two parts, each with the size of its ball."""
     one, other = ball(1), ball(2).transformed(pose(np.eye(3), [400.0, 0.0, 0.0]))
