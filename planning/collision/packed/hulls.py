@@ -101,7 +101,7 @@ class PackedHulls:
 def inscribed_prism(corners: Floats) -> Floats:
     """Corners of a prism inside the cylinder that `prism` gave the corners about, along z of any frame."""
     middle, inside = corners.mean(axis=0), 1.0 - INSIDE
-    return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(np.pi / PRISM_SIDES)] + [inside]))
+    return np.asarray(middle + (corners - middle) * (2 * [inside * np.cos(2.0 * np.pi / len(corners))] + [inside]))
 
 
 def row_starts(sizes: Sequence[int] | Ints) -> Ints:
