@@ -60,3 +60,15 @@ def test_the_small_workcell_has_directions_of_both_kinds():
 def test_everything_that_is_used_once_works():
     """Nobody reads what the process says: an arm, a planner or a painter that has changed must show here."""
     first_use.use_once()
+
+
+def test_what_tells_that_all_is_compiled_is_compiled_by_each_search(begun, monkeypatch):
+    """A kernel that a search no longer uses would let a process begin beside every command for good."""
+    queried = []
+    monkeypatch.setattr(
+        "puncture_twin.planning.base.cache.kernel_cache.is_compiled", lambda kernel: queried.append(kernel)
+    )
+    with first_use.compiling_beside():
+        ask_arm(small_workcell())
+    (kernel,) = queried
+    assert kernel.signatures

@@ -23,9 +23,9 @@ def compiling_beside() -> Iterator[None]:
     """While the block runs, compile in a second process, where nothing is compiled yet and a core is free for it."""
     from puncture_twin.planning.base.cache.kernel_cache import is_compiled
     from puncture_twin.planning.base.processes import worker_count
-    from puncture_twin.planning.collision.kernels.proofs import first_unproven
+    from puncture_twin.planning.collision.kernels.settled import first_not_clear
 
-    if is_compiled(first_unproven) or worker_count(2, 2) == 1:
+    if is_compiled(first_not_clear) or worker_count(2, 2) == 1:
         yield
         return
     other = _begin()

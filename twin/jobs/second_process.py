@@ -159,9 +159,9 @@ def second_process(get_ready: Callable[[], None]) -> Iterator[Beside]:
     """
     from puncture_twin.planning.base.cache.kernel_cache import is_compiled
     from puncture_twin.planning.base.processes import worker_count
-    from puncture_twin.planning.collision.kernels.proofs import first_unproven
+    from puncture_twin.planning.collision.kernels.settled import first_not_clear
 
-    if worker_count(2, 2) == 1 or not is_compiled(first_unproven):
+    if worker_count(2, 2) == 1 or not is_compiled(first_not_clear):
         yield Here()
         return
     beside = SecondProcess(_begin(get_ready))
