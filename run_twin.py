@@ -710,7 +710,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for one another
     with late_collection():
-        return exit_code_of(partial(app, arguments, standalone_mode=False), partial(print, file=sys.stderr))
+        return exit_code_of(partial(app, arguments, standalone_mode=False), _print_whole)
+
+
+def _print_whole(line: str) -> None:
+    """Print a line at once, so that Ctrl-C comes before or after it."""
+    print(f"{line}\n", end="", file=sys.stderr)
 
 
 def program() -> NoReturn:

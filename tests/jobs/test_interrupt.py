@@ -9,6 +9,7 @@ from contextlib import suppress
 
 import pytest
 
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.jobs.exit_codes import INTERRUPTED, exit_code_of
 from puncture_twin.twin.jobs.interrupt import ended_by_ctrl_c, insistent_ctrl_c
 from puncture_twin.twin.jobs.terminal import print_answer
@@ -149,3 +150,19 @@ def test_who_hears_the_signal_otherwise_keeps_it():
     thread.start()
     thread.join()
     assert heard == [signal.default_int_handler]
+
+
+def test_an_interruption_while_a_refusal_is_printed_ends_the_command():
+    """The refusal's line, then the word; no traceback."""
+    said = []
+
+    def print_line(line):
+        said.append(line)
+        if len(said) == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    def command():
+        raise InputError("no such file", where="joints.csv", allowed="a readable file")
+
+    assert exit_code_of(command, print_line) == INTERRUPTED
+    assert len(said) == 2 and said[0].startswith("joints.csv: ") and said[1] == "interrupted"

@@ -36,6 +36,14 @@ def exit_code_of(command: Callable[[], object], print_line: PrintLine) -> int:
         command: Such as the parser with its arguments.
         print_line: Shows the line, and what was made anew.
     """
+    try:
+        return _exit_code_of(command, print_line)
+    except KeyboardInterrupt:  # as the command's own last line was printed
+        print_line("interrupted")
+        return INTERRUPTED
+
+
+def _exit_code_of(command: Callable[[], object], print_line: PrintLine) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _notes(warnings.showwarning, print_line)
         try:
