@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import decode_text
+from puncture_twin.planning.formats.points.joint_columns import JOINT_COLUMNS, joints_deg
 from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_coordinate
 from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.units import Unit, parse_unit
@@ -18,9 +19,6 @@ _ALLOWED = (
     "a header name,x_mm,y_mm,z_mm (or _cm, _m; kind, and q1_deg to q6_deg, may be added), "
     "then as many fields in every line"
 )
-_JOINTS = tuple(f"q{number}_deg" for number in range(1, 7))
-MAX_JOINT_DEG = 720.0
-"""No joint of a robot arm turns farther than two whole turns; a larger angle is none in degrees."""
 
 
 class _Row(NamedTuple):
@@ -59,16 +57,10 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
         unit=unit,
         space=None,
         kinds=tuple(f[columns["kind"]].strip() for _, f in rows[1:]) if "kind" in columns else None,
-        joints_deg=[_joints(row, columns, where) for row in rows[1:]] if "q1" in columns else None,
+        joints_deg=[joints_deg(fields, header, f"{where}, line {line}") for line, fields in rows[1:]]
+        if "q1" in columns
+        else None,
     )
-
-
-def _joints(row: _Row, columns: Mapping[str, int], where: str) -> tuple[float, ...]:
-    line = f"{where}, line {row.line}"
-    angles = tuple(parse_coordinate(row.fields[columns[f"q{number}"]], line) for number in range(1, 7))
-    if max(map(abs, angles)) > MAX_JOINT_DEG:
-        refuse(f"a joint at {max(angles, key=abs):g} degrees", line, f"-{MAX_JOINT_DEG:g} to {MAX_JOINT_DEG:g}")
-    return angles
 
 
 def _rows(data: bytes, where: str) -> Iterator[_Row]:
@@ -88,11 +80,11 @@ def _unit(header: list[str], where: str) -> Unit | None:
         axis = re.fullmatch(r"([xyz])(?:_(\w+))?", name)
         if axis:
             units[axis[1]] = axis[2] or ""
-        elif name not in ("name", "kind", *_JOINTS):
+        elif name not in ("name", "kind", *JOINT_COLUMNS):
             refuse(f"column {name[:40]!r}", f"{where}, header", _ALLOWED)
     if len(set(header)) != len(header) or sorted(units) != ["x", "y", "z"] or "name" not in header:
         refuse(f"columns {header}", f"{where}, header", _ALLOWED)
-    joints = sum(name in _JOINTS for name in header)
+    joints = sum(name in JOINT_COLUMNS for name in header)
     if joints not in (0, 6) or len(header) != 4 + ("kind" in header) + joints:  # such as x_mm beside x_m
         refuse(f"columns {header}", f"{where}, header", _ALLOWED)
     if len(set(units.values())) != 1:
