@@ -23,7 +23,7 @@ from scipy.special import ndtr
 
 from benchmarks.timing import least_seconds
 from benchmarks.trust import Scene, punctures, scenes
-from puncture_twin.planning.clearance.near_faces import NearFaces
+from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
 from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
@@ -69,7 +69,7 @@ def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
                 reach = doubt.reach(length, threshold)
                 if near.distance[i, place] > max(reach):
                     continue
-                faces = engine.near(int(column), case.target_ct, outward, length, reach)
+                faces = near_faces(engine.blocks[column], case.target_ct, outward, length, reach)
                 lines = line_chance(faces, doubt, length, threshold, near.gradient[i, place])
                 took = time.thread_time() - start
                 distance = faces.distance(origins, along, length)

@@ -31,6 +31,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import farthest_from_singular
 from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.clearance.near_faces import near_faces
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
@@ -333,7 +334,7 @@ def _touched(of: Scene, puncture: Puncture, rooms: Rooms, shift: float) -> np.nd
     for place, column in enumerate(columns):
         length = float(lengths[column])
         reach = (radius + shift + 1e-6, radius + shift + length * turn + 1e-6)
-        faces = of.context.engine.near(int(column), case.target_ct, puncture.outward_ct, length, reach)
+        faces = near_faces(of.context.engine.blocks[column], case.target_ct, puncture.outward_ct, length, reach)
         if len(faces):
             touched[:, place] = faces.distance(rooms.tip_ct, rooms.outward_ct, length) < radius
     return touched

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from puncture_twin.planning.base.arrays import Floats, Ints, Ints32
-from puncture_twin.planning.clearance.near_faces import NearFaces
+from puncture_twin.planning.clearance.kernels.blocks import Blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +41,11 @@ class ClearanceEngine(Protocol):
         """Of each structure, shape (m, 9), corners in rows, mm: what `AxisDistances.nearest` counts."""
         ...
 
+    @property
+    def blocks(self) -> tuple[Blocks, ...]:
+        """Of each structure: among them `near_faces` finds what a displaced needle can meet."""
+        ...
+
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
     ) -> AxisDistances:
@@ -57,10 +62,4 @@ class ClearanceEngine(Protocol):
 
     def of(self, columns: Ints) -> ClearanceEngine:
         """The same engine for some of its structures, in this order; nothing is prepared again."""
-        ...
-
-    def near(
-        self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]
-    ) -> NearFaces:
-        """All faces of one structure within reach (mm, at the axis' start and at its end) of an axis, and some more."""
         ...

@@ -17,7 +17,7 @@ from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED
-from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
+from puncture_twin.planning.clearance.near_faces import near_faces
 from puncture_twin.planning.clearance.one_structure import measure_structure
 from puncture_twin.planning.clearance.placed_surface import PlacedSurface, placed_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -70,6 +70,11 @@ class FastEngine:
         """Of each structure, in blocks; see `ClearanceEngine`."""
         return tuple(blocks.triangles for blocks in self._blocks)
 
+    @property
+    def blocks(self) -> tuple[Blocks, ...]:
+        """Of each structure; see `ClearanceEngine`."""
+        return self._blocks
+
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
     ) -> AxisDistances:
@@ -110,7 +115,7 @@ class FastEngine:
         from the axis is, by its lower bound, within the radius and `FCL_BEYOND_MM`.
         """
         reach = radius + FCL_BEYOND_MM
-        near = self.near(structure, target_ct, outward_ct, length, (reach, reach))
+        near = near_faces(self.blocks[structure], target_ct, outward_ct, length, (reach, reach))
         return len(near) > 0 and capsule_touches_any(near.triangles, target_ct, outward_ct, length, radius)
 
     def of(self, columns: Ints) -> FastEngine:
@@ -119,12 +124,6 @@ class FastEngine:
         part._blocks = tuple(self._blocks[column] for column in columns)
         part._seen, part._progress = None, None
         return part
-
-    def near(
-        self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]
-    ) -> NearFaces:
-        """Faces of one structure near an axis; see `ClearanceEngine`."""
-        return near_faces(self._blocks[structure], origin_ct, outward_ct, length, reach)
 
 
 def _packed(mesh: TriangleMesh, memory: Memory) -> Blocks:

@@ -11,8 +11,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.engine import AxisDistances
-from puncture_twin.planning.clearance.kernels.blocks import pack
-from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
+from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.geometry.crossings import first_crossing
 from puncture_twin.planning.geometry.frames import frame_about
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -41,6 +40,11 @@ class FclEngine:
     def triangles(self) -> tuple[Floats, ...]:
         """Of each structure, as its mesh has them; see `ClearanceEngine`."""
         return tuple(mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in self._meshes)
+
+    @property
+    def blocks(self) -> tuple[Blocks, ...]:
+        """Of each structure, packed anew: FCL itself needs none; see `ClearanceEngine`."""
+        return tuple(pack(mesh) for mesh in self._meshes)
 
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
@@ -92,12 +96,6 @@ class FclEngine:
         part._objects = tuple(self._objects[column] for column in columns)
         part._progress = None
         return part
-
-    def near(
-        self, structure: int, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]
-    ) -> NearFaces:
-        """Faces of one structure near an axis; see `ClearanceEngine`."""
-        return near_faces(pack(self._meshes[structure]), origin_ct, outward_ct, length, reach)
 
 
 def capsule_touches_any(triangles: Floats, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
+from puncture_twin.planning.clearance.near_faces import near_faces
 from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rotations import exp_rotation
@@ -39,7 +40,7 @@ def chances(mesh, cov, surface=0.0, freedom=None, threshold=RADIUS):
     normal = normals_of(engine.triangles, np.zeros(3), UP[None], axes)
     near = proximity(axes.distance, axes.depth, normal, UP[None], cov[None], surface)
     first = touch_chance(near, threshold, freedom)
-    around = Surroundings(engine, np.array([0]), np.array([LENGTH]), np.zeros(3))
+    around = Surroundings(engine.blocks, np.array([LENGTH]), np.zeros(3))
     needles = Needles(UP[None], cov[None], near, surface, freedom)
     found = refined(around, needles, np.array([threshold]), first, np.ones((1, 1), bool))
     return first[0, 0], found[0, 0]
@@ -54,7 +55,7 @@ def displaced(cov, count, seed=0):
 def drawn(mesh, cov, count=100_000, threshold=RADIUS):
     """How many of so many displaced needles come nearer than a threshold, measured on the faces near them."""
     origins, outward = displaced(cov, count)
-    faces = FastEngine([mesh]).near(0, np.zeros(3), UP, LENGTH, (15.0, 30.0))
+    faces = near_faces(FastEngine([mesh]).blocks[0], np.zeros(3), UP, LENGTH, (15.0, 30.0))
     return np.mean(faces.distance(origins, outward, LENGTH) < threshold)
 
 
@@ -154,7 +155,7 @@ def test_near_faces_answer_as_the_engine_does(rng, kind):
     surface = moved(mesh, 30.0, 5.0, 70.0)
     origins, outward = displaced(4 * LEAN, 300)
     reach = (5.0, 12.0)
-    quick = kind([surface]).near(0, np.zeros(3), UP, LENGTH, reach).distance(origins, outward, LENGTH)
+    quick = near_faces(kind([surface]).blocks[0], np.zeros(3), UP, LENGTH, reach).distance(origins, outward, LENGTH)
     whole = measure_displaced(FastEngine([surface]), origins, outward, LENGTH)[:, 0]
     shift = np.linalg.norm(origins, axis=1) + LENGTH * np.linalg.norm(outward - UP, axis=1)
     sure = whole + shift < min(reach)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.clearance.engine import ClearanceEngine
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.clearance.kernels.blocks import Blocks
+from puncture_twin.planning.clearance.near_faces import near_faces
 from puncture_twin.planning.uncertainty.lines.line_sampling import line_chance
 from puncture_twin.planning.uncertainty.lines.needle_doubt import needle_doubt
 from puncture_twin.planning.uncertainty.touch import Proximity
@@ -18,14 +19,12 @@ class Surroundings:
     """What must not be touched about one target; CT frame, mm.
 
     Attributes:
-        engine: Has the structures' faces.
-        columns: Shape (k,), the structures' places in the engine.
+        blocks: The faces of each of the k structures.
         length: Shape (k,), of the needle's axis for each.
         target_ct: Shape (3,), where every axis starts.
     """
 
-    engine: ClearanceEngine
-    columns: Ints
+    blocks: tuple[Blocks, ...]
     length: Floats
     target_ct: Floats
 
@@ -75,7 +74,7 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
             reach = doubt.reach(length, threshold)
             if needles.near.distance[row, column] > max(reach):
                 continue
-            faces = around.engine.near(int(around.columns[column]), around.target_ct, outward, length, reach)
+            faces = near_faces(around.blocks[column], around.target_ct, outward, length, reach)
             if len(faces):
                 chance = line_chance(faces, doubt, length, threshold, needles.near.gradient[row, column])
                 found[row, column] = first[row, column] if np.isnan(chance) else chance
