@@ -5,8 +5,7 @@ transport to the target, Omega what errs anew at each marker:
 
     Sigma6 = G Sigma_eta G' + X L Omega L' X' + (rep^2 + drift^2) Jq_f Jq_f',   G = J_f - X L J
 
-The minus sign is the cancellation: what the arm does wrong at the markers it does again at the target. Where nobody
-says how the arm touched them, 2 J_f Sigma_eta J_f' stands for the first term: errors of equal size, independent.
+The minus sign is the cancellation: what the arm does wrong at the markers it does again at the target (`cancellation`).
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.uncertainty.cancellation import not_cancelled
 from puncture_twin.planning.uncertainty.sources import reading_parts
 
 
@@ -65,7 +65,7 @@ class PoseError:
         """Sigma6 of configurations (n, 6), rad: shape (n, 6, 6), tip (mm) then rotation (rad), base axes."""
         readings = self.fit.cov_at(self.target_base)
         J, arm = error_jacobian(self.model, q, self.tip_mm), self.errors.arm
-        lasting = self._lasting(J) * np.sqrt(self.fit.noise.eta_variances)
+        lasting = not_cancelled(self.fit, J, self.target_base) * np.sqrt(self.fit.noise.eta_variances)
         anew = J[..., PARAMETERS["joint"]] * np.hypot(arm.drift, arm.repeatability)
         root = self.fit.test.scale * np.concatenate([lasting, anew], axis=-1)
         straight = readings + root @ np.swapaxes(root, -1, -2)
@@ -126,18 +126,12 @@ class PoseError:
 
     def _arm_parts(self, J: Floats) -> dict[str, Floats]:
         """Of the arm's parameters, of its drift since the touches, and of one arrival at the target."""
-        G, eta = self._lasting(J), self.fit.noise.eta_variances
+        G, eta = not_cancelled(self.fit, J, self.target_base), self.fit.noise.eta_variances
         found = {source: _outer(G[..., part], eta[part]) for source, part in PARAMETERS.items()}
         Jq, arm = J[..., PARAMETERS["joint"]], self.errors.arm
         found["drift"] = _outer(Jq, np.full(6, arm.drift**2))
         found["arrival"] = _outer(Jq, np.full(6, arm.repeatability**2))
         return found
-
-    def _lasting(self, J: Floats) -> Floats:
-        """G, shape (n, 6, 28): what the arm's parameters do at the target, that they did at the markers taken off."""
-        if not self.fit.noise.touches_known:
-            return np.asarray(np.sqrt(2.0) * J)
-        return np.asarray(J - self.fit.map_at(self.target_base) @ self.fit.noise.arm_jacobian)
 
 
 def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
