@@ -10,7 +10,8 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.case.entry import entry_frame, grid, view_frame
+from puncture_twin.planning.case.case import view_frame
+from puncture_twin.planning.case.entry import entry_frame, grid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory

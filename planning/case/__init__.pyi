@@ -1,6 +1,6 @@
 from .angle_grid import AngleGrid as AngleGrid
 from .bed import bed_frame as bed_frame
-from .case import Case as Case
+from .case import Case as Case, view_frame as view_frame
 from .case_file import count_difference as count_difference
 from .entry import (
     ANATOMICAL_LPS as ANATOMICAL_LPS,
@@ -10,7 +10,6 @@ from .entry import (
     grid as grid,
     needle_pose as needle_pose,
     outward as outward,
-    view_frame as view_frame,
 )
 from .errors import ArmUncertainty as ArmUncertainty, ErrorModel as ErrorModel
 from .mount import Axis as Axis, axes_frame as axes_frame, mount_pose as mount_pose

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.entry import ANATOMICAL_LPS, view_frame
+from puncture_twin.planning.case.case import Case, view_frame
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.mount import Axis, axes_frame
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 

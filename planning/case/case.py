@@ -10,7 +10,7 @@ from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.provenance import Input, InputFiles
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case_volumes import CaseVolumes
-from puncture_twin.planning.case.entry import Directions, direction, grid, view_frame
+from puncture_twin.planning.case.entry import Directions, direction, grid
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.case.html import case_html
 from puncture_twin.planning.case.named_files import MASK_ROLE
@@ -28,6 +28,7 @@ from puncture_twin.planning.case.tables.registration_section import MarkerSectio
 from puncture_twin.planning.case.tables.search_section import RankingSection
 from puncture_twin.planning.case.tables.structures_section import StructureSection, StructuresSection
 from puncture_twin.planning.formats.labels.mask_folder import structure_name
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.needle.deflection import Bending
 
@@ -125,3 +126,10 @@ class Case:
         inside = PurePosixPath(folder)
         files = [one.path for one in self.inputs if one.role.startswith(MASK_ROLE)]
         return {structure_name(file): file for file in files if PurePosixPath(file).parent == inside}
+
+
+def view_frame(R_ct_entry: Floats, target_ct: Floats) -> Floats:
+    """T_ct_entry: the entry frame with its origin on the target, shape (4, 4), read-only."""
+    T = pose(R_ct_entry, target_ct)
+    T.setflags(write=False)
+    return T

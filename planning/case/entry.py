@@ -13,7 +13,6 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.angle_grid import AngleGrid
 from puncture_twin.planning.case.tables.search_section import EntryAxes
 from puncture_twin.planning.geometry.frames import frame_of_axes
-from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 ANATOMICAL_LPS = MappingProxyType(
@@ -96,13 +95,6 @@ def _axis(axis: str | tuple[float, float, float], space: Space) -> Floats:
     if isinstance(axis, str):
         return np.array(ANATOMICAL_LPS[axis])
     return to_lps(np.array([axis]), space)[0]
-
-
-def view_frame(R_ct_entry: Floats, target_ct: Floats) -> Floats:
-    """T_ct_entry: the entry frame with its origin on the target, shape (4, 4), read-only."""
-    T = pose(R_ct_entry, target_ct)
-    T.setflags(write=False)
-    return T
 
 
 def outward(theta: Floats | float, beta: Floats | float) -> Floats:

@@ -10,10 +10,10 @@ from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.case import Case, view_frame
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.case_volumes import CaseVolumes
-from puncture_twin.planning.case.entry import entry_frame, view_frame
+from puncture_twin.planning.case.entry import entry_frame
 from puncture_twin.planning.case.sections.bend import bending_of
 from puncture_twin.planning.case.sections.breath import breathing_of
 from puncture_twin.planning.case.sections.robot import robot_of

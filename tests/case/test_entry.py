@@ -6,7 +6,8 @@ from hypothesis import given, strategies as st
 
 import puncture_twin.planning.case.entry
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.entry import angles, direction, entry_frame, grid, needle_pose, outward, view_frame
+from puncture_twin.planning.case.case import view_frame
+from puncture_twin.planning.case.entry import angles, direction, entry_frame, grid, needle_pose, outward
 from puncture_twin.planning.case.tables.search_section import EntryAxes
 from puncture_twin.planning.geometry.spaces import Space
 

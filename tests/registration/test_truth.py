@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.case import Case, view_frame
 from puncture_twin.planning.case.case_volumes import CaseVolumes
-from puncture_twin.planning.case.entry import view_frame
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.settings import Needle, RobotSettings, SearchSettings
 from puncture_twin.planning.case.tables.errors_section import RehearsalSection

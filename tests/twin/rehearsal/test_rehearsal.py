@@ -18,9 +18,8 @@ from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.bed import bed_frame
-from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.case import Case, view_frame
 from puncture_twin.planning.case.case_volumes import CaseVolumes
-from puncture_twin.planning.case.entry import view_frame
 from puncture_twin.planning.case.settings import Needle, Obstacle, RobotSettings, SearchSettings
 from puncture_twin.planning.case.tables.errors_section import RehearsalSection
 from puncture_twin.planning.case.tables.search_section import RankingSection
