@@ -22,7 +22,7 @@ from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscan
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rigid import apply, pose
 
 SMOOTH_MM = 3.0
 """Means over a cube of this edge are compared with air: noise of a finer image falls below that of 3 mm voxels."""
@@ -40,6 +40,9 @@ EDGE_MM = 40.0
 """The edge of a table or cradle is no thicker."""
 BEYOND_LONG_MM = (*BEYOND_MM[:2], 1000.0)
 """`BEYOND_MM` where an image is so long that the surface would be larger than any that is plausible."""
+CUT_AT_MM = (30.0, 120.0, 480.0)
+"""What is drawn out along the bed is cut across so far beyond the image: a triangle as long as all of it would lie near
+every needle, and the search would measure most axes from most of them."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
@@ -107,8 +110,10 @@ def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> T
     """
     if not mask.any():
         return None
-    surface = field_surface(mask.astype(np.float32) - 0.5, image.T_ct_index, where=where)
-    drawn = _drawn_out(surface, image)
+    layers = len(CUT_AT_MM)
+    layered = np.pad(mask.astype(np.float32) - 0.5, ((0, 0), (0, 0), (layers, layers)), mode="edge")
+    T_ct_layered = image.T_ct_index @ pose(np.eye(3), [0.0, 0.0, -layers])
+    drawn = _drawn_out(field_surface(layered, T_ct_layered, where=where), image)
     return joined([drawn, *_hulls_beyond(mask & ~find_unscanned(image.hu).padded, image)])
 
 
@@ -233,12 +238,18 @@ def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_m
 
 
 def _drawn_out(surface: TriangleMesh, image: OutsideImage) -> TriangleMesh:
-    """The surface with its caps, vertices beyond the border voxels' centres, moved outward."""
+    """The surface with the layers beyond its border voxels' centres, and its caps half a voxel after, moved outward."""
     T = image.T_ct_index
     index = np.linalg.solve(T[:3, :3], (surface.vertices - T[:3, 3]).T).T
-    last = np.array(image.hu.shape) - 1.0
-    away = np.array(image.beyond_mm) / image.spacing_mm
-    index = np.where(index < -1e-6, index - away, np.where(index > last + 1e-6, index + away, index))
+    for axis, cut_at_mm in enumerate(((), (), CUT_AT_MM)):
+        last, layers = image.hu.shape[axis] - 1.0, np.arange(1.0, len(cut_at_mm) + 1)
+        beyond = np.array([*layers, len(cut_at_mm) + 0.5])
+        moved = np.array([*cut_at_mm, image.beyond_mm[axis] + 0.5 * image.spacing_mm[axis]]) / image.spacing_mm[axis]
+        index[:, axis] = np.interp(
+            index[:, axis],
+            np.concatenate([-beyond[::-1], [0.0, last], last + beyond]),
+            np.concatenate([-moved[::-1], [0.0, last], last + moved]),
+        )
     return TriangleMesh(apply(T, index), surface.faces)
 
 

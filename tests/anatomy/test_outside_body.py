@@ -1,0 +1,64 @@
+"""What the border of an image cuts goes on beyond it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from puncture_twin.planning.anatomy.body.outside_body import (
+    BEYOND_MM,
+    CUT_AT_MM,
+    OutsideImage,
+    outside_surface,
+)
+from puncture_twin.planning.geometry.containment import inside_each
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+SPACING = np.array([2.0, 2.0, 3.0])
+SHAPE = (40, 30, 20)
+BAR = (slice(10, 16), slice(20, 24))
+"""A bar along the bed: 20 to 30 mm, and 40 to 46 mm, by its voxels' centres."""
+
+
+@pytest.fixture
+def bar() -> TriangleMesh:
+    """Its surface; the border cuts it at both ends."""
+    mask = np.zeros(SHAPE, bool)
+    mask[BAR] = True
+    empty = np.full(SHAPE, -1000.0, np.float32)
+    surface = outside_surface(
+        OutsideImage(empty, np.zeros(SHAPE, bool), np.diag([*SPACING, 1.0]), SPACING), mask, where="bar"
+    )
+    assert surface is not None
+    return surface
+
+
+def test_it_goes_on_as_far_as_is_said(bar):
+    """Along the bed, from the outer face of the last voxels; it is closed."""
+    ends = -0.5 * SPACING[2] - BEYOND_MM[2], (SHAPE[2] - 0.5) * SPACING[2] + BEYOND_MM[2]
+    np.testing.assert_allclose(bar.bounds[:, 2], ends, atol=1e-9)
+    assert bar.closed
+
+
+@pytest.mark.parametrize("beyond_mm", [1.0, 29.0, 100.0, 400.0, 479.0])
+@pytest.mark.parametrize("end", [0, 1])
+def test_it_is_as_wide_beyond_the_image_as_at_its_border(bar, beyond_mm, end):
+    """Points just within and just outside of each side, as far beyond as a needle reaches."""
+    z = (SHAPE[2] - 1) * SPACING[2] + beyond_mm if end else -beyond_mm
+    middle, half = np.array([25.0, 43.0]), np.array([6.0, 4.0])
+    for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1)):
+        for factor, within in ((0.999, True), (1.001, False)):
+            point = np.append(middle, z)
+            point[axis] += sign * factor * half[axis]
+            assert inside_each(bar, point[None])[0] == within
+
+
+def test_no_triangle_near_the_image_is_long(bar):
+    """Those that begin before a cut end there."""
+    last = (SHAPE[2] - 1) * SPACING[2]
+    z = np.sort(bar.vertices[bar.faces][..., 2], axis=1)
+    for cut, following in zip((0.0, *CUT_AT_MM[:-1]), CUT_AT_MM, strict=True):
+        for low, high in ((last + cut, last + following), (-following, -cut)):
+            crossing = (z[:, 0] < high - 1e-9) & (z[:, 2] > low + 1e-9)
+            assert crossing.any()
+            assert np.all((z[crossing, 0] >= low - 1e-9) & (z[crossing, 2] <= high + 1e-9))
