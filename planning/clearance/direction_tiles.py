@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,9 @@ TILE = 12
 
 WIDEST = 0.12
 """Chord from a bundle's axis to its members above which it is divided: about 7 degrees."""
+
+LEAST_BUNDLES = 256
+"""A run of fewer bundles is not worth a piece of work of its own."""
 
 CHORD_SLACK = 1e-6
 """More than float32 takes from a chord or a unit vector."""
@@ -38,6 +42,19 @@ class Tiles:
     starts: NDArray[np.int64]
     middle: NDArray[np.int64]
     chord: Floats
+
+    def parts(self, most: int) -> list[Tiles]:
+        """The same bundles in at most so many runs of about as many each, none below ``LEAST_BUNDLES``."""
+        count = max(1, min(most, len(self.middle) // LEAST_BUNDLES))
+        edges = np.linspace(0, len(self.middle), count + 1).astype(int)
+        return [self._run(low, high) for low, high in itertools.pairwise(edges)]
+
+    def _run(self, low: int, high: int) -> Tiles:
+        """Bundles ``low`` to ``high``."""
+        first = self.starts[low]
+        members = slice(first, self.starts[high])
+        starts, middle = self.starts[low : high + 1] - first, self.middle[low:high] - first
+        return Tiles(self.order[members], self.outward[members], starts, middle, self.chord[low:high])
 
 
 def bundle(outward: Floats) -> Tiles:

@@ -12,7 +12,7 @@ from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.processes import on_threads
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.clearance.direction_tiles import bundle
+from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
@@ -26,7 +26,11 @@ FCL_BEYOND_MM = 1.0
 """Farther from a capsule FCL sees nothing: its tolerance is 1e-6 mm, and the bounds' rounding 1e-5 mm."""
 
 MOST_THREADS = 16
-"""The largest structure takes a sixth of a search; more threads would wait for it."""
+"""More were never tried."""
+
+PIECE_TRIANGLES = 20_000
+"""For every so many a structure is searched in one more piece, each with its share of the directions, so that no thread
+waits long for another at the end. Pieces do not depend on threads: which of equally near triangles is named may."""
 
 WORTH_THREADS = 20_000
 """Answers, a few milliseconds of work: below, starting threads takes as long."""
@@ -45,7 +49,7 @@ class FastEngine:
         meshes: The k surfaces, in the CT frame, mm.
         progress: Called with (structures done in all directions, structures).
         memory: Where packed surfaces are kept.
-        threads: At most so many structures are searched side by side, and one a core; each is searched by itself, so
+        threads: At most so many pieces of the work are done side by side, and one a core; each is done by itself, so
             the answer is the same to the bit.
 
     Attributes:
@@ -83,22 +87,31 @@ class FastEngine:
         outward = np.ascontiguousarray(outward_ct, dtype=np.float64).reshape(-1, 3)
         shape = (len(self._blocks), len(outward))
         lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[:1])
-        sound = np.isfinite(target).all() and np.isfinite(outward).all()
-        if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
-            raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
-        distance, depth, nearest = np.empty(shape), np.empty(shape), np.empty(shape, np.int32)
-        counts = np.zeros((len(self._blocks), len(COUNTED)), np.int64)
-        seen, tiles = self._seen_from(target), bundle(outward)
-
-        answers = [AxisDistances(distance[row], depth[row], nearest[row]) for row in range(len(self._blocks))]
-        pieces = list(zip(self._blocks, seen, lengths, answers, counts, strict=True))
-        pieces.sort(key=lambda piece: -len(piece[0].triangles))  # so that no thread ends long after the others
+        _refuse_unsound(target, outward, lengths)
+        answer = AxisDistances(np.empty(shape), np.empty(shape), np.empty(shape, np.int32))
+        pieces = self._pieces(self._seen_from(target), lengths, answer, bundle(outward))
+        counts = np.zeros((len(pieces), len(COUNTED)), np.int64)
         threads = self._threads if np.prod(shape) >= WORTH_THREADS else 1
-        for done in on_threads(lambda k: measure_structure(target, tiles, *pieces[k]), len(pieces), threads):
+        for done in on_threads(lambda k: measure_structure(target, *pieces[k], counts[k]), len(pieces), threads):
             if shown and self._progress is not None:
-                self._progress(done, len(pieces))
+                self._progress(done * len(self._blocks) // len(pieces), len(self._blocks))
         self.counts += counts.sum(axis=0)
-        return AxisDistances(distance.T, depth.T, nearest.T)
+        return AxisDistances(answer.distance.T, answer.depth.T, answer.nearest.T)
+
+    def _pieces(
+        self, seen: tuple[PlacedSurface, ...], lengths: Floats, answer: AxisDistances, tiles: Tiles
+    ) -> list[tuple[Tiles, Blocks, PlacedSurface, float, AxisDistances]]:
+        """What `measure_structure` is given in turn: the largest structures first, in runs of directions.
+
+        Here rows of ``answer`` are structures.
+        """
+        pieces = []
+        for row in sorted(range(len(self._blocks)), key=lambda row: -len(self._blocks[row].triangles)):
+            blocks = self._blocks[row]
+            own = AxisDistances(answer.distance[row], answer.depth[row], answer.nearest[row])
+            for part in tiles.parts(1 + len(blocks.triangles) // PIECE_TRIANGLES):
+                pieces.append((part, blocks, seen[row], float(lengths[row]), own))
+        return pieces
 
     def _seen_from(self, target: Floats) -> tuple[PlacedSurface, ...]:
         """The surfaces as seen from a target; those of the last target are kept."""
@@ -124,6 +137,12 @@ class FastEngine:
         part._blocks = tuple(self._blocks[column] for column in columns)
         part._seen, part._progress = None, None
         return part
+
+
+def _refuse_unsound(target: Floats, outward: Floats, lengths: Floats) -> None:
+    sound = np.isfinite(target).all() and np.isfinite(outward).all()
+    if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
+        raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
 
 
 def _packed(mesh: TriangleMesh, memory: Memory) -> Blocks:

@@ -28,18 +28,19 @@ def measure_structure(
 
     Args:
         target: Shape (3,), mm: where every axis starts.
-        tiles: The n directions.
+        tiles: All or some of the n directions.
         blocks: The structure.
         placed: Itself as seen from the target.
         length: Of the axes, mm.
-        answer: Arrays of shape (n,) in the caller's order, filled.
+        answer: Arrays of shape (n,) in the caller's order; rows of ``tiles`` are filled.
         counts: Shape (7,), added to: see `tile_search.COUNTED`.
     """
     distance, depth, nearest = answer.distance, answer.depth, answer.nearest
     if placed.distance == 0.0:
-        distance[:], depth[:], nearest[:] = 0.0, 0.0, placed.nearest
+        distance[tiles.order], depth[tiles.order], nearest[tiles.order] = 0.0, 0.0, placed.nearest
         return
-    found = Found(np.empty(len(distance)), np.empty(len(distance)), np.empty(len(distance), np.int64), counts)
+    n = len(tiles.order)
+    found = Found(np.empty(n), np.empty(n), np.empty(n, np.int64), counts)
     surface = (blocks.triangles, blocks.local, blocks.base)
     bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
     search_tiles(

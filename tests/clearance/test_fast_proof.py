@@ -9,8 +9,9 @@ from oracles import segment_mesh_distance
 from places import DATA
 
 from puncture_twin import meshes
+from puncture_twin.planning.clearance.direction_tiles import bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
-from puncture_twin.planning.clearance.fast_engine import WORTH_THREADS, FastEngine
+from puncture_twin.planning.clearance.fast_engine import PIECE_TRIANGLES, WORTH_THREADS, FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.clearance.too_near import NEAR_THRESHOLD_MM, ROUNDING_MM, too_near
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -200,3 +201,20 @@ def test_verdicts_and_distances_hold_for_any_small_surface_and_target(seed, clos
     np.testing.assert_allclose(exact, expected, atol=1e-9, rtol=0)
     rated = [judge.collides(0, target, u, length, radius) for u in directions]
     assert too_near(engine, 0, target, directions, length, exact, radius).tolist() == rated
+
+
+def test_a_large_structure_is_searched_in_pieces_with_the_same_distances(ball):
+    """Each direction belongs to one piece, and is answered as that piece's directions alone are."""
+    target, directions = np.array([3.0, -2.0, 70.0]), units(np.random.default_rng(4), 12_000)
+    surface = ball(30, (0, 0, 0), 6)
+    assert len(surface.faces) >= 4 * PIECE_TRIANGLES
+    engine = FastEngine([surface])
+    whole = engine.measure(target, directions, LENGTH)
+    pieces = bundle(directions).parts(1 + len(surface.faces) // PIECE_TRIANGLES)
+    assert len(pieces) > 2
+    assert sorted(np.concatenate([piece.order for piece in pieces])) == list(range(len(directions)))
+    for piece in pieces:
+        alone = engine.measure(target, directions[piece.order], LENGTH)
+        np.testing.assert_array_equal(piece.outward, directions[piece.order])
+        assert whole.distance[piece.order].tobytes() == alone.distance.tobytes()
+        assert whole.depth[piece.order].tobytes() == alone.depth.tobytes()
