@@ -121,3 +121,23 @@ def test_neither_width_nor_colour_changes_what_is_printed(command):
     ]
     assert shown[0] == shown[1]
     assert "\x1b" not in shown[0]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full is of Linux")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ONE, [*ONE, "--json"]])
+def test_a_full_disk_under_stdout_is_told_in_one_line(arguments, unbuffered):
+    """Exit code 3, the reason, no traceback."""
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM, *arguments],
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+        )
+    told = [line for line in done.stderr.splitlines() if "stdout" in line]
+    assert done.returncode == PROGRAM_FAILED
+    assert told == ["stdout: No space left on device; allowed: a place that takes it"]
+    assert "Traceback" not in done.stderr

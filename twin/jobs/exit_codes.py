@@ -20,7 +20,7 @@ from puncture_twin.planning.base.errors import (
     one_line,
 )
 from puncture_twin.twin.jobs.interrupt import insistent_ctrl_c
-from puncture_twin.twin.jobs.terminal import flush_output, leave_unread, reader_is_gone
+from puncture_twin.twin.jobs.terminal import flush_output, leave_unread, reader_is_gone, refusal_of
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 130, 141
 """The last two as the shell gives them for a program that Ctrl-C, or a closed pipe, has ended."""
@@ -58,9 +58,8 @@ def _exit_code_of(command: Callable[[], object], print_line: PrintLine) -> int:
             return code
         except (BrokenPipeError, SystemExit) as error:  # click and rich end the program at any broken pipe
             return _unread(error)
-        except Exception:  # the last line of defence: the user gets exit code 3 and the traceback, whatever broke
-            traceback.print_exc()
-            return PROGRAM_FAILED
+        except Exception as error:  # the last line of defence: the user gets exit code 3, and the traceback
+            return _failed(error, print_line)
     if result == INTERRUPTED:  # typer itself turns Ctrl-C into this, and says nothing
         print_line("interrupted")
     return result if isinstance(result, int) else OK
@@ -74,6 +73,17 @@ def _unread(error: BaseException) -> int:
         return PROGRAM_FAILED
     leave_unread(sys.stdout)
     return UNREAD
+
+
+def _failed(error: Exception, print_line: PrintLine) -> int:
+    """What broke is shown whole, unless it is that stdout takes nothing, as where its disk is full."""
+    why = refusal_of(sys.stdout) if isinstance(error, OSError) else None
+    if why is None:
+        traceback.print_exc()
+    else:
+        leave_unread(sys.stdout)
+        print_line(f"stdout: {why}; allowed: a place that takes it")
+    return PROGRAM_FAILED
 
 
 def _line_and_code(error: PlanningError | ClickException) -> tuple[str, int]:

@@ -49,6 +49,17 @@ def reader_is_gone(stream: TextIO) -> bool:
         return False
 
 
+def refusal_of(stream: TextIO | None) -> str | None:
+    """Why a stream does not take a line end, as where the disk is full; None where it does, and has it then."""
+    try:
+        if stream is not None and not stream.closed:
+            stream.write("\n")
+            stream.flush()
+    except OSError as error:
+        return error.strerror
+    return None
+
+
 def leave_unread(stream: TextIO) -> None:
     """Send whatever a stream still holds nowhere, so that the end of the program does not fail by it."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
