@@ -18,17 +18,19 @@ sys.path.insert(0, str(ROOT / "tests"))
 from walls.house import arrows, is_package, modules  # noqa: E402  (the walls that the tests hold read the same imports)
 
 COLORS = {"planning": ("#dbe9f6", "#1f4e8c"), "twin": ("#fbe5d0", "#a65e12"), "": ("#e8e8e8", "#444444")}
-WIDTH, STEP = 2.3, 1.5
+WIDTH, STEP = 2.5, 1.9
 """Distance of two columns, and of two levels."""
 COLUMNS = {
-    "run_twin": 0.0, "api": 1.4, "twin/jobs": -1.2, "planning/base": 1.4, "planning/geometry": 1.4,
-    "meshes": -4.7, "twin/phantoms": -3.7, "twin/guidance/ultrasound": -2.7, "twin/guidance/stereo": -1.7,
-    "twin/rehearsal": -0.7, "twin/report": 0.3, "planning/export": 2.0,
-    "twin/plant": -1.7, "twin/world": -0.5, "planning/place": 0.6, "planning/plan": 1.6, "planning/certify": 2.6,
-    "planning/batch": 3.6, "planning/init": 4.6, "planning/collision_cases": 4.6, "planning/search": 2.6,
-    "planning/motion": 0.1, "planning/reach": 2.1, "planning/uncertainty": 3.6,
-    "planning/registration": -0.9, "planning/collision": 1.4, "planning/clearance": 3.2,
-    "planning/anatomy": 1.4, "planning/case": 1.4, "planning/formats": 2.1, "planning/arm": 0.7,
+    "run_twin": 1.15, "api": 2.3, "twin/jobs": 1.15,
+    "twin/experiment": -3.8, "twin/guidance/ultrasound": -2.7, "twin/guidance/stereo": -1.6, "twin/rehearsal": -0.5,
+    "twin/report": 0.6, "twin/guidance/ct": 1.7, "twin/phantoms": -3.8, "twin/plant": -1.6, "twin/world": -0.5,
+    "planning/export": 1.7, "planning/touch": 2.8, "planning/collision_cases": 3.9,
+    "planning/place": 0.6, "planning/plan": 1.7, "planning/certify": 2.8, "planning/batch": 3.9,
+    "planning/budget": 5.0, "planning/sweep": 6.1, "planning/search": 2.8, "planning/uncertainty": 2.8,
+    "planning/registration": 0.6, "planning/motion": 1.7, "planning/reach": 2.8,
+    "planning/collision": 1.7, "planning/clearance": 3.5, "planning/init": 4.6,
+    "planning/anatomy": 2.3, "planning/case": 2.3, "planning/arm": 1.2, "planning/breathing": 2.3,
+    "planning/needle": 3.4, "planning/formats": 2.3, "planning/geometry": 2.3, "planning/base": 2.3, "meshes": 1.2,
 }  # fmt: skip
 """Where each room stands from left to right; a room that is not listed goes to the far right of its level."""
 
@@ -97,7 +99,7 @@ def places(graph):
 def draw(graph, sizes):
     """The figure."""
     edges, at = needed(graph), places(graph)
-    figure, ax = plt.subplots(figsize=(25, 13), dpi=72)
+    figure, ax = plt.subplots(figsize=(22, 20), dpi=72)
     for room, other in sorted(edges):
         arrow(ax, at[room], at[other], room)
     for room in graph:
@@ -121,18 +123,18 @@ def box(ax, x, y, room, size):
     """A room with its name and its number of modules."""
     fill, line = colors(room)
     style = {"boxstyle": "round,pad=0.02,rounding_size=0.12", "facecolor": fill, "edgecolor": line, "linewidth": 1.4}
-    ax.add_patch(FancyBboxPatch((x - 1.02, y - 0.36), 2.04, 0.72, zorder=3, **style))
+    ax.add_patch(FancyBboxPatch((x - 1.18, y - 0.5), 2.36, 1.0, zorder=3, **style))
     name = (room.partition("/")[2] or room).replace("guidance/", "guidance/\n").replace("collision_", "collision_\n")
     middle = {"ha": "center", "va": "center", "zorder": 4}
-    ax.text(x, y + 0.09, name, fontsize=11, weight="bold", color=line, linespacing=0.85, **middle)
+    ax.text(x, y + 0.13, name, fontsize=12, weight="bold", color=line, linespacing=0.85, **middle)
     count = "data" if size == 0 else f"{size} module{'s' * (size > 1)}"
-    ax.text(x, y - 0.25, count, fontsize=8, **middle)
+    ax.text(x, y - 0.35, count, fontsize=10, **middle)
 
 
 def arrow(ax, start, end, room):
     """A curve that leaves a room downward and comes to the other from above."""
     (x, y), (to_x, to_y) = start, end
-    y, to_y = y - 0.38, to_y + 0.4
+    y, to_y = y - 0.52, to_y + 0.54
     bend = 0.45 * (y - to_y)
     curve = Curve([(x, y), (x, y - bend), (to_x, to_y + bend), (to_x, to_y)], [Curve.MOVETO, *[Curve.CURVE4] * 3])
     style = {"arrowstyle": "-|>", "mutation_scale": 13, "linewidth": 1.4, "color": colors(room)[1], "alpha": 0.8}
@@ -142,7 +144,7 @@ def arrow(ax, start, end, room):
 def main() -> None:
     """Write the picture."""
     assert modules()
-    draw(*room_graph()).savefig(Path(__file__).parent / "pictures" / "architecture.png")
+    draw(*room_graph()).savefig(Path(__file__).parent / "pictures" / "architecture.png", bbox_inches="tight")
 
 
 if __name__ == "__main__":
