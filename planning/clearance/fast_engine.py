@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from functools import partial
 
 import numpy as np
 
@@ -33,7 +34,7 @@ PIECE_TRIANGLES = 20_000
 waits long for another at the end. Pieces do not depend on threads: which of equally near triangles is named may."""
 
 WORTH_THREADS = 20_000
-"""Answers, a few milliseconds of work: below, starting threads takes as long."""
+"""Answers, or triangles to pack: a few milliseconds of work. Below, starting threads takes as long."""
 
 LONGEST_MM = 1e9
 """A needle that could reach the nodes that only fill a level up would be measured from them."""
@@ -63,7 +64,7 @@ class FastEngine:
         memory: Memory = NO_MEMORY,
         threads: int = MOST_THREADS,
     ) -> None:
-        self._blocks = tuple(_packed(mesh, memory) for mesh in meshes)
+        self._blocks = _packed(meshes, threads) if memory is NO_MEMORY else _remembered(meshes, memory)
         self._seen: tuple[Floats, tuple[PlacedSurface, ...]] | None = None
         self._threads = threads
         self._progress = progress
@@ -145,8 +146,22 @@ def _refuse_unsound(target: Floats, outward: Floats, lengths: Floats) -> None:
         raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
 
 
-def _packed(mesh: TriangleMesh, memory: Memory) -> Blocks:
-    """A surface as blocks of triangles; it is the same for every target."""
-    if memory is NO_MEMORY:
-        return pack(mesh)
-    return memory.get((__name__, mesh.digest), lambda: pack(mesh), lambda blocks: blocks.nbytes)
+def _packed(meshes: Sequence[TriangleMesh], threads: int) -> tuple[Blocks, ...]:
+    """Surfaces as blocks of triangles, packed side by side, the largest first; they are the same for every target."""
+    found: dict[int, Blocks] = {}
+    order = sorted(range(len(meshes)), key=lambda row: -len(meshes[row].faces))
+
+    def work(k: int) -> None:
+        found[order[k]] = pack(meshes[order[k]])
+
+    many = sum(len(mesh.faces) for mesh in meshes) >= WORTH_THREADS
+    for _ in on_threads(work, len(meshes), threads if many else 1):
+        pass
+    return tuple(found[row] for row in range(len(meshes)))
+
+
+def _remembered(meshes: Sequence[TriangleMesh], memory: Memory) -> tuple[Blocks, ...]:
+    """The same, those that an earlier case packed taken from memory."""
+    return tuple(
+        memory.get((__name__, mesh.digest), partial(pack, mesh), lambda blocks: blocks.nbytes) for mesh in meshes
+    )

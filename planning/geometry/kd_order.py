@@ -30,7 +30,7 @@ def kd_order(points: NDArray[np.float64], leaf: int) -> NDArray[np.int64]:
     return order
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _sort(records, order, leaf):  # type: ignore[no-untyped-def]  # numba infers
     """Split range after range, each at its left-balanced middle."""
     stack = np.empty((STACK, 2), np.int64)
@@ -51,22 +51,23 @@ def _sort(records, order, leaf):  # type: ignore[no-untyped-def]  # numba infers
         waiting += 2
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _longest_side(records, low, high):  # type: ignore[no-untyped-def]  # numba infers
     """Axis along which a range of points extends most."""
-    axis, longest = 0, np.float32(-1.0)
-    for a in range(3):
-        least = most = records[low, a]
-        for i in range(low + 1, high):
-            x = records[i, a]
-            least = x if x < least else least
-            most = x if x > most else most
-        if most - least > longest:
-            axis, longest = a, most - least
-    return axis
+    x0 = x1 = records[low, 0]
+    y0 = y1 = records[low, 1]
+    z0 = z1 = records[low, 2]
+    for i in range(low + 1, high):
+        x, y, z = records[i, 0], records[i, 1], records[i, 2]
+        x0, y0, z0 = min(x0, x), min(y0, y), min(z0, z)
+        x1, y1, z1 = max(x1, x), max(y1, y), max(z1, z)
+    dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+    if dx >= dy and dx >= dz:
+        return 0
+    return 1 if dy >= dz else 2
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _select(records, order, low, high, middle, axis):  # type: ignore[no-untyped-def]  # numba infers
     """Rearrange a range until no point before ``middle`` lies above one behind it (Hoare's selection)."""
     high -= 1

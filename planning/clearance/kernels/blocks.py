@@ -72,7 +72,7 @@ def _outward(disc: Floats) -> NDArray[np.float32]:
     return grown.astype(np.float32)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _middles(vertices, faces):  # type: ignore[no-untyped-def]  # numba infers
     """Middle of each triangle's box, shape (m, 3), float32."""
     middles = np.empty((len(faces), 3), np.float32)
@@ -84,7 +84,7 @@ def _middles(vertices, faces):  # type: ignore[no-untyped-def]  # numba infers
     return middles
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _fill(vertices, faces, order, triangles):  # type: ignore[no-untyped-def]  # numba infers
     """Copy the corners in order, the last triangle again and again to the end."""
     for row in range(len(triangles)):
@@ -95,7 +95,7 @@ def _fill(vertices, faces, order, triangles):  # type: ignore[no-untyped-def]  #
                 triangles[row, 3 * corner + x] = vertices[vertex, x]
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _block_discs(triangles, local, center, disc):  # type: ignore[no-untyped-def]  # numba infers
     """Disc of every block, and its corners relative to the disc's centre."""
     for block in range(len(local)):
@@ -128,7 +128,7 @@ def _block_discs(triangles, local, center, disc):  # type: ignore[no-untyped-def
         disc[3, block], disc[4, block] = np.sqrt(rho2), h
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _center_along(rows, n, c):  # type: ignore[no-untyped-def]  # numba infers
     """Move a centre along the normal to the middle of what it must hold."""
     least, most = np.inf, -np.inf
@@ -142,7 +142,7 @@ def _center_along(rows, n, c):  # type: ignore[no-untyped-def]  # numba infers
         c[x] += 0.5 * (least + most) * n[x]
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _mean_normal(rows):  # type: ignore[no-untyped-def]  # numba infers
     """Unit mean of the triangles' normals by area, all turned to the side of the largest; z where there is none."""
     total, first, largest, area = np.zeros(3), np.zeros(3), 0.0, 0.0
@@ -167,7 +167,7 @@ def _mean_normal(rows):  # type: ignore[no-untyped-def]  # numba infers
     return total / norm
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _parent_discs(center, disc, child, count, parent):  # type: ignore[no-untyped-def]  # numba infers
     """Discs of one level around those of the level below, whose nodes ``child`` ... ``child + count`` they hold.
 
@@ -201,13 +201,13 @@ def _parent_discs(center, disc, child, count, parent):  # type: ignore[no-untype
         disc[3, parent + group], disc[4, parent + group] = rho, 0.5 * (most - least)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _dot(p, q):  # type: ignore[no-untyped-def]  # numba infers
     """Inner product of two vectors of three, however they lie in memory."""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _reach_along(disc, j, n):  # type: ignore[no-untyped-def]  # numba infers
     """How far a disc reaches from its centre along n, mm."""
     q = _dot(disc[:3, j], n)
