@@ -21,6 +21,7 @@ from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.twin.jobs.batch.commands import batch_app
+from puncture_twin.twin.jobs.call_room import with_room
 from puncture_twin.twin.jobs.collector import late_collection
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, exit_code_of
 from puncture_twin.twin.jobs.extras import require_extra
@@ -710,7 +711,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for one another
     with late_collection():
-        return exit_code_of(partial(app, arguments, standalone_mode=False), _print_whole)
+        return with_room(partial(exit_code_of, partial(app, arguments, standalone_mode=False), _print_whole))
 
 
 def _print_whole(line: str) -> None:
