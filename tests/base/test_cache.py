@@ -269,8 +269,8 @@ def test_what_older_versions_left_is_cleared(cache, monkeypatch):
 @pytest.mark.parametrize("maker", MAKERS)
 def test_the_libraries_of_every_maker_are_in_the_key(maker):
     """Whatever its code imports is this project, Python's own or a library whose version counts."""
-    files = closure([PROJECT / (maker.replace(".", "/") + ".py")])
-    imports = [found for path in files for found in IMPORTED.findall(path.read_bytes())]
+    files = closure([f"{PROJECT}/{maker.replace('.', '/')}.py"])
+    imports = [found for file in files for found in IMPORTED.findall(Path(file).read_bytes())]
     modules = {name for module, _, listed in imports for name in ([module] if module else NAME.findall(listed))}
     tops = {module.decode().split(".")[0] for module in modules}
     packages = {"skimage": "scikit-image", "fcl": "python-fcl", "fast_simplification": "fast-simplification"}
@@ -281,22 +281,19 @@ def test_the_libraries_of_every_maker_are_in_the_key(maker):
 
 def test_the_code_that_makes_a_surface_is_in_its_stamp():
     """From reading a file to the surface: each of these modules decides what is kept."""
-    names = {
-        str(path.relative_to(PROJECT))
-        for path in closure([PROJECT / "puncture_twin" / "planning" / "anatomy" / "surfaces.py"])
-    }
+    names = closure([f"{PROJECT}/puncture_twin/planning/anatomy/surfaces.py"])
     volumes = (f"formats/volumes/{name}" for name in ("nifti_header", "inflate", "voxels"))
     wanted = ("anatomy/skin", "anatomy/body/body_mask", "formats/labels/label_surface", *volumes)
-    assert {f"puncture_twin/planning/{name}.py" for name in wanted} <= names
+    assert {f"{PROJECT}/puncture_twin/planning/{name}.py" for name in wanted} <= names
 
 
 def test_the_code_that_reads_a_volume_decides_what_is_kept_of_it(tmp_path, monkeypatch):
     """Readers of DICOM are handed in: the organ of the old one stayed when one was mended."""
-    files = {
-        str(path.relative_to(PROJECT)) for path in closure([PROJECT / (surfaces.READERS.replace(".", "/") + ".py")])
-    }
+    files = closure([f"{PROJECT}/{surfaces.READERS.replace('.', '/')}.py"])
     dicom = [f"dicom/{name}" for name in ("ct_series", "tilt", "segmentation", "structure_set", "polygon_fill")]
-    assert {f"puncture_twin/planning/formats/{name}.py" for name in (*dicom, "labels/slicer_segments")} <= files
+    assert {
+        f"{PROJECT}/puncture_twin/planning/formats/{name}.py" for name in (*dicom, "labels/slicer_segments")
+    } <= files
     assert {"pydicom", "python-gdcm"} <= set(LIBRARIES)
     made = []
     for stamp in ("old", "old", "mended"):

@@ -21,7 +21,7 @@ from numba.core import config as numba_config
 from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
 
 from puncture_twin.planning.base.cache.kernel_files import CheckedFiles, ProjectStamp, use_checked_files
-from puncture_twin.planning.base.cache.source_stamp import PACKAGE, PARTS, library_versions, stamp_of
+from puncture_twin.planning.base.cache.source_stamp import PACKAGE, PARTS, library_versions, sources_with, stamp_of
 
 config: Any = numba_config
 """It makes its attributes when it is loaded."""
@@ -45,8 +45,7 @@ def kernels_stamp() -> ProjectStamp:
 
     What they import counts too: numba freezes a constant into the kernel that names it. So do the compilers' versions.
     """
-    files = [path for part in PARTS for path in (PACKAGE / part).rglob("*.py") if b"numba" in path.read_bytes()]
-    return ProjectStamp(f"{stamp_of(files)} {library_versions(COMPILERS)}")
+    return ProjectStamp(f"{stamp_of(sources_with(b'numba'))} {library_versions(COMPILERS)}")
 
 
 @cache
