@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
-from puncture_twin.planning.formats.meshes.glb import read_glb
 from puncture_twin.planning.formats.meshes.obj import read_obj
 from puncture_twin.planning.formats.meshes.ply import read_ply
 from puncture_twin.planning.formats.meshes.stl import read_stl
@@ -34,8 +33,15 @@ from puncture_twin.planning.geometry.units import Unit
 MAX_FILE_BYTES = 2_000_000_000
 """Twenty million triangles of binary STL are 1 GB; a file beyond twice that is refused before it is read."""
 
+
+def _read_glb(data: bytes, where: str) -> RawMesh:
+    from puncture_twin.planning.formats.meshes.glb import read_glb  # here: its schema costs all others 0.02 s
+
+    return read_glb(data, where)
+
+
 _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
-    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": read_glb, ".vtp": read_vtp, ".vtk": read_vtk}
+    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": _read_glb, ".vtp": read_vtp, ".vtk": read_vtk}
 )
 
 _STATEMENT = re.compile(rb"3D Slicer output\. SPACE=(LPS|RAS)\b")
