@@ -14,7 +14,7 @@ from puncture_twin.planning.batch.run import RunCounts
 from puncture_twin.planning.batch.state import CohortState
 from puncture_twin.twin.jobs.batch.merge_job import Merged
 from puncture_twin.twin.jobs.batch.plan_job import PlanRun, estimate_summary
-from puncture_twin.twin.report.progress import duration_text
+from puncture_twin.twin.report.pace import duration_text
 
 MOST_LINES = 10
 """Of a list; the rest is counted. ``--json`` has all."""
