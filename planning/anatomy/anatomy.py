@@ -145,10 +145,10 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     structures.extend(beyond.structures)
     _check_names(case, [*structures, *outside])
     _check_target(case, structures, skin)
-    warnings = [*loader.warnings, *beyond.warnings, *left_out, *skin.warnings]
-    for structure in (one for one in structures if one.source != OWN_TARGET):  # the ball is ours
-        warnings.extend(kept_mesh_warnings(structure.mesh, structure.name, cache.memory))
-    return Anatomy(tuple(structures), skin, tuple(warnings), outside, scan, tuple(loader.ignored), couch)
+    read = {one.name: one.mesh for one in structures if one.source != OWN_TARGET}  # the ball is ours
+    of_meshes = kept_mesh_warnings(read, cache)
+    warnings = (*loader.warnings, *beyond.warnings, *left_out, *skin.warnings, *of_meshes)
+    return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch)
 
 
 def _outside(case: Case, scan: Scan, outside: Outside, warnings: list[str]) -> tuple[Structure, ...]:

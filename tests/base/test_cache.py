@@ -21,6 +21,7 @@ BY = "puncture_twin.planning.anatomy.surfaces"
 MAKERS = (
     "puncture_twin.planning.anatomy.surfaces",
     "puncture_twin.planning.anatomy.scan",
+    "puncture_twin.planning.formats.meshes.mesh_warnings",
     "puncture_twin.planning.collision.packed.hulls",
     "puncture_twin.planning.collision.packed.skin",
     "puncture_twin.planning.collision.never_touching",

@@ -3,6 +3,7 @@
 import base64
 import json
 import struct
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -16,10 +17,11 @@ from places import DATA, TESTS
 from scipy.spatial import cKDTree
 from slicer_files import vtk_model
 
+from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
-from puncture_twin.planning.formats.meshes.mesh_warnings import mesh_warnings
+from puncture_twin.planning.formats.meshes.mesh_warnings import kept_mesh_warnings, mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.geometry.units import Unit
@@ -718,6 +720,25 @@ def test_unusual_meshes_work_with_a_warning(change: Callable[[np.ndarray], np.nd
     mesh = guard_mesh(BALL.vertices, change(BALL.faces), where="ball")
     (warning,) = mesh_warnings(mesh, "liver")
     assert warning.startswith("liver: ") and says in warning
+
+
+def test_what_is_kept_of_meshes_is_what_they_warn_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sentences or none, in the order of the meshes; found again for other names and other triangles alone."""
+    whole, cut = (guard_mesh(BALL.vertices, BALL.faces[left_out:], where="ball") for left_out in (0, 1))
+    meshes, cache = {"liver": cut, "spleen": whole, "aorta": cut}, Cache(tmp_path)
+    expected = (*mesh_warnings(cut, "liver"), *mesh_warnings(cut, "aorta"))
+    assert len(expected) == 2
+    found: list[str] = []
+
+    def counted(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
+        found.append(name)
+        return mesh_warnings(mesh, name)
+
+    monkeypatch.setattr(sys.modules[kept_mesh_warnings.__module__], "mesh_warnings", counted)
+    assert kept_mesh_warnings(meshes, cache) == kept_mesh_warnings(meshes, cache) == expected
+    assert kept_mesh_warnings({"a": whole}, cache) == kept_mesh_warnings({"a": whole}, cache) == ()
+    assert kept_mesh_warnings({**meshes, "spleen": cut}, cache) != expected
+    assert found == ["liver", "spleen", "aorta", "a", "liver", "spleen", "aorta"]
 
 
 needs_vh_male = pytest.mark.skipif(not VH_MALE.is_dir(), reason="the hubmap_vh_male set is not on this machine")

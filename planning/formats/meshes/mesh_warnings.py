@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Mapping
 
 import numpy as np
 
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.formats.mesh_guard import twice_areas
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -34,12 +34,21 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def kept_mesh_warnings(mesh: TriangleMesh, name: str, memory: Memory) -> tuple[str, ...]:
-    """As `mesh_warnings`; what this process keeps of the same mesh is not found again."""
-    if memory is NO_MEMORY:
-        return mesh_warnings(mesh, name)
-    key = (mesh_warnings.__name__, mesh.digest, name)
-    return memory.get(key, partial(mesh_warnings, mesh, name), lambda lines: sum(map(len, lines)))
+def kept_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tuple[str, ...]:
+    """As `mesh_warnings` of each mesh, by name; what was found of the same meshes before is not found again."""
+    made_from = {"what": "mesh warnings", "meshes": [(name, mesh.digest) for name, mesh in meshes.items()]}
+
+    def found() -> Arrays:
+        return {
+            "lines": np.array([line for name, mesh in meshes.items() for line in mesh_warnings(mesh, name)], np.str_)
+        }
+
+    return tuple(cache.arrays(made_from, found, by=__name__, check=_check_lines)["lines"].tolist())
+
+
+def _check_lines(kept: Arrays) -> None:
+    if kept["lines"].dtype.kind != "U" or kept["lines"].ndim != 1:
+        raise ValueError("no lines")
 
 
 def _signed_volume(mesh: TriangleMesh) -> float:
