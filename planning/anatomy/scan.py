@@ -38,7 +38,6 @@ from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.mesh_guard import fits
 from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 
 SKIN_TOLERANCE_MM = 3.0
@@ -171,7 +170,8 @@ class Scan:
             points_ct: Shape (n, 3), LPS mm.
         """
         T = np.linalg.inv(self._ct.T_ct_index)
-        index = np.round(apply(T, points_ct)).astype(np.int64)
+        at = np.einsum("ij,nj->ni", T[:3, :3], points_ct) + T[:3, 3]  # on one core: several wait for a busy one
+        index = np.round(at).astype(np.int64)
         inside = np.all((index >= 0) & (index < self._hu.shape), axis=1)
         found = np.full(len(points_ct), np.nan)
         found[inside] = self._hu[tuple(index[inside].T)]

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
-from pathlib import Path
-from typing import Literal
-
-import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ImageDraw, ImageFont
+from PIL import ImageDraw
 
 from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.twin.report.canvas.fonts import Anchor, Face, font
 from puncture_twin.twin.report.map_view import body_directions
 from puncture_twin.twin.report.raster.camera import ViewCamera
 
@@ -28,15 +24,6 @@ LEGEND_SIZE = 15
 
 SCALE_BARS_MM = (5, 10, 20, 50, 100, 200, 500)
 
-Anchor = Literal["lm", "rm", "mm", "la", "ra", "ma", "lb"]
-
-
-@cache
-def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans as matplotlib ships it, so that no system font is needed."""
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    return ImageFont.truetype(str(Path(mpl.get_data_path()) / "fonts" / "ttf" / name), size)
-
 
 def write(
     draw: ImageDraw.ImageDraw,
@@ -50,7 +37,11 @@ def write(
     halo: int = 0,
 ) -> None:
     """One line of text; ``halo`` is the width of a white rim in pixels."""
-    draw.text(at, text, fill=colour, font=font(size, bold), anchor=anchor, stroke_width=halo, stroke_fill=WHITE)
+    draw.text(at, text, fill=colour, font=font(size, _face(bold)), anchor=anchor, stroke_width=halo, stroke_fill=WHITE)
+
+
+def _face(bold: bool) -> Face:
+    return "bold" if bold else "plain"
 
 
 def width_of(text: str, size: int) -> float:
@@ -95,13 +86,13 @@ def body_axes(
         at = end[0] + out[0] * 6, end[1] + out[1] * (size * 0.75)
         short = name.removeprefix("patient's ")
         anchor: Anchor = "lm" if out[0] > 0.35 else "rm" if out[0] < -0.35 else "mm"
-        box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
+        box = draw.textbbox(at, short, font=font(size, _face(not far)), anchor=anchor)
         for side in (1, -1, 2, -2, 3, -3):  # beside words that already stand there: above them it would read as one
             if not any(_overlap(box, other) for other in taken):
                 break
             at = end[0] + side * size * 0.6, end[1]
             anchor = "lm" if side > 0 else "rm"
-            box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
+            box = draw.textbbox(at, short, font=font(size, _face(not far)), anchor=anchor)
         taken.append(box)
         write(draw, at, short, size=size, bold=not far, colour=colour, anchor=anchor, halo=2)
 

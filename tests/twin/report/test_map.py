@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import report_world as world
-from matplotlib.axes import Axes
 from PIL import Image
 
 from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.planning.search.selection.choice import best_pick
+from puncture_twin.twin.report.canvas.canvas import Canvas
 from puncture_twin.twin.report.map.front import MOST_DOTS, shown_front
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import row_colours
@@ -45,8 +45,12 @@ def with_clearance(found, mm):
 
 def written(monkeypatch, found, case, path):
     """All that the picture of these directions says."""
-    said, write = [], Axes.text
-    monkeypatch.setattr(Axes, "text", lambda axes, x, y, s, **look: said.append(s) or write(axes, x, y, s, **look))
+    said, write = [], Canvas.write
+    monkeypatch.setattr(
+        Canvas,
+        "write",
+        lambda canvas, at, text, *look, **more: said.append(text) or write(canvas, at, text, *look, **more),
+    )
     draw_map(found, case, path)
     assert Image.open(path).size[0] > 1000
     return said

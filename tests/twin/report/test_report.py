@@ -24,7 +24,8 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.directions import ring_weights
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate
-from puncture_twin.twin.report.map.map_picture import FIGURE_INCHES, MAP_BOX, RIM, draw_map
+from puncture_twin.twin.report.map.map_layout import disc_pixels
+from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
 from puncture_twin.twin.report.numbers import reason_counts
@@ -201,13 +202,7 @@ def test_a_pixel_has_the_colour_of_its_reason(case, theta_max):
 
 def map_pixel(image, view, theta_deg, beta_deg):
     """The colour of the finished picture at a direction, found from the layout of the figure."""
-    x, y = view.place(np.radians(theta_deg), np.radians(beta_deg))
-    width, height = image.size
-    assert width / height == pytest.approx(FIGURE_INCHES[0] / FIGURE_INCHES[1], rel=0.01)
-    left, bottom, box_width, box_height = np.array(MAP_BOX) * [width, height, width, height]
-    side = min(box_width, box_height)
-    column = left + box_width / 2 + x / RIM * side / 2
-    line = height - (bottom + box_height / 2 + y / RIM * side / 2)
+    column, line = disc_pixels(view.place(np.radians(theta_deg), np.radians(beta_deg)))
     return image.getpixel((int(column), int(line)))
 
 
@@ -745,7 +740,7 @@ def test_the_cross_s_words_keep_apart(monkeypatch, case, toward):
     image = ImageDraw.Draw(Image.new("RGB", (300, 300)))
 
     def note(draw, at, words, *, size, bold, anchor, **look):
-        boxes.append(draw.textbbox(at, words, font=annotate.font(size, bold), anchor=anchor))
+        boxes.append(draw.textbbox(at, words, font=annotate.font(size, "bold" if bold else "plain"), anchor=anchor))
 
     monkeypatch.setattr(annotate, "write", note)
     camera = ViewCamera(-500 * np.array(toward), np.zeros(3), np.array([0, -1.0, 0.1]), 0.5, 200, 200)

@@ -23,6 +23,8 @@ from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 from puncture_twin.twin.report.budget_picture import draw_budget
 from puncture_twin.twin.report.map.map_picture import draw_map
+from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
+from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Uncertainty, write_page
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
 from puncture_twin.twin.report.slices.sheet import Slices, draw_slices, write_sheet
@@ -30,10 +32,11 @@ from puncture_twin.twin.report.slices.subject import Subject
 
 
 class Drawn(NamedTuple):
-    """The pictures of a search and its plan: their files, and the slices that the page shows too."""
+    """The pictures of a search and its plan: their files, and what the page shows of them too."""
 
     files: tuple[Path, ...]
     slices: tuple[Slices, ...]
+    raster: MapRaster
 
 
 def with_pictures(run: Run, out: Path) -> Run:
@@ -46,7 +49,8 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
     context, found = run.context, run.candidates
     case, anatomy, stages = context.case, context.anatomy, context.stages
     with stages.time("map"):
-        draw_map(found, case, out / "map.png", run.pick)
+        raster = map_raster(found, map_view(case, found))
+        draw_map(found, case, out / "map.png", run.pick, raster)
     with stages.time("scene"):
         draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, failed=bool(run.refusal))
     with stages.time("slices"):
@@ -54,7 +58,7 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
         if slices:
             write_sheet(slices[0], out / SLICES)
     sheet = (out / SLICES,) if slices else ()
-    return Drawn((*sheet, out / "map.png", out / "scene.png"), slices)
+    return Drawn((*sheet, out / "map.png", out / "scene.png"), slices, raster)
 
 
 def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
@@ -80,6 +84,7 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
             slices=drawn.slices,
             facts=run.facts,
             refusal=run.refusal,
+            raster=drawn.raster,
         )
     return run.with_files(*drawn.files, out / PAGE)
 

@@ -3,66 +3,58 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
-from scipy import ndimage
+from PIL import Image
 
-from puncture_twin.planning.base.arrays import Bools, Texts
+from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.search.candidates import Candidates, Verdict
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
-from puncture_twin.twin.report.map.chance_layer import draw_chances
+from puncture_twin.twin.report.canvas.canvas import BLACK, Canvas, Halo, Words, circle
+from puncture_twin.twin.report.map.chance_layer import chance_picture
 from puncture_twin.twin.report.map.front import shown_front
+from puncture_twin.twin.report.map.map_layout import (
+    HEIGHT,
+    MIDDLE,
+    POINT,
+    RADIUS,
+    RINGS_AT,
+    Label,
+    disc_pixels,
+    ring_radii,
+)
+from puncture_twin.twin.report.map.map_marks import mark_dot, mark_ring, mark_star
+from puncture_twin.twin.report.map.map_names import region_codes, region_labels
 from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map.map_side import draw_side
 from puncture_twin.twin.report.map_view import BEYOND, MapView, map_view, step_of
 from puncture_twin.twin.report.numbers import needle_text, target_text
 from puncture_twin.twin.report.palette import PNG_LEVEL
 
-PIXELS = 1120
-"""Side of the raster; finer than the picture shows it."""
-
-FIGURE_INCHES = (13.0, 9.4)
-DPI = 130
-MAP_BOX = (0.015, 0.05, 0.66, 0.85)
-SIDE_BOX = (0.685, 0.05, 0.305, 0.85)
-RIM = 1.26
-"""Half the side of the map's axes; the disc has radius 1, labels lie between."""
-
-NAMED_FRACTION = 0.006
-"""Least fraction of the disc that a rejected region needs to carry its structure's name."""
-
-NOT_SEEN_HERE = "not seen"
-"""In a region whose directions leave what was scanned; the legend says how."""
-
-NAME_POINTS = 9.0
-"""Size of a name, or of a ring's angle; no two of them lie over one another while there is room."""
-
-RINGS_AT = np.radians(67.5)
-"""Where the rings' angles are written, counter-clockwise from the right."""
+WIDTH = 1690
 
 BORDER_OPACITY = 0.45
+"""Of the lines between regions of different structures."""
 
-HALO = (withStroke(linewidth=3.2, foreground="white"),)
+RIM_LABEL = 0.95
+"""Of the disc's radii: the angle of a ring at the rim stands there, not over the line."""
+
+RIM_HALO = Halo(1.6 * POINT)
+NAME = Words(9 * POINT, "slanted", halo=RIM_HALO)
+RING = Words(9 * POINT, halo=RIM_HALO)
+AZIMUTH = Words(9 * POINT, colour=(64, 64, 64))
+DIRECTION = Words(14 * POINT, "bold")
+TITLE, SUBTITLE = Words(19 * POINT, "bold"), Words(12 * POINT, colour=(64, 64, 64))
+NOTICE = Words(9 * POINT, colour=(102, 102, 102))
 
 
-class Label(NamedTuple):
-    """What is written on the map, and where, in the disc's radii (x right, y up)."""
-
-    x: float
-    y: float
-    text: str
-
-
-def draw_map(candidates: Candidates, case: Any, path: Path, pick: Pick | None = None) -> None:
+def draw_map(
+    candidates: Candidates, case: Any, path: Path, pick: Pick | None = None, raster: MapRaster | None = None
+) -> None:
     """Write the map of a search.
 
     Args:
@@ -70,65 +62,94 @@ def draw_map(candidates: Candidates, case: Any, path: Path, pick: Pick | None = 
         case: The case: ``name``, ``space``, ``T_ct_entry``, ``needle``, ``target_name``.
         path: The PNG to write; it appears whole or not at all.
         pick: The planned candidate, or the one to be shown; None shows the best.
+        raster: The map's pixels where somebody has them already.
     """
     pick = pick or best_pick(candidates)
     view = map_view(case, candidates)
-    raster = map_raster(candidates, view, PIXELS)
-    figure = Figure(figsize=FIGURE_INCHES, dpi=DPI, facecolor="white")
-    axes = figure.add_axes(MAP_BOX)
-    axes.imshow(raster.rgba, extent=(-1, 1, -1, 1), interpolation="antialiased", zorder=1)
-    _frame(axes, view)
-    draw_chances(axes, candidates, raster.rows)
-    _outline(axes, raster, candidates)
+    raster = map_raster(candidates, view) if raster is None else raster
+    codes, names = region_codes(candidates.verdict, raster.rows)
+    canvas = Canvas(WIDTH, HEIGHT)
+    _disc(canvas, _lined(raster, candidates, codes))
+    _frame(canvas, view)
+    chances = chance_picture(candidates, raster.rows, 2 * RADIUS)
+    if chances is not None:
+        _disc(canvas, chances)
     bests = [window.best for window in find_windows(candidates).windows[:MOST_WINDOWS]]
-    _names(axes, raster, candidates, [*_ring_labels(view), *_best_labels(view, candidates, bests)])
-    _marks(axes, view, candidates, bests, pick)
-    _title(figure, case, candidates)
-    draw_side(figure.add_axes(SIDE_BOX), candidates, view, pick)
+    rings = _ring_labels(view)
+    for x, y, text in rings:
+        canvas.write(tuple(disc_pixels((x, y))), text, RING, anchor="mm")
+    for x, y, text in region_labels(codes, names, [*rings, *_best_labels(view, candidates, bests)]):
+        canvas.write(tuple(disc_pixels((x, y))), text, NAME, anchor="mm")
+    _marks(canvas, view, candidates, bests, pick)
+    _title(canvas, case, candidates)
+    draw_side(canvas, candidates, view, pick)
     with atomic(Path(path)) as temporary:
-        FigureCanvasAgg(figure)
-        figure.savefig(temporary, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
+        canvas.image.convert("RGB").save(temporary, format="PNG", compress_level=PNG_LEVEL)
 
 
-def _frame(axes: Axes, view: MapView) -> None:
-    axes.set_xlim(-RIM, RIM)
-    axes.set_ylim(-RIM, RIM)
-    axes.set_aspect("equal")
-    axes.set_axis_off()
-    turns = np.linspace(0, 2 * np.pi, 721)
-    top = np.degrees(view.theta_max)
-    for ring in _rings(view):
-        radius = ring / top
+def _disc(canvas: Canvas, rgba: NDArray[np.uint8]) -> None:
+    """Lay a picture of the disc, as fine as it may be, where the disc is."""
+    size = 2 * RADIUS
+    shown = rgba if len(rgba) == size else _smaller(rgba, size)
+    canvas.paste(shown, round(MIDDLE[0]) - RADIUS, round(MIDDLE[1]) - RADIUS)
+
+
+def _smaller(rgba: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+    return np.array(Image.fromarray(rgba).resize((size, size), Image.Resampling.HAMMING))
+
+
+def _lined(raster: MapRaster, candidates: Candidates, codes: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """The raster with lines between regions of different structures, and about what is safe."""
+    rgba = raster.rgba.copy()
+    between = _edges(codes, named=True)
+    rgba[between, :3] = np.round(rgba[between, :3] * (1 - BORDER_OPACITY))
+    around = _edges(np.append(candidates.safe, False)[raster.rows].astype(np.int64))
+    rgba[around] = (*BLACK, 255)
+    return rgba
+
+
+def _edges(values: NDArray[np.int64], *, named: bool = False) -> Bools:
+    """Pixels within one of where two values lie beside each other; where ``named``, of two that are not 0."""
+    marked = np.zeros(values.shape, dtype=bool)
+    for here, there, at in (
+        (values[:-1], values[1:], marked[:-1]),
+        (values[:, :-1], values[:, 1:], marked[:, :-1]),
+    ):
+        at |= (here != there) & ((here * there != 0) | (not named))
+    wide = marked.copy()
+    wide[1:] |= marked[:-1]
+    wide[:-1] |= marked[1:]
+    wider = wide.copy()
+    wider[:, 1:] |= wide[:, :-1]
+    wider[:, :-1] |= wide[:, 1:]
+    return wider
+
+
+def _frame(canvas: Canvas, view: MapView) -> None:
+    """Rings, spokes and what lies beyond the rim."""
+    for ring, radius in ring_radii(view):
         wide = 1.6 if ring == 90 and view.theta_max > BEYOND else 0.7
-        axes.plot(radius * np.cos(turns), radius * np.sin(turns), color="black", lw=wide, alpha=0.45, zorder=3)
-    for x, y, text in _ring_labels(view):
-        _text(axes, x, y, text, size=NAME_POINTS)
-    axes.plot(np.cos(turns), np.sin(turns), color="black", lw=1.2, zorder=3)
+        canvas.line(circle(MIDDLE, radius * RADIUS, 180), wide * POINT, BLACK, opacity=0.45)
+    canvas.line(circle(MIDDLE, RADIUS, 360), 1.2 * POINT, BLACK)
     for beta in range(0, 360, 30):
         angle = np.radians(beta) + view.turn
-        c, s = np.cos(angle), np.sin(angle)
-        axes.plot([0, c], [0, s], color="black", lw=0.5, alpha=0.3, zorder=3)
-        axes.plot([c, 1.02 * c], [s, 1.02 * s], color="black", lw=1.0, zorder=3)
-        axes.text(1.085 * c, 1.07 * s, f"β {beta}°", ha="center", va="center", fontsize=9, color="0.25")
+        spoke = np.array([np.cos(angle), np.sin(angle)])
+        canvas.line(disc_pixels(np.outer([0.0, 1.0], spoke)), 0.5 * POINT, BLACK, opacity=0.3)
+        canvas.line(disc_pixels(np.outer([1.0, 1.02], spoke)), POINT, BLACK)
+        canvas.write(tuple(disc_pixels(spoke * (1.085, 1.07))), f"β {beta}°", AZIMUTH, anchor="mm")
     for text, angle in view.rim:
         # Upright at the sides, so that long words stay in the picture.
         side = abs(np.cos(angle)) > 0.8 and len(text) > 3
-        turn = (90 if np.cos(angle) < 0 else -90) if side else 0
-        where = 1.215 * np.cos(angle), 1.16 * np.sin(angle)
-        axes.text(*where, text, ha="center", va="center", fontsize=14, fontweight="bold", rotation=turn)
-
-
-def _rings(view: MapView) -> range:
-    """θ of the rings that are drawn, degrees."""
-    top = np.degrees(view.theta_max)
-    spacing = 15 if top <= 100 else 30
-    return range(spacing, int(top) + 1, spacing)
+        turned = (1 if np.cos(angle) < 0 else -1) if side else 0
+        where = disc_pixels((1.215 * np.cos(angle), 1.16 * np.sin(angle)))
+        canvas.write(tuple(where), text, DIRECTION, anchor="mm", turned=turned)
 
 
 def _ring_labels(view: MapView) -> list[Label]:
-    """The rings' angles."""
-    radii = [(ring, ring / float(np.degrees(view.theta_max))) for ring in _rings(view)]
-    return [Label(r * np.cos(RINGS_AT), r * np.sin(RINGS_AT), f"θ {ring}°") for ring, r in radii]
+    """The rings' angles; that of a ring at the rim stands within it."""
+    cosine, sine = float(np.cos(RINGS_AT)), float(np.sin(RINGS_AT))
+    radii = [(ring, min(radius, RIM_LABEL)) for ring, radius in ring_radii(view)]
+    return [Label(radius * cosine, radius * sine, f"θ {ring}°") for ring, radius in radii]
 
 
 def _best_labels(view: MapView, candidates: Candidates, bests: list[int]) -> list[Label]:
@@ -136,97 +157,28 @@ def _best_labels(view: MapView, candidates: Candidates, bests: list[int]) -> lis
     return [Label(x, y, "OO") for x, y in view.place(candidates.theta[bests], candidates.beta[bests])]
 
 
-def _outline(axes: Axes, raster: MapRaster, candidates: Candidates) -> None:
-    safe = np.append(candidates.safe, False)[raster.rows]
-    if safe.any() and not safe.all():
-        axis = (np.arange(PIXELS) + 0.5) / PIXELS * 2 - 1
-        axes.contour(axis, -axis, safe.astype(float), levels=[0.5], colors="black", linewidths=1.3, zorder=4)
+def _marks(canvas: Canvas, view: MapView, candidates: Candidates, bests: list[int], pick: Pick | None) -> None:
+    """The centre, the Pareto front, the best of each window, and the chosen direction."""
 
+    def places(rows: Any, of: Candidates = candidates) -> Any:
+        return disc_pixels(view.place(of.theta[rows], of.beta[rows]))
 
-def _names(axes: Axes, raster: MapRaster, candidates: Candidates, written: list[Label]) -> None:
-    """Write into every large enough region what forbids it, off what is written there, and part regions by a line."""
-    every, coded = np.unique(np.append(_region_names(candidates.verdict), ""), return_inverse=True)
-    codes = coded[raster.rows]
-    parted = np.zeros(codes.shape, dtype=bool)
-    parted[:-1] = (codes[1:] != codes[:-1]) & (codes[1:] * codes[:-1] > 0)
-    parted[:, :-1] |= (codes[:, 1:] != codes[:, :-1]) & (codes[:, 1:] * codes[:, :-1] > 0)
-    border = np.zeros((*codes.shape, 4), dtype=np.uint8)
-    border[ndimage.binary_dilation(parted, np.ones((3, 3))), 3] = round(255 * BORDER_OPACITY)
-    axes.imshow(border, extent=(-1, 1, -1, 1), interpolation="antialiased", zorder=2)
-    coarse = codes[::4, ::4]
-    free = np.ones(coarse.shape, dtype=bool)
-    for x, y, text in written:
-        _taken(free, *_pixel(x, y, len(coarse)), *_half_size(text, len(coarse)))
-    for depth, structure in _regions(coarse, list(map(str, every))):
-        text = structure.replace("_", " ")
-        high, wide = _half_size(text, len(coarse))
-        space = np.where(ndimage.minimum_filter(free, (2 * high + 1, 2 * wide + 1)), depth, 0.0)
-        row, column = np.unravel_index(int(np.where(space.any(), space, depth).argmax()), depth.shape)
-        _taken(free, int(row), int(column), high, wide)
-        x, y = (column + 0.5) / len(coarse) * 2 - 1, 1 - (row + 0.5) / len(coarse) * 2
-        _text(axes, x, y, text, size=NAME_POINTS, style="italic")
-
-
-def _region_names(verdict: Verdict) -> Texts:
-    """What is written over each direction, shape (n,): the structure that forbids it, or "unknown" and why."""
-    unknown = verdict.reason == Reason.UNKNOWN_REGION.value
-    named = np.where(verdict.reason == Reason.TOO_CLOSE.value, verdict.structure, "").astype(object)
-    whys = np.where(verdict.not_seen, NOT_SEEN_HERE, verdict.structure)
-    named[unknown] = [f"unknown:\n{why}" for why in whys[unknown]]
-    return np.asarray(named)
-
-
-def _regions(codes: NDArray[np.int64], names: list[str]) -> list[tuple[NDArray[np.float64], str]]:
-    """Large enough regions of one name, the largest first: how deep inside each pixel lies, and the name."""
-    found = []
-    for code, name in enumerate(names):
-        labels, _ = ndimage.label((codes == code) if name else np.zeros(codes.shape, dtype=bool))
-        areas = ndimage.sum_labels(np.ones_like(labels), labels, np.arange(1, labels.max() + 1))
-        for part in np.flatnonzero(areas > NAMED_FRACTION * codes.size * np.pi / 4) + 1:
-            depth = ndimage.distance_transform_edt(np.pad(labels == part, 1))[1:-1, 1:-1]
-            found.append((float(areas[part - 1]), depth, name))
-    return [(depth, name) for _, depth, name in sorted(found, key=lambda region: -region[0])]
-
-
-def _half_size(text: str, size: int) -> tuple[int, int]:
-    """Half the height and half the width of a name, in pixels of a square picture of the disc."""
-    radius_points = MAP_BOX[3] * FIGURE_INCHES[1] * 72 / (2 * RIM)
-    pixel_points = radius_points / (size / 2)
-    lines = text.split("\n")
-    high, wide = 0.7 * NAME_POINTS * len(lines), 0.29 * NAME_POINTS * max(map(len, lines))
-    return round(high / pixel_points), round(wide / pixel_points)
-
-
-def _pixel(x: float, y: float, size: int) -> tuple[int, int]:
-    """Row and column of a point of the disc (x right, y up) in a square picture of it."""
-    return round((1 - y) / 2 * size), round((1 + x) / 2 * size)
-
-
-def _taken(free: Bools, row: int, column: int, high: int, wide: int) -> None:
-    """Mark a name's box about a pixel, half so high and wide, in place."""
-    free[max(0, row - high) : row + high + 1, max(0, column - wide) : column + wide + 1] = False
-
-
-def _marks(axes: Axes, view: MapView, candidates: Candidates, bests: list[int], pick: Pick | None) -> None:
-    def put(rows: Any, of: Candidates = candidates, **look: Any) -> None:
-        points = view.place(of.theta[rows], of.beta[rows])
-        axes.scatter(points[:, 0], points[:, 1], **look)
-
-    axes.plot([0], [0], marker="+", color="black", ms=9, mew=1.2, zorder=5)
-    put(shown_front(candidates, view).rows, s=9, c="white", edgecolors="black", linewidths=0.5, zorder=6)
-    put(bests, s=46, facecolors="none", edgecolors="black", linewidths=1.2, zorder=7)
+    x, y = MIDDLE
+    canvas.segments(np.array([[(x - 8, y), (x + 8, y)], [(x, y - 8), (x, y + 8)]]), 1.2 * POINT, BLACK)
+    for place in places(shown_front(candidates, view).rows):
+        mark_dot(canvas, place)
+    for place in places(bests):
+        mark_ring(canvas, place)
     if pick is not None:
-        put([pick.row], pick.candidates, s=330, marker="*", c="white", edgecolors="black", linewidths=1.6, zorder=8)
+        mark_star(canvas, places([pick.row], pick.candidates)[0], 9.1 * POINT)
 
 
-def _title(figure: Figure, case: Any, candidates: Candidates) -> None:
-    figure.text(0.02, 0.955, f"{case.name}: entry directions to {target_text(case)}", fontsize=19, fontweight="bold")
+def _title(canvas: Canvas, case: Any, candidates: Candidates) -> None:
+    left = 0.02 * WIDTH
+    canvas.write((left, 0.045 * HEIGHT), f"{case.name}: entry directions to {target_text(case)}", TITLE)
     line = f"{len(candidates):,} directions, step {np.degrees(step_of(candidates)):g}°;  {needle_text(case)}"
     if not candidates.arm_checked:
         line += ";  ARM NOT CHECKED"
-    figure.text(0.02, 0.918, line, fontsize=12, color="0.25")
-    figure.text(0.985, 0.012, "research software, not a medical device", fontsize=9, color="0.4", ha="right")
-
-
-def _text(axes: Axes, x: float, y: float, text: str, *, size: float, style: str = "normal") -> None:
-    axes.text(x, y, text, fontsize=size, style=style, ha="center", va="center", zorder=9, path_effects=list(HALO))
+    canvas.write((left, 0.082 * HEIGHT), line, SUBTITLE)
+    notice = "research software, not a medical device"
+    canvas.write((0.985 * WIDTH, 0.988 * HEIGHT), notice, NOTICE, anchor="rs")

@@ -17,6 +17,9 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import MapCells, MapView
 from puncture_twin.twin.report.palette import reason_of, safe_shades
 
+PIXELS = 1120
+"""Side of the raster that picture and page share: twice as fine as the page shows it, finer than the picture does."""
+
 OVERSAMPLING = 2
 """Samples per pixel side at the cells' borders, which they smooth."""
 
@@ -88,7 +91,7 @@ def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
     return colours
 
 
-def map_raster(candidates: Candidates, view: MapView, size: int) -> MapRaster:
+def map_raster(candidates: Candidates, view: MapView, size: int = PIXELS) -> MapRaster:
     """Draw the cap.
 
     Args:

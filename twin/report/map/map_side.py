@@ -2,70 +2,87 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
-from matplotlib.patches import Rectangle
 
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.doubt import chance_text
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
+from puncture_twin.twin.report.canvas.canvas import Canvas, Words, rounded
+from puncture_twin.twin.report.canvas.fonts import Anchor, Face
 from puncture_twin.twin.report.map.chance_layer import chance_legend
 from puncture_twin.twin.report.map.front import shown_front
+from puncture_twin.twin.report.map.map_layout import POINT, SIDE_HEIGHT, side_pixels
+from puncture_twin.twin.report.map.map_marks import mark_dot, mark_ring, mark_star
 from puncture_twin.twin.report.map.map_raster import SCALE_DIGITS, ClearanceScale, clearance_scale
 from puncture_twin.twin.report.map_view import BEYOND, MapView
-from puncture_twin.twin.report.numbers import arm_text, nearest_structure, number, percent, reason_counts
+from puncture_twin.twin.report.numbers import ReasonCount, arm_text, nearest_structure, number, percent, reason_counts
 from puncture_twin.twin.report.palette import safe_shades
 
-MOST_LEGEND = 0.45
-"""Height of the legend's lines together, of the column's: more reasons stand closer."""
+MOST_LEGEND, LINE, GAP = 0.45, 0.0215, 0.6
+"""Heights: of the legend's entries together, of the column's; of a line; between two entries, of a line."""
+
+GREY: Rgb = (64, 64, 64)
+SMALL, HEAD = Words(9.5 * POINT), Words(9 * POINT, colour=(89, 89, 89))
+HOW_TO_READ = Words(9.5 * POINT, colour=GREY, spacing=1.35)
+NUMBERS = Words(10 * POINT, spacing=1.4)
+NOTHING = Words(13 * POINT, "bold", (160, 32, 0))
+
+PATCH = 0.06
+"""Width of a patch of colour, of the column's."""
+
+PADDING = 9.0
+"""Pixels about the words in a box."""
 
 
-def draw_side(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None) -> None:
+def draw_side(canvas: Canvas, candidates: Candidates, view: MapView, pick: Pick | None) -> None:
     """Draw the column: what the colours and marks mean, the chosen direction, and how to read the map."""
-    axes.set_xlim(0, 1)
-    axes.set_ylim(1, 0)
-    axes.set_axis_off()
-    y = _legend(axes, candidates)
-    y = _scale(axes, candidates, y + 0.03)
-    y = chance_legend(axes, candidates, y)
-    y = _mark_legend(axes, candidates, view, y + 0.05)
-    y = _chosen(axes, candidates, pick, y + 0.035)
+    y = _legend(canvas, reason_counts(candidates))
+    y = _scale(canvas, candidates, y + 0.01)
+    y = chance_legend(canvas, candidates, y)
+    y = _mark_legend(canvas, candidates, view, y + 0.05)
+    _chosen(canvas, candidates, pick, y + 0.04)
     toward = f"Centre (+), θ = 0: {view.centre}.\n" if view.centre else ""
     if view.theta_max > BEYOND:
         toward += "Beyond the thick ring (θ 90°) it comes from the far side.\n"
-    axes.text(
-        0.0,
-        1.0,
+    text = (
         "HOW TO READ\nThe target is behind the centre; you look at the body\n"
         "from OUTSIDE, along −z of the entry frame. A point is\n"
         "where the needle comes from: θ grows from the centre\n"
         "to the rim, β runs counter-clockwise.\n"
-        f"{toward}{_folded(arm_text(candidates), 52)}",
-        fontsize=9.5,
-        color="0.25",
-        va="bottom",
-        linespacing=1.35,
+        f"{toward}{_folded(arm_text(candidates), 52)}"
     )
+    left, bottom = side_pixels(0.0, 0.995)
+    high = HOW_TO_READ.size * HOW_TO_READ.spacing * text.count("\n")
+    canvas.write((left, bottom - high), text, HOW_TO_READ)
 
 
-def _legend(axes: Axes, candidates: Candidates) -> float:
-    y = 0.0
-    for x, text in ((0.62, "directions"), (0.79, "of grid"), (1.0, "of solid\nangle")):
-        axes.text(x, y + 0.012, text, fontsize=9, color="0.35", ha="right", va="bottom")
-    counts = reason_counts(candidates)
-    for line in counts:
-        y += min(0.05, MOST_LEGEND / len(counts))
-        bold = "bold" if line.code == "safe" else "normal"
-        colour = np.array(line.colour) / 255
-        axes.add_patch(Rectangle((0.0, y - 0.017), 0.06, 0.032, facecolor=colour, edgecolor="black", lw=0.8))
-        axes.text(0.085, y, _folded(line.text), fontsize=10.5, va="center", fontweight=bold, linespacing=0.95)
-        axes.text(0.62, y, f"{line.count:,}", fontsize=10.5, ha="right", va="center", fontweight=bold)
-        axes.text(0.79, y, percent(line.fraction), fontsize=10.5, ha="right", va="center", fontweight=bold)
-        axes.text(1.0, y, percent(line.solid_angle), fontsize=10.5, ha="right", va="center", fontweight=bold)
-    return y
+def _legend(canvas: Canvas, counts: Sequence[ReasonCount]) -> float:
+    """A patch, a text and numbers for each reason; an entry of more lines is higher."""
+    for x, text in ((0.62, "directions"), (0.79, "of grid")):
+        canvas.write(side_pixels(x, 0.012), text, HEAD, anchor="rs")
+    for line, text in enumerate(("of solid", "angle")):
+        canvas.write(side_pixels(1.0, 0.012 - 0.018 * (1 - line)), text, HEAD, anchor="rs")
+    texts = [_folded(one.text) for one in counts]
+    heights = np.array([text.count("\n") + 1 + GAP for text in texts])
+    unit = min(LINE, MOST_LEGEND / float(heights.sum()))
+    ends = 0.022 + unit * np.cumsum(heights)
+    for one, text, y in zip(counts, texts, (ends - unit * heights / 2).tolist(), strict=True):
+        face: Face = "bold" if one.code == "safe" else "plain"
+        look = Words(min(10.5 * POINT, unit * SIDE_HEIGHT / 1.08), face, spacing=1.08)
+        canvas.rectangle(_box(0.0, y - 0.016, PATCH, 0.032 * min(1.0, unit / 0.015)), one.colour, 0.8 * POINT)
+        canvas.write(side_pixels(0.085, y), text, look, anchor="lm")
+        for x, value in ((0.62, f"{one.count:,}"), (0.79, percent(one.fraction)), (1.0, percent(one.solid_angle))):
+            canvas.write(side_pixels(x, y), value, look, anchor="rm")
+    return float(ends[-1])
+
+
+def _box(x: float, y: float, wide: float, high: float) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom in pixels."""
+    return (*side_pixels(x, y), *side_pixels(x + wide, y + high))
 
 
 def _folded(text: str, width: int = 19) -> str:
@@ -77,29 +94,33 @@ def _folded(text: str, width: int = 19) -> str:
     return "\n".join(lines)
 
 
-def _scale(axes: Axes, candidates: Candidates, y: float) -> float:
+def _scale(canvas: Canvas, candidates: Candidates, y: float) -> float:
     """The shades of safe; one shade where one number says it all."""
     if not candidates.safe.any():
         return y
     scale = clearance_scale(candidates)
     safe = "" if candidates.breathing is not None else f"{candidates.safe_text}, "  # too long for one line
     if scale.even:
-        axes.add_patch(Rectangle((0.0, y + 0.02), 0.06, 0.032, facecolor=_even_shade(scale), edgecolor="black", lw=0.8))
-        axes.text(0.085, y + 0.036, f"{safe}{_even_text(scale)}", fontsize=9.5, va="center")
+        canvas.rectangle(_box(0.0, y + 0.02, PATCH, 0.032), _even_shade(scale), 0.8 * POINT)
+        canvas.write(side_pixels(0.085, y + 0.036), f"{safe}{_even_text(scale)}", SMALL, anchor="lm")
         return y + 0.06
-    shades = ListedColormap(safe_shades(np.linspace(0, 1, 64)) / 255.0)
-    axes.imshow(np.linspace(0, 1, 256)[None], extent=(0.0, 1.0, y + 0.045, y + 0.02), aspect="auto", cmap=shades)
-    axes.add_patch(Rectangle((0.0, y + 0.02), 1.0, 0.025, fill=False, edgecolor="black", lw=0.8))
-    axes.set_xlim(0, 1)
-    axes.set_ylim(1, 0)
-    axes.text(0.0, y + 0.05, number(scale.low, SCALE_DIGITS, "mm"), fontsize=9.5, va="top")
-    axes.text(1.0, y + 0.05, number(scale.high, SCALE_DIGITS, "mm"), fontsize=9.5, va="top", ha="right")
-    axes.text(0.5, y + 0.05, f"{safe}by least clearance", fontsize=9.5, va="top", ha="center")
+    left, top, right, bottom = (round(edge) for edge in _box(0.0, y + 0.02, 1.0, 0.025))
+    shades = safe_shades(np.linspace(0, 1, right - left))
+    canvas.pixels[top:bottom, left:right, :3] = shades
+    canvas.rectangle((left, top, right, bottom), None, 0.8 * POINT)
+    ends: tuple[tuple[float, str, Anchor], ...] = (
+        (0.0, number(scale.low, SCALE_DIGITS, "mm"), "la"),
+        (0.5, f"{safe}by least clearance", "ma"),
+        (1.0, number(scale.high, SCALE_DIGITS, "mm"), "ra"),
+    )
+    for x, text, anchor in ends:
+        canvas.write(side_pixels(x, y + 0.05), text, SMALL, anchor=anchor)
     return y + 0.06
 
 
-def _even_shade(scale: ClearanceScale) -> Any:
-    return tuple(scale.shades(np.zeros(1))[0] / 255.0)
+def _even_shade(scale: ClearanceScale) -> Rgb:
+    red, green, blue = scale.shades(np.zeros(1))[0].tolist()
+    return red, green, blue
 
 
 def _even_text(scale: ClearanceScale) -> str:
@@ -109,26 +130,30 @@ def _even_text(scale: ClearanceScale) -> str:
     return f"least clearance {number(scale.low, SCALE_DIGITS, 'mm')} everywhere"
 
 
-def _mark_legend(axes: Axes, candidates: Candidates, view: MapView, y: float) -> float:
+def _mark_legend(canvas: Canvas, candidates: Candidates, view: MapView, y: float) -> float:
     if not candidates.safe.any():
         return y
-    axes.scatter([0.03], [y], s=240, marker="*", c="white", edgecolors="black", linewidths=1.5, clip_on=False)
-    axes.text(0.07, y, "chosen", fontsize=9.5, va="center")
-    axes.scatter([0.235], [y], s=46, facecolors="none", edgecolors="black", linewidths=1.2)
-    axes.text(0.26, y, "best of a window", fontsize=9.5, va="center")
+    mark_star(canvas, _place(0.03, y), 7.7 * POINT)
+    canvas.write(side_pixels(0.07, y), "chosen", SMALL, anchor="lm")
+    mark_ring(canvas, _place(0.225, y))
+    canvas.write(side_pixels(0.25, y), "best of a window", SMALL, anchor="lm")
     front = shown_front(candidates, view)
     if front.of:
-        axes.scatter([0.6], [y], s=9, c="white", edgecolors="black", linewidths=0.5)
-        axes.text(0.62, y, front.text, fontsize=9.5, va="center")
+        mark_dot(canvas, _place(0.575, y))
+        canvas.write(side_pixels(0.595, y), front.text, SMALL, anchor="lm")
     return y
 
 
-def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> float:
+def _place(x: float, y: float) -> Floats:
+    return np.array(side_pixels(x, y))
+
+
+def _chosen(canvas: Canvas, candidates: Candidates, pick: Pick | None, y: float) -> None:
+    """The chosen direction in a box; or, in a box of warning, that there is none."""
     if pick is None:
         text = "NOTHING IS SAFE\nEvery direction of the grid is refused."
-        box = {"facecolor": "#ffe9e0", "edgecolor": "#b03000", "boxstyle": "round,pad=0.5"}
-        axes.text(0.02, y + 0.03, text, fontsize=13, fontweight="bold", color="#a02000", va="top", bbox=box)
-        return y + 0.12
+        _boxed(canvas, text, y, NOTHING, ((255, 233, 224), (176, 48, 0)))
+        return
     word = "Best" if pick == best_pick(candidates) else "Chosen"
     candidates, row = pick
     name, clearance = nearest_structure(candidates, row)
@@ -139,9 +164,17 @@ def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> 
         f"skin angle {number(float(np.degrees(candidates.path.skin_angle[row])), 0)}°",
         f"nearest: {name.replace('_', ' ') or 'none'}, {number(clearance, 1, 'mm')}",
     )
-    box = {"facecolor": "#eef7f2", "edgecolor": "#00684a", "boxstyle": "round,pad=0.5"}
-    axes.text(0.02, y + 0.02, "\n".join(lines), fontsize=10, va="top", linespacing=1.4, bbox=box)
-    return y + 0.12
+    _boxed(canvas, "\n".join(lines), y, NUMBERS, ((238, 247, 242), (0, 104, 74)))
+
+
+def _boxed(canvas: Canvas, text: str, y: float, look: Words, colours: tuple[Rgb, Rgb]) -> None:
+    """Words in a box of two colours, ground and edge, whose upper edge is at a height."""
+    left, top = side_pixels(0.0, y)
+    high = look.size * (1 + look.spacing * text.count("\n"))
+    edge = rounded((left, top, left + look.width(text) + 2 * PADDING, top + high + 2 * PADDING), PADDING)
+    canvas.fill(edge, colours[0])
+    canvas.line(edge, POINT, colours[1])
+    canvas.write((left + PADDING, top + PADDING + 0.85 * look.size), text, look)
 
 
 def _chances(candidates: Candidates, row: int) -> str:

@@ -15,6 +15,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.doubt import Doubt
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import find_windows
+from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.numbers import (
     TRUTH_IS_BELIEF,
     demanding,
@@ -69,6 +70,7 @@ def write_page(
     slices: Sequence[Slices] = (),
     facts: EntryFacts | None = None,
     refusal: str = "",
+    raster: MapRaster | None = None,
 ) -> None:
     """Write the page.
 
@@ -86,6 +88,7 @@ def write_page(
         slices: What is shown in the CT, the first at once, the others where they are chosen.
         facts: How the planned or shown path is found at the patient.
         refusal: Why there is no plan although one was requested; "" where none was.
+        raster: The map's pixels where somebody has them already.
     """
     pick = pick or best_pick(candidates)
     doubt = None if uncertainty is None else uncertainty.doubt
@@ -111,7 +114,7 @@ def write_page(
         warnings=tables.warnings_section(anatomy.warnings),
         inputs=tables.inputs_table(case.inputs),
         origin=tables.origin_section(seed),
-        data=script_json(_drawn(case, anatomy, candidates, plan, rehearsal, pick, slices)),
+        data=script_json(_drawn(case, anatomy, candidates, plan, rehearsal, pick, slices, raster)),
         plotly=plotly_script(),
         **_uncertain_sections(uncertainty, registration),
     )
@@ -125,10 +128,11 @@ def _drawn(
     rehearsal: Any | None,
     pick: Pick | None,
     slices: Sequence[Slices],
+    raster: MapRaster | None,
 ) -> dict[str, Any]:
     """What the page's script draws: map, scene, the rehearsal's charts and slices; arguments as of `write_page`."""
     return {
-        "map": map_data(case, candidates, pick),
+        "map": map_data(case, candidates, pick, raster),
         "scene": scene_figure(case, anatomy, candidates, plan, user_cache(), pick),
         "charts": None if rehearsal is None else rehearsal_charts(rehearsal, demanding(anatomy)),
         "slices": slices_data(slices),

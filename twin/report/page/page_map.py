@@ -16,11 +16,11 @@ from puncture_twin.planning.search.candidates import NOT_SEEN, Candidates
 from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.map.front import shown_front
-from puncture_twin.twin.report.map.map_raster import map_raster
+from puncture_twin.twin.report.map.map_raster import PIXELS as FINE, MapRaster, map_raster
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.palette import PNG_LEVEL, reason_of
 
-PIXELS = 560
+PIXELS = FINE // 2
 """Side of the map on the page, CSS pixels; the picture is twice as fine for sharp screens."""
 
 DETAIL_UNITS = {
@@ -36,14 +36,20 @@ DETAIL_UNITS = {
 """What ``Candidates.verdict.amount`` is, by reason."""
 
 
-def map_data(case: Any, candidates: Candidates, pick: Pick | None) -> dict[str, Any]:
+def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRaster | None = None) -> dict[str, Any]:
     """What the page's script needs to draw the map and answer the pointer; plain values, degrees and mm.
 
     The pixel-to-row table is stored run by run, row after row of the picture: ``runs`` is [candidate, length, ...],
     candidate -1 outside the grid.
+
+    Args:
+        case: The case.
+        candidates: The search's rows.
+        pick: What is shown as chosen.
+        raster: The map's pixels where somebody has them already.
     """
     view, windows = map_view(case, candidates), find_windows(candidates)
-    raster = map_raster(candidates, view, 2 * PIXELS)
+    raster = map_raster(candidates, view) if raster is None else raster
     rows = map_raster_rows(raster.rows[::2, ::2])
     structures = sorted({*map(str, candidates.verdict.named), *candidates.clearance.structures})
     front = shown_front(candidates, view)

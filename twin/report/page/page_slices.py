@@ -56,7 +56,7 @@ def _panel(panel: Panel) -> dict[str, str]:
         stream = io.BytesIO()
         Image.fromarray(stored(panel.hu)).save(stream, format="JPEG", quality=QUALITY)
         ct = "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-    return {"name": panel.plane.name, "ct": ct, "over": _png(panel.overlay.quantize(COLOURS))}
+    return {"name": panel.plane.name, "ct": ct, "over": _png(Image.fromarray(panel.overlay).quantize(COLOURS))}
 
 
 def _png(image: Image.Image) -> str:

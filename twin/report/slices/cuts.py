@@ -10,8 +10,13 @@ from puncture_twin.twin.report.slices.planes import Plane
 
 
 def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
-    """The cut of a surface, shape (n, 2, 2): segments in the plane, mm to the right and up of the target."""
-    height = (mesh.vertices - plane.at_ct) @ plane.normal
+    """The cut of a surface, shape (n, 2, 2): segments in the plane, mm to the right and up of the target.
+
+    Nothing of a surface whose box does not reach what the plane shows.
+    """
+    if not _is_seen(mesh, plane):
+        return np.zeros((0, 2, 2))
+    height = plane.height(mesh.vertices)
     above = height > 0  # a corner in the plane counts as below it: every triangle is cut in no edge or in two
     if above.all() or not above.any():
         return np.zeros((0, 2, 2))
@@ -24,6 +29,15 @@ def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
     along = (height[tip] / (height[tip] - height[others].T)).T[:, :, None]
     ends = mesh.vertices[tip][:, None] * (1 - along) + mesh.vertices[others] * along
     return plane.place(ends)
+
+
+def _is_seen(mesh: TriangleMesh, plane: Plane) -> bool:
+    """Whether a surface's box reaches the part of the plane that is shown."""
+    low, high = mesh.bounds
+    middle, half = (low + high) / 2, (high - low) / 2
+    axes = np.stack([plane.right, plane.up, plane.normal])
+    shown, reach = np.array([*plane.centre, 0.0]), np.array([plane.half_mm, plane.half_mm, 0.0])
+    return bool(np.all(np.abs(axes @ (middle - plane.at_ct) - shown) <= np.abs(axes) @ half + reach))
 
 
 def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane, points: int = 181) -> Floats:

@@ -5,37 +5,39 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import patheffects
-from matplotlib.artist import Artist
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, PathPatch, Polygon
-from matplotlib.path import Path
-from matplotlib.text import Text
-from matplotlib.transforms import Affine2D, Transform
-from PIL import Image
+from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.reasons import css
+from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report.annotate import SCALE_BARS_MM
+from puncture_twin.twin.report.canvas.canvas import BLACK, WHITE, Canvas, Halo, Words
+from puncture_twin.twin.report.canvas.fonts import Anchor
 from puncture_twin.twin.report.palette import SKIN, TARGET_POINT
 from puncture_twin.twin.report.slices.cuts import capsule, ellipse, outline
 from puncture_twin.twin.report.slices.planes import Plane, letters
 from puncture_twin.twin.report.slices.subject import Subject
 
-PIXELS, DPI = 480, 96
-NEEDLE_COLOUR, REGION_COLOUR, BENT_COLOUR = "#00e5ff", "#ff4df0", "#b6ff00"
+PIXELS = 480
+
+NEEDLE_COLOUR: Rgb = (0, 229, 255)
+REGION_COLOUR: Rgb = (255, 77, 240)
+BENT_COLOUR: Rgb = (182, 255, 0)
 """On grey none is near a structure's colour."""
 
-HALO = (patheffects.withStroke(linewidth=2.4, foreground="black"),)
-"""Behind letters and thin lines, so that they show on bright tissue too."""
+STRONG, WEAK, OF_SKIN, OF_BEAD = 2.5, 1.1, 1.6, 4.0
+"""Pixels: how wide outlines are, and how large a bead is."""
+
+RIM = Halo(0.9, BLACK)
+"""Under thin lines, so that they show on bright tissue too."""
+
+LETTERS = Words(16, "bold", WHITE, Halo(1.6, BLACK))
+SMALL = Words(12, "plain", WHITE, Halo(1.6, BLACK))
 
 IN_PLANE = 1e-3
 """A needle whose direction has less than this along a plane's normal lies in it."""
 
-DASHED: Any = {"edgecolor": NEEDLE_COLOUR, "lw": 1.0, "ls": "--"}
-"""The needle with the greatest margin."""
+DASHED, DOTTED = (5.0, 2.2), (1.5, 2.4)
+"""Pixels drawn and left out: about the needle with the greatest margin, and along its shadow."""
 
 BEADS = 0.025
 """Between two beads, of half a picture's side."""
@@ -45,6 +47,15 @@ MOST_BEADS = 1 << 20
 SCALE_FRACTION = 0.34
 """Of a picture's side, the scale bar at most."""
 
+BAR_HEIGHT = 4.0
+"""Of the scale, pixels."""
+
+EDGE = 7.0
+"""Pixels between a picture's edge and the letters there."""
+
+CLEAR = 24.0
+"""Pixels that letters keep from the needle's line, along their edge."""
+
 
 class Panel(NamedTuple):
     """One slice.
@@ -52,12 +63,12 @@ class Panel(NamedTuple):
     Attributes:
         plane: Where it lies.
         hu: Shape (PIXELS, PIXELS), NaN where the image ends; None in a case without CT.
-        overlay: RGBA, transparent where nothing is drawn.
+        overlay: Shape (PIXELS, PIXELS, 4), RGB and opacity.
     """
 
     plane: Plane
     hu: Floats | None
-    overlay: Image.Image
+    overlay: NDArray[np.uint8]
 
 
 def draw_panel(subject: Subject, plane: Plane) -> Panel:
@@ -67,64 +78,52 @@ def draw_panel(subject: Subject, plane: Plane) -> Panel:
     sheet = _Sheet(plane)
     _outlines(sheet, subject, plane)
     _needle(sheet, subject, plane)
-    _target(sheet, subject, plane)
+    _target(sheet, plane)
     _directions(sheet, subject, plane)
     _scale(sheet, plane)
-    return Panel(plane, hu, drawn(sheet.canvas))
+    return Panel(plane, hu, sheet.canvas.pixels)
 
 
 class _Sheet:
-    """What one draws on in a plane's mm: a figure without axes, which take longer to make than all that is drawn.
+    """What one draws on in a plane's mm.
 
     Args:
         plane: The plane.
     """
 
     def __init__(self, plane: Plane) -> None:
-        self._figure = Figure(figsize=(PIXELS / DPI, PIXELS / DPI), dpi=DPI, facecolor="none")
-        self.canvas = FigureCanvasAgg(self._figure)
-        corner = plane.centre - plane.half_mm
-        self._to_pixels = Affine2D().translate(*-corner).scale(PIXELS / (2 * plane.half_mm))
+        self.canvas = Canvas(PIXELS, PIXELS, None)
+        self._corner = plane.centre + plane.half_mm * np.array([-1.0, 1.0])
+        self._per_mm = PIXELS / (2 * plane.half_mm) * np.array([1.0, -1.0])
 
-    def line(self, points: Floats, **look: Any) -> None:
+    def pixels(self, points: Any) -> Floats:
+        """Columns and rows of points (..., 2), mm."""
+        return np.asarray((np.asarray(points, dtype=float) - self._corner) * self._per_mm)
+
+    def line(self, points: Floats, width: float, colour: Rgb, **look: Any) -> None:
         """A line through points (n, 2), mm."""
-        self._add(Line2D(*np.asarray(points, dtype=float).T, **look))
+        self.canvas.line(self.pixels(points), width, colour, **look)
 
-    def segments(self, segments: Floats, **look: Any) -> None:
+    def segments(self, segments: Floats, width: float, colour: Rgb) -> None:
         """Lines from point to point, each alone, shape (n, 2, 2), mm."""
-        codes = np.tile(np.array([Path.MOVETO, Path.LINETO], dtype=Path.code_type), len(segments))
-        path = Path(np.asarray(segments, dtype=float).reshape(-1, 2), codes)
-        self._add(PathPatch(path, fill=False, **look))
+        self.canvas.segments(self.pixels(segments), width, colour)
 
-    def patch(self, patch: Patch) -> None:
-        """A patch in mm."""
-        self._add(patch)
-
-    def words(self, x: float, y: float, text: str, *, relative: bool = False, **look: Any) -> None:
-        """Text at a point, mm, or as a fraction of the picture."""
-        self._add(Text(x, y, text, **look), self._figure.transFigure if relative else self._to_pixels)
-
-    def _add(self, artist: Artist, transform: Transform | None = None) -> None:
-        artist.set_transform(self._to_pixels if transform is None else transform)
-        self._figure.add_artist(artist)
-
-
-def drawn(canvas: FigureCanvasAgg) -> Image.Image:
-    """The canvas as it looks, RGBA."""
-    pixels, size = canvas.print_to_buffer()  # type: ignore[no-untyped-call]  # matplotlib states no types there
-    return Image.frombytes("RGBA", size, bytes(pixels))
+    def area(self, outline_mm: Floats, colour: Rgb) -> None:
+        """What a closed line (n, 2), mm, holds."""
+        self.canvas.fill(self.pixels(outline_mm), colour)
 
 
 def _outlines(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
     """Every structure that the plane cuts: the near ones and the target's strongly, unknown ones as beads."""
     strong = {one.name for one in subject.near} | {subject.case.target_structure}
     for one in subject.anatomy.checked:
-        segments, colour = outline(one.mesh, plane), css(subject.colours[one.name])
+        segments, colour = outline(one.mesh, plane), subject.colours[one.name]
         if str(one.role) == "unknown":
-            sheet.line(_beads(segments, plane), ls="none", marker=".", ms=4, mec=colour, mfc=colour)
-        elif len(segments):
-            sheet.segments(segments, edgecolor=colour, lw=1.9 if one.name in strong else 0.8)
-    sheet.segments(outline(subject.anatomy.skin.mesh, plane), edgecolor=css(SKIN), lw=1.2)
+            beads = _beads(segments, plane)
+            sheet.segments(np.stack([beads, beads], axis=1), OF_BEAD, colour)
+        else:
+            sheet.segments(segments, STRONG if one.name in strong else WEAK, colour)
+    sheet.segments(outline(subject.anatomy.skin.mesh, plane), OF_SKIN, SKIN)
 
 
 def _beads(segments: Floats, plane: Plane) -> Floats:
@@ -143,18 +142,19 @@ def _beads(segments: Floats, plane: Plane) -> Floats:
 
 
 def _needle(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
-    """The needle as thick as it is where the plane holds it, else its cut and, dotted, its shadow."""
+    """The needle as thick as it is where the plane holds it, else its cut and, dotted, its shadow; the tip's region."""
     outward, radius = subject.outward_ct, subject.needle_radius_mm
     shaft = subject.case.needle.shaft_mm
     end, across = plane.place(plane.at_ct + shaft * outward), abs(float(outward @ plane.normal))
-    if IN_PLANE < across < 1 - IN_PLANE:
-        sheet.line(np.stack([np.zeros(2), end]), color=NEEDLE_COLOUR, lw=1.1, ls=":", path_effects=HALO)
-    body = capsule(outward, shaft, radius, plane)
-    sheet.patch(Polygon(body, facecolor=NEEDLE_COLOUR, lw=0, zorder=3))
     path = subject.path_mm if np.isfinite(subject.path_mm) else shaft
     if subject.margin_mm > 0:
         wide = capsule(outward, path, radius + subject.margin_mm, plane)
-        sheet.patch(Polygon(wide, fill=False, **DASHED))
+        sheet.line(wide, 1.3, NEEDLE_COLOUR, dashes=DASHED)
+    if IN_PLANE < across < 1 - IN_PLANE:
+        sheet.line(np.stack([np.zeros(2), end]), 1.5, NEEDLE_COLOUR, dashes=DOTTED, halo=RIM)
+    if subject.region_ct is not None:
+        sheet.line(ellipse(subject.region_ct, plane), 1.7, REGION_COLOUR, halo=RIM)
+    sheet.area(capsule(outward, shaft, radius, plane), NEEDLE_COLOUR)
     if subject.bent_mm is not None:
         _bent(sheet, subject, plane, subject.bent_mm)
 
@@ -164,46 +164,46 @@ def _bent(sheet: _Sheet, subject: Subject, plane: Plane, bent_mm: Floats) -> Non
     outward, off = subject.outward_ct, abs(float(bent_mm[-1, 1]))
     if abs(float(outward @ plane.normal)) > IN_PLANE:
         if off > 0:
-            sheet.patch(Polygon(capsule(outward, subject.path_mm, off, plane), fill=False, edgecolor=BENT_COLOUR))
+            sheet.line(capsule(outward, subject.path_mm, off, plane), 1.3, BENT_COLOUR)
         return
     along = plane.place(plane.at_ct + outward)
     for aside in (np.array([-along[1], along[0]]), np.array([along[1], -along[0]])):
-        sheet.line(bent_mm @ np.stack([along, aside]), color=BENT_COLOUR, lw=1.3, zorder=4, solid_capstyle="butt")
+        sheet.line(bent_mm @ np.stack([along, aside]), 1.7, BENT_COLOUR)
 
 
-def _target(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
-    """A cross at the target, and the region of the tip where errors are declared."""
+def _target(sheet: _Sheet, plane: Plane) -> None:
+    """A cross at the target."""
     near, far = 0.03 * plane.half_mm, 0.09 * plane.half_mm
     arms = [((near, 0), (far, 0)), ((-near, 0), (-far, 0)), ((0, near), (0, far)), ((0, -near), (0, -far))]
-    sheet.segments(np.array(arms), edgecolor=css(TARGET_POINT), lw=1.8, zorder=4)
-    if subject.region_ct is not None:
-        sheet.line(ellipse(subject.region_ct, plane), color=REGION_COLOUR, lw=1.3, path_effects=HALO)
+    sheet.segments(np.array(arms), 2.4, TARGET_POINT)
 
 
 def _directions(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
-    """What lies beyond each edge of the picture."""
-    edges = ((0.985, 0.5, plane.right), (0.015, 0.5, -plane.right), (0.5, 0.985, plane.up), (0.5, 0.015, -plane.up))
-    for x, y, direction in edges:
-        sheet.words(
-            x,
-            y,
-            letters(subject.case.space, direction),
-            relative=True,
-            ha="right" if x > 0.9 else "left" if x < 0.1 else "center",
-            va="top" if y > 0.9 else "bottom" if y < 0.1 else "center",
-            color="white",
-            fontsize=12,
-            fontweight="bold",
-            path_effects=HALO,
-        )
+    """What lies beyond each edge of the picture; beside the needle where it leaves the picture there."""
+    middle, far = PIXELS / 2, PIXELS - EDGE
+    edges: tuple[tuple[float, float, Floats, Anchor], ...] = (
+        (far, middle, plane.right, "rm"),
+        (EDGE, middle, -plane.right, "lm"),
+        (middle, EDGE, plane.up, "ma"),
+        (middle, far, -plane.up, "mb"),
+    )
+    shaft = subject.case.needle.shaft_mm * subject.outward_ct
+    needle = sheet.pixels(np.linspace(0, 1, PIXELS)[:, None] * plane.place(plane.at_ct + shaft))
+    for x, y, direction, anchor in edges:
+        beside = anchor in {"rm", "lm"}
+        near = needle[np.linalg.norm(needle - (x, y), axis=1) < 2 * CLEAR]
+        off = 0.0 if len(near) == 0 else float(near[:, int(beside)].mean()) - middle
+        shift = 0.0 if len(near) == 0 or abs(off) > CLEAR else off + (-CLEAR if off > 0 else CLEAR)
+        at = (x, y + shift) if beside else (x + shift, y)
+        sheet.canvas.write(at, letters(subject.case.space, direction), LETTERS, anchor=anchor)
 
 
 def _scale(sheet: _Sheet, plane: Plane) -> None:
     """A bar of a round length in the lower left corner."""
     side = 2 * plane.half_mm
     length = max((mm for mm in SCALE_BARS_MM if mm <= SCALE_FRACTION * side), default=SCALE_BARS_MM[0])
-    left, low = plane.centre - plane.half_mm * np.array([0.94, 0.93])
-    bar = np.array([(left, low), (left + length, low)])
-    sheet.line(bar, color="white", lw=3, solid_capstyle="butt", path_effects=HALO)
-    words = f"{length} mm"
-    sheet.words(left, low + 0.022 * side, words, color="white", fontsize=9, va="bottom", path_effects=HALO)
+    left, low = sheet.pixels(plane.centre - plane.half_mm * np.array([0.94, 0.93])).tolist()
+    bar = (left, low - BAR_HEIGHT / 2, left + PIXELS * length / side, low + BAR_HEIGHT / 2)
+    sheet.canvas.rectangle((bar[0] - 1, bar[1] - 1, bar[2] + 1, bar[3] + 1), BLACK)
+    sheet.canvas.rectangle(bar, WHITE)
+    sheet.canvas.write((left, low - 9), f"{length} mm", SMALL)

@@ -51,6 +51,11 @@ class Plane:
         """Shadows of points (..., 3) on the plane: mm to the right and up of the target, shape (..., 2)."""
         return np.asarray((points_ct - self.at_ct) @ np.stack([self.right, self.up], axis=1))
 
+    def height(self, points_ct: Floats) -> Floats:
+        """How far points (n, 3) lie before the plane, mm, shape (n,); on one core, for so little work needs no more."""
+        x, y, z = (points_ct[:, k] * self.normal[k] for k in range(3))
+        return np.asarray(x + y + z - self.at_ct @ self.normal)
+
     def points_ct(self, size: int) -> Floats:
         """The middles of the pixels of a picture, row after row from its top, shape (size * size, 3)."""
         steps = ((np.arange(size) + 0.5) / size * 2 - 1) * self.half_mm

@@ -60,8 +60,8 @@ class Slices:
         """Names with colours."""
         subject = self.subject
         target = subject.case.target_structure
-        first = [("needle", _rgb(NEEDLE_COLOUR)), ("target", TARGET_POINT)]
-        region = [] if subject.region_ct is None else [("95 % region", _rgb(REGION_COLOUR))]
+        first = [("needle", NEEDLE_COLOUR), ("target", TARGET_POINT)]
+        region = [] if subject.region_ct is None else [("95 % region", REGION_COLOUR)]
         return [*first, *region, (target, subject.colours[target]), *((one.text, one.colour) for one in subject.near)]
 
 
@@ -76,7 +76,7 @@ def flat(panel: Panel, tone: Tone) -> Image.Image:
     ground = Image.new("RGBA", (PIXELS, PIXELS), (*WITHOUT_CT, 255))
     if panel.hu is not None:
         ground = Image.fromarray(tone.grey(panel.hu)).convert("RGBA")
-    return Image.alpha_composite(ground, panel.overlay).convert("RGB")
+    return Image.alpha_composite(ground, Image.fromarray(panel.overlay)).convert("RGB")
 
 
 def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
@@ -104,7 +104,3 @@ def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
     sheet = sheet.crop((0, 0, size[0], min(size[1], int(row) + GAP)))
     with atomic(Path(path)) as temporary:
         sheet.save(temporary, format="PNG", compress_level=PNG_LEVEL)
-
-
-def _rgb(css: str) -> Rgb:
-    return int(css[1:3], 16), int(css[3:5], 16), int(css[5:7], 16)
