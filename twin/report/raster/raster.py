@@ -31,12 +31,14 @@ WIDE = 8
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def outlines(points, faces, grid):
+def outlines(points, faces, bodies, solids, grid):
     """The rows and columns of samples that each triangle may cover.
 
     Args:
         points: Shape (n, 3), camera's frame, mm.
         faces: Shape (m, 3).
+        bodies: Shape (m,), the body of each triangle.
+        solids: Shape (b,), bool: bodies of which no triangle is drawn that faces away.
         grid: Samples per unit of x and y, rows, columns.
 
     Returns:
@@ -62,11 +64,18 @@ def outlines(points, faces, grid):
             left, right, top, bottom = _cut_outline(points, faces[f], seen, grid)
         first, last = int(np.ceil(max(top - EDGE, 0.0))), int(np.floor(min(bottom + EDGE, height - 1.0)))
         begin, end = int(np.ceil(max(left - EDGE, 0.0))), int(np.floor(min(right + EDGE, width - 1.0)))
-        if first <= last and begin <= end:
+        if first <= last and begin <= end and not (solids[bodies[f]] and _faces_away(points, a, b, c)):
             spans[count, 0], spans[count, 1], spans[count, 2] = f, first, last
             spans[count, 3], spans[count, 4] = begin, end
             count += 1
     return spans[:count]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _faces_away(points, a, b, c):
+    """Whether the eye is behind a triangle; the camera's frame is left-handed."""
+    x, y, z = _cross(_row(points, b), _row(points, c))
+    return points[a, 0] * x + points[a, 1] * y + points[a, 2] * z < 0.0
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -61,6 +61,7 @@ class SceneBody:
         mesh: CT frame, mm.
         colour: RGB.
         alpha: 1 for opaque; less for see-through.
+        solid: See `Surface`.
     """
 
     name: str
@@ -68,11 +69,13 @@ class SceneBody:
     mesh: TriangleMesh
     colour: Rgb
     alpha: float = 1.0
+    solid: bool = False
 
     @property
     def surface(self) -> Surface:
         """For the ray caster; the corridor is flat colour, without the rim that makes a skin look like glass."""
-        return Surface(self.mesh, self.colour, self.alpha, *((0.0,) if self.group == "safe" else ()))
+        rim = 0.0 if self.group == "safe" else Surface.rim
+        return Surface(self.mesh, self.colour, self.alpha, rim, self.solid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +183,13 @@ class ArmPicture:
         own = () if tool is None else (Link("tool", FLANGE, (tool.mesh,)),)
         self._links = (*visual_links(self._model), *own)
         self._T_ct_base = np.linalg.inv(T_base_ct)
-        self.layers = tuple(Layer([Surface(link.mesh, palette.ARM)]) for link in self._links)
+        self.layers = tuple(
+            Layer([Surface(link.mesh, palette.ARM, solid=self._is_solid(link))]) for link in self._links
+        )
+
+    def _is_solid(self, link: Link) -> bool:
+        """Links of the arms that ship are; of an own arm and tool nobody knows."""
+        return self._model.urdf is None and link.name != "tool"
 
     def poses_ct(self, q: Floats) -> Floats:
         """T_ct_link of every layer, shape (k, 4, 4), mm, at a configuration (6,), rad."""
@@ -192,7 +201,11 @@ class ArmPicture:
         poses = self.poses_ct(q)
         links = (
             SceneBody(
-                link.name, "arm", link.mesh.transformed(T), palette.HOLDER if link.name == "tool" else palette.ARM
+                link.name,
+                "arm",
+                link.mesh.transformed(T),
+                palette.HOLDER if link.name == "tool" else palette.ARM,
+                solid=self._is_solid(link),
             )
             for link, T in zip(self._links, poses, strict=True)
         )

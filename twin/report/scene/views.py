@@ -27,6 +27,9 @@ ENTRY_SIDE = 0.35
 ELEVATIONS = (np.radians(22.0), np.radians(40.0))
 AZIMUTHS = 16
 TILTS = (0.0, np.radians(25.0), np.radians(-25.0))
+EXTENT_WEIGHT = 0.8
+"""What the focus' length in the picture counts, where all of it being seen counts 1."""
+
 PATH_SAMPLES = 24
 TARGET_WEIGHT = 8
 """The target counts as so many points of the path when one asks what a view hides."""
@@ -110,16 +113,25 @@ def _best(
 ) -> ViewCamera:
     """The option that sees most of the focus; among equals, the one that sees it longest in the picture."""
     content = content[ConvexHull(content).vertices]
-    best, best_score = None, -np.inf
-    for toward in options:
-        if abs(toward @ up) > 0.95:
-            continue
-        camera = camera_around(content, toward, up, fov=FOV, width=size[0], height=size[1])
-        seen = camera.project(focus)
-        extent = np.linalg.norm(np.ptp(seen[:, :2], axis=0)) / np.hypot(*size)
-        score = float(blockers.sees(camera.eye, focus).mean()) + 0.8 * float(extent)
-        if score > best_score:
-            best, best_score = camera, score
-    if best is None:
+    cameras = [
+        camera_around(content, toward, up, fov=FOV, width=size[0], height=size[1])
+        for toward in options
+        if abs(toward @ up) <= 0.95
+    ]
+    if not cameras:
         return camera_around(content, -_across(up), up, fov=FOV, width=size[0], height=size[1])
-    return best
+    extents = [_extent(camera, focus, size) for camera in cameras]
+    best, best_score = 0, -np.inf
+    for i in np.argsort(-np.array(extents), kind="stable").tolist():
+        if EXTENT_WEIGHT * extents[i] + 1.0 < best_score:  # nor does one after it, were nothing hidden
+            break
+        score = float(blockers.sees(cameras[i].eye, focus).mean()) + EXTENT_WEIGHT * extents[i]
+        if score > best_score or (score == best_score and i < best):
+            best, best_score = i, score
+    return cameras[best]
+
+
+def _extent(camera: ViewCamera, focus: Floats, size: tuple[int, int]) -> float:
+    """How long the focus is in the picture, of the picture's diagonal."""
+    seen = camera.project(focus)
+    return float(np.linalg.norm(np.ptp(seen[:, :2], axis=0)) / np.hypot(*size))
