@@ -45,7 +45,7 @@ def test_help_and_a_wrong_argument_load_no_library_of_numbers(arguments, code):
 
 SEARCH = """
 import sys
-sys.argv = ["run_twin.py", "search", {case!r}, "--no-arm", "--no-pictures", "--out", {out!r}]
+sys.argv = ["run_twin.py", "search", {case!r}, "--no-arm", *{options!r}, "--out", {out!r}]
 from puncture_twin import run_twin
 code = run_twin.main(sys.argv[1:])
 print(sorted({unused!r} & set(sys.modules)), code)
@@ -57,6 +57,18 @@ UNUSED = {"matplotlib", "ompl", "networkx", "trimesh", "scipy.stats", "scipy.ndi
 
 def test_a_search_without_arm_and_pictures_loads_no_library_that_it_does_not_use(tmp_path):
     """The embedded carton; each of these costs a tenth of a second to half of one."""
-    code = SEARCH.format(case=str(ROOT / "meshes/carton/case_m.toml"), out=str(tmp_path / "out"), unused=UNUSED)
+    assert left_loaded(tmp_path, ["--no-pictures"], UNUSED) == "[] 0"
+
+
+def test_map_scene_slices_and_page_are_drawn_without_a_plotter(tmp_path):
+    """Matplotlib takes a third of a second to load."""
+    assert left_loaded(tmp_path, [], {"matplotlib", "plotly"}) == "[] 0"
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"map.png", "scene.png", "slices.png", "report.html"}
+
+
+def left_loaded(folder, options, unused):
+    """Which modules of some a search of the carton has loaded at its end, and its exit code."""
+    case, out = str(ROOT / "meshes/carton/case_m.toml"), str(folder / "out")
+    code = SEARCH.format(case=case, out=out, options=options, unused=unused)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "[] 0"
+    return done.stdout.splitlines()[-1]

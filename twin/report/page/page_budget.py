@@ -7,7 +7,6 @@ from typing import Any
 
 from markupsafe import Markup
 
-from puncture_twin.twin.report.budget_picture import budget_png
 from puncture_twin.twin.report.page.page_tables import faint, table, two
 from puncture_twin.twin.report.page.template import png_address
 
@@ -21,6 +20,8 @@ def budget_section(facts: Mapping[str, Any]) -> Markup:
     Args:
         facts: As ``register --json`` has them under ``budget``, of the direction that is shown.
     """
+    from puncture_twin.twin.report.budget_picture import budget_png  # with matplotlib, only where there is a budget
+
     now, best = facts["expected_mm"], facts["best"]
     won = now - best["expected_mm"]
     head = f"The tip is expected to miss the target by {now:.2f} mm (rms)"

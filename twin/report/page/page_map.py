@@ -125,7 +125,8 @@ def map_raster_rows(rows: Any) -> list[int]:
     flat = np.asarray(rows).ravel()
     starts = np.concatenate([[0], np.flatnonzero(np.diff(flat)) + 1])
     lengths = np.diff(np.append(starts, len(flat)))
-    return [int(v) for v in np.stack([flat[starts], lengths], axis=1).ravel()]
+    runs: list[int] = np.stack([flat[starts], lengths], axis=1).ravel().tolist()
+    return runs
 
 
 def _nearest(candidates: Candidates) -> tuple[list[str], Any]:

@@ -106,7 +106,7 @@ class FrameWords:
         standing = source.rehearsal.standing
         shown = "rehearsal in the twin" if standing is None else standing.short
         for line, text in enumerate((shown, f"{speed}; green: planned path")):
-            annotate.write(draw, (left + 10, below + 37 + 19 * line), text, size=13)
+            annotate.write(draw, (left + 10, below + 37 + 19 * line), text, size=12)
         annotate.body_axes(draw, wide, self._case.space, (left + near.width / 2, wide.height - 96), 42, size=14)
         about = "directions in the large view"
         annotate.write(draw, (left + 24, wide.height - 204), about, size=11, colour=annotate.FAINT)
