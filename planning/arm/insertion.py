@@ -14,7 +14,7 @@ import numpy as np
 from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, least_term, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 
 MAX_JOINT_STEP_RAD_PER_MM = 0.05
 """A joint that turns more per mm of insertion jumps: at 10 mm/s it would run at 0.5 rad/s."""
@@ -51,7 +51,7 @@ def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop
     return InsertionStop(float(depths_mm[at]), f"{what} {depths_mm[at]:.1f} mm after the standoff")
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _first_stop_at(lengths, path, depths, at_least, fastest):  # type: ignore[no-untyped-def]  # numba infers
     """Index at which a path ends: no solution, too near a singularity, or a joint faster than it may; -1: nowhere.
 
@@ -86,7 +86,7 @@ def reach_margin(model: UrModel, q: Floats) -> float:
     return float(_path_margin(model.lengths, model.joint_limits, FULL_MARGIN_RAD, q))
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _path_margin(lengths, limits, full, path):  # type: ignore[no-untyped-def]  # numba infers
     """Least of the singular terms and of each joint's distance to its limits over ``full``, at most 1."""
     margin = 1.0

@@ -14,7 +14,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 
 N_BRANCHES = 8
 """Shoulder left or right, times wrist flipped or not, times elbow up or down, in this order of weight 4, 2, 1."""
@@ -60,7 +60,7 @@ def _inverse_all(lengths, T, q):  # type: ignore[no-untyped-def]  # numba infers
         fill_branches(lengths, R, p, q[row], np.int64(-1))
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def fill_branches(lengths, R, p, q, only):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``q`` (8, 6) for the flange at ``R`` (3, 3) and ``p`` (3,); one row alone unless ``only`` < 0."""
     a2, a3, d6 = lengths[1], lengths[2], lengths[5]
@@ -94,7 +94,7 @@ def fill_branches(lengths, R, p, q, only):  # type: ignore[no-untyped-def]  # nu
                 q[row, 5] = wrapped_angle(q6)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _pan(lengths, px, py, side):  # type: ignore[no-untyped-def]  # numba infers
     """q1 for the wrist centre's (x, y): the arm's plane passes it at the distance d4. NaN inside that circle."""
     d4 = lengths[3]
@@ -108,7 +108,7 @@ def _pan(lengths, px, py, side):  # type: ignore[no-untyped-def]  # numba infers
     return math.atan2(py, px) + math.atan2(d4, side * in_plane)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _wrist(lengths, R, p, c1, s1, flip):  # type: ignore[no-untyped-def]  # numba infers
     """q5, q6, q234, and where they leave wrist 1: in the arm's plane and up, seen from the shoulder."""
     # The three parallel axes point along (s1, -c1, 0); their parts along the flange's axes give the wrist.
@@ -129,7 +129,7 @@ def _wrist(lengths, R, p, c1, s1, flip):  # type: ignore[no-untyped-def]  # numb
     return q5, q6, q234, c1 * x + s1 * y, p[2] - d6 * R[2, 2] - d5 * zz - d1
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _bend(lengths, x, y):  # type: ignore[no-untyped-def]  # numba infers
     """Cosine of the elbow that reaches (x, y) in the shoulder's plane. NaN where that is too far or too near."""
     a2, a3 = lengths[1], lengths[2]
@@ -139,7 +139,7 @@ def _bend(lengths, x, y):  # type: ignore[no-untyped-def]  # numba infers
     return math.copysign(1.0, cosine) if abs(cosine) < 1.0 + BOUNDARY_TOLERANCE else math.nan
 
 
-@nb.njit(cache=True, inline="always")
+@allocation_free(inline="always")
 def wrapped_angle(angle):  # type: ignore[no-untyped-def]  # numba infers
     """The same angle in (-pi, pi]; untouched where it is there already."""
     if -math.pi < angle <= math.pi:
@@ -165,7 +165,7 @@ def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
     return missing
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _missing_reach(lengths, T, missing):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``missing`` (n,) in mm: how far upper arm and forearm are too short or too long for ``T`` (n, 4, 4)."""
     upper, fore, d6 = abs(lengths[1]), abs(lengths[2]), lengths[5]

@@ -13,7 +13,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 
 
 def _rows(q: Floats) -> Floats:
@@ -37,7 +37,7 @@ def link_poses(model: UrModel, q: Floats) -> Floats:
     return poses.reshape(*np.shape(q)[:-1], 7, 4, 4)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def link_frames(lengths, q, frames):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``frames`` (n, 7, 4, 4) from ``q`` (n, 6)."""
     d1, a2, a3, d4, d5, d6 = lengths
@@ -56,7 +56,7 @@ def link_frames(lengths, q, frames):  # type: ignore[no-untyped-def]  # numba in
             _next_frame(frames[row, joint], frames[row, joint + 1], c, s, a, d, ca, sa)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _next_frame(before, after, c, s, a, d, ca, sa):  # type: ignore[no-untyped-def]  # numba infers
     """``after`` = ``before`` Rz Tz(d) Tx(a) Rx, with cosine and sine of the joint and of the twist."""
     for i in range(3):
@@ -91,7 +91,7 @@ def jacobian(model: UrModel, q: Floats) -> Floats:
     return columns.reshape(*np.shape(q)[:-1], 6, 6)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def jacobians(frames, J):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``J`` (n, 6, 6) from ``frames`` (n, 7, 4, 4): axis x lever above axis, one column a joint."""
     for row in range(len(frames)):

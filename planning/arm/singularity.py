@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 
 MIN_SINGULARITY = 0.05
 """Each term of :class:`Singularity` must exceed this over the whole insertion. For the wrist
@@ -88,7 +88,7 @@ def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> 
     return np.asarray(equal[int(np.argmax(np.round(elbow, ELBOW_DIGITS)))])
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _singularities(lengths, q, terms):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``terms`` (3, n) from ``q`` (n, 6)."""
     for row in range(len(q)):
@@ -96,7 +96,7 @@ def _singularities(lengths, q, terms):  # type: ignore[no-untyped-def]  # numba 
         terms[0, row], terms[1, row], terms[2, row] = shoulder, elbow, wrist
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _singular_terms(lengths, q2, q3, q4, q5):  # type: ignore[no-untyped-def]  # numba infers
     """Shoulder, elbow and wrist term, each 0 (singular) to 1."""
     a2, a3, d5 = lengths[1], lengths[2], lengths[4]
@@ -104,7 +104,7 @@ def _singular_terms(lengths, q2, q3, q4, q5):  # type: ignore[no-untyped-def]  #
     return abs(in_plane) / (abs(a2) + abs(a3) + d5), abs(math.sin(q3)), abs(math.sin(q5))
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def least_term(lengths, q):  # type: ignore[no-untyped-def]  # numba infers
     """The least of the three terms of one configuration (6,); NaN where there is none."""
     shoulder, elbow, wrist = _singular_terms(lengths, q[1], q[2], q[3], q[4])

@@ -13,7 +13,7 @@ from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ def _moving(lengths, q, corners, lever, frames, moved, rotated):  # type: ignore
             rotated[k + 1, link] = rotated[k, link] + abs(q[k + 1, link] - q[k, link])
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def motion_bounds(frames, q, corners, lever, bounds):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``bounds`` (m - 1, 6) from ``frames`` (m, 7, 4, 4), ``q`` (m, 6) and box ``corners`` (6, 8, 3).
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 
 ROUNDS_TO_ZERO = 1e-30
 """Squared lengths, mm^2, below which a segment has no direction."""
@@ -28,14 +28,14 @@ def squared_distance(points: NDArray[np.float64], triangles: NDArray[np.float64]
     return squares.reshape(shape)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _each(triangles, points, squares):  # type: ignore[no-untyped-def]  # numba infers
     """One point from one triangle, row by row."""
     for row in range(len(points)):
         squares[row] = to_triangle(triangles[row], points[row, 0], points[row, 1], points[row, 2])
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def to_triangle(t, x, y, z):  # type: ignore[no-untyped-def]  # numba infers
     """Squared distance of a point to a triangle (3, 3): its edges', or its plane's where the foot lies inside.
 
@@ -62,7 +62,7 @@ def to_triangle(t, x, y, z):  # type: ignore[no-untyped-def]  # numba infers
     return squared
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _to_segment(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]  # numba infers
     """Squared distance of the origin to the segment a b."""
     ux, uy, uz = bx - ax, by - ay, bz - az
@@ -74,7 +74,7 @@ def _to_segment(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]  # numb
     return x * x + y * y + z * z
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def nearest_point(t, x, y, z):  # type: ignore[no-untyped-def]  # numba infers
     """The point of a triangle (3, 3) that is nearest to another, as three numbers; one without area included."""
     best, px, py, pz = math.inf, 0.0, 0.0, 0.0
@@ -106,7 +106,7 @@ def nearest_point(t, x, y, z):  # type: ignore[no-untyped-def]  # numba infers
     return px, py, pz
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def farthest_from(triangles, points):  # type: ignore[no-untyped-def]  # numba infers
     """The largest distance of points (n, 3) to triangles (m, 3, 3); 0 without points."""
     farthest = 0.0

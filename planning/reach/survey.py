@@ -20,7 +20,7 @@ from puncture_twin.planning.arm.needle_line import NeedleLine
 from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, least_term
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.reach.answer import ReachRequest
 
 MAX_SWEEP_MM = 2.0
@@ -200,7 +200,7 @@ def _survey_line(lengths, limits, R, target, outward, distances, depths, rolls, 
             _rolled(limits, rolls, full, reached, margins[branch], turns[branch])
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _fast_joint(before, after, mm, fastest):  # type: ignore[no-untyped-def]  # numba infers
     """Whether a joint turns more than ``fastest``, rad/mm, between two configurations (6,) that lie so far apart."""
     fast = False
@@ -209,7 +209,7 @@ def _fast_joint(before, after, mm, fastest):  # type: ignore[no-untyped-def]  # 
     return fast
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _rolled(limits, rolls, full, reached, margins, turns):  # type: ignore[no-untyped-def]  # numba infers
     """Fill ``margins`` (r,) and ``turns`` (r, 6) of one branch.
 

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING
 from puncture_twin.planning.collision.kernels.proofs import (
     BOX,
@@ -39,7 +39,7 @@ LIKELY = 0.6
 is left for when the part is halved."""
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _found(at, gap, kept_mm, fraction, answered, answer):
     """Whether a bound at a state, which is too small to tell the check clear there, ends the search.
 
@@ -58,7 +58,7 @@ def _found(at, gap, kept_mm, fraction, answered, answer):
     return True
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def left_of(scene, movers, segment, part, span, into, room, answered, answer):
     """Which checks the middle of a part of the segment does not clear all over the part.
 
@@ -116,7 +116,7 @@ def left_of(scene, movers, segment, part, span, into, room, answered, answer):
     return into
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def divide(scene, movers, segment, halvings, order, room, answered, answer):
     """Halve the segment, and leave of each part the checks that neither its middle nor that of a larger part clears.
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 
 TOUCHING = -1e9
 """In place of a gap: a point that both hulls contain was found."""
@@ -72,7 +72,7 @@ class Hulls(NamedTuple):
     """Shape (h,): the frame that each moves with."""
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _climb(corners, starts, ends, at, x, y, z):
     """Row of the corner farthest along a direction, by way of ever better neighbours from row ``at`` on."""
     best, better = x * corners[at, 0] + y * corners[at, 1] + z * corners[at, 2], True
@@ -86,7 +86,7 @@ def _climb(corners, starts, ends, at, x, y, z):
     return at
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _nearest_of_segment(S, i, j):
     """The point of the segment of rows i and j of S that is nearest to the origin; which rows hold it, -1 for none."""
     ax, ay, az = S[i, 0], S[i, 1], S[i, 2]
@@ -101,7 +101,7 @@ def _nearest_of_segment(S, i, j):
     return i, j, ax + fraction * ux, ay + fraction * uy, az + fraction * uz
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _nearest_of_triangle(S, i, j, k):
     """The corner rows and the point of the triangle of three rows that is nearest to the origin."""
     ax, ay, az = S[i, 0], S[i, 1], S[i, 2]
@@ -125,7 +125,7 @@ def _nearest_of_triangle(S, i, j, k):
     return p, q, -1, x, y, z
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _outside(S, p, q, r, opposite):
     """Whether the origin lies beyond the face p q r of a tetrahedron, or its inside cannot be told."""
     ax, ay, az = S[p, 0], S[p, 1], S[p, 2]
@@ -138,7 +138,7 @@ def _outside(S, p, q, r, opposite):
     return height * height <= FLAT * FLAT * size or -(nx * ax + ny * ay + nz * az) * height <= 0.0
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _nearest_of_tetrahedron(S):
     """The rows and the point of the tetrahedron of all four that is nearest; rows -1 where the origin lies inside."""
     best, i, j, k, x, y, z = math.inf, -1, -1, -1, 0.0, 0.0, 0.0
@@ -152,7 +152,7 @@ def _nearest_of_tetrahedron(S):
     return i, j, k, x, y, z
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _keep(S, i, j, k):
     """Move some rows, -1 for none, to the front; how many there are."""
     i0, i1, i2 = S[i, 0], S[i, 1], S[i, 2]
@@ -164,7 +164,7 @@ def _keep(S, i, j, k):
     return 1 + (j >= 0) + (k >= 0)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
     """A lower and an upper bound on the distance of two convex hulls, mm; (``TOUCHING``, 0) where they overlap.
 
@@ -225,7 +225,7 @@ def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
     return lower, upper
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def deep(S, mm):
     """Whether the origin lies within the tetrahedron of all four rows, farther than ``mm`` from each face; not if NaN.
 
@@ -244,7 +244,7 @@ def deep(S, mm):
     return True
 
 
-@nb.njit(cache=True, fastmath={"nnan", "ninf", "nsz", "reassoc", "contract"})
+@allocation_free(fastmath={"nnan", "ninf", "nsz", "reassoc", "contract"})
 def _extreme(px, py, pz, x, y, z):
     """The largest projection of points on a direction. Its inputs are finite: that lets it run four abreast."""
     best = -1e300
@@ -253,7 +253,7 @@ def _extreme(px, py, pz, x, y, z):
     return best
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _plane_gap(axes, starts, first, second, M, x, y, z):
     """The gap between two hulls along a direction, by all of some corners."""
     cx, cy, cz = axes
@@ -267,7 +267,7 @@ def _plane_gap(axes, starts, first, second, M, x, y, z):
     return gap - _extreme(cx[begin:end], cy[begin:end], cz[begin:end], x, y, z)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _toward(hulls, first, second, M, axis):
     """Fill ``axis`` with the unit direction from one hull's sphere to the other's."""
     squared = 0.0
@@ -281,7 +281,17 @@ def _toward(hulls, first, second, M, axis):
         axis[i] = axis[i] / size if size > 0.0 else (1.0 if i == 2 else 0.0)
 
 
-@nb.njit(cache=True)
+@allocation_free()
+def _inner_bound(hulls, M, axis, at, S):
+    """The lower bound between the bodies within two hulls; ``axis`` and ``at`` stay as the hulls' search left them."""
+    x, y, z, i, j = axis[0], axis[1], axis[2], at[0], at[1]
+    starts, ends = hulls.neighbour_starts, hulls.neighbours
+    lower, _ = distance_bounds(hulls.inner, starts, ends, M, axis, at, 0.0, S)
+    axis[0], axis[1], axis[2], at[0], at[1] = x, y, z, i, j
+    return lower
+
+
+@allocation_free()
 def hull_gap(hulls, first, second, M, axis, at, needed, S):
     """Lower bound on the distance of two hulls, mm; ``TOUCHING`` where the bodies in them surely share a point.
 
@@ -310,5 +320,5 @@ def hull_gap(hulls, first, second, M, axis, at, needed, S):
             gap = max(gap, _plane_gap(hulls.axes, hulls.starts, first, second, M, x, y, z))
         return max(0.0, gap)
     if lower == TOUCHING and (hulls.rounded[first] or hulls.rounded[second]):
-        lower, _ = distance_bounds(hulls.inner, starts, ends, M, axis.copy(), at.copy(), 0.0, S)
+        lower = _inner_bound(hulls, M, axis, at, S)
     return TOUCHING if lower == TOUCHING else 0.0

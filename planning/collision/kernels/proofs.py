@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.collision.kernels.hulls import Hulls, hull_gap
 from puncture_twin.planning.collision.kernels.surfaces import STACK, moved, skin_gap
 
@@ -94,7 +94,7 @@ def scratch(checks, hulls):
     return ProofScratch(axes, corners, spheres, stacks[0], stacks[1], np.empty((3, 4)), np.empty((4, 3)))
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def place_sphere(hulls, frames, hull, spheres):
     """Fill a row of ``spheres`` (h, 3) with the centre of a hull's sphere, the arm standing at ``frames`` (7, 4, 4)."""
     frame = hulls.frames[hull]
@@ -104,14 +104,14 @@ def place_sphere(hulls, frames, hull, spheres):
         spheres[hull, i] = along + frames[frame, i, 3]
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def place_spheres(hulls, frames, spheres):
     """Fill all rows of ``spheres``, see :func:`place_sphere`."""
     for hull in range(len(spheres)):
         place_sphere(hulls, frames, hull, spheres)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def sphere_gap(is_box, first, second, spheres, radii, T_box_base, halves):
     """Lower bound on the distance of two hulls: of their spheres, or of a box and a sphere."""
     x, y, z = spheres[second, 0], spheres[second, 1], spheres[second, 2]
@@ -125,7 +125,7 @@ def sphere_gap(is_box, first, second, spheres, radii, T_box_base, halves):
     return math.sqrt(squared) - radii[first] - radii[second]
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _between(A, B, M):
     """Fill ``M`` (3, 4) with frame B (4, 4) as frame A sees it."""
     for i in range(3):
@@ -135,7 +135,7 @@ def _between(A, B, M):
             M[i, k] = A[0, i] * B[0, k] + A[1, i] * B[1, k] + A[2, i] * B[2, k]
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def near_gap(scene, work, at, frames, enough, far, needed):
     """Lower bound on the distance of check ``at``, the arm standing at ``frames`` (7, 4, 4); of use above ``needed``.
 
@@ -150,7 +150,7 @@ def near_gap(scene, work, at, frames, enough, far, needed):
     return hull_gap(scene.hulls, scene.checks[at, 1], second, work.M, work.axes[at], work.corners[at], needed, work.S)
 
 
-@nb.njit(cache=True, inline="always")
+@allocation_free(inline="always")
 def state_gap(scene, work, at, frames, enough, far, needed):
     """Lower bound as of :func:`near_gap`, sooner where the spheres about two hulls are ``enough`` apart.
 
@@ -165,7 +165,7 @@ def state_gap(scene, work, at, frames, enough, far, needed):
     return near_gap(scene, work, at, frames, enough, far, needed)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def first_unproven(scene, levers, motion, work, proven, state, check, tested, clear_mm):
     """The first state and check, in order, that the bounds do not prove to be more than ``clear_mm`` apart.
 
@@ -212,7 +212,7 @@ def first_unproven(scene, levers, motion, work, proven, state, check, tested, cl
     return -1
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
     """How far a body may move while each joint turns by no more than a fraction of ``turns`` (6,), rad, either way.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import link_frames
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.collision.kernels.proofs import Movers, ProofScene, ProofScratch, scratch
 
 CLEAR, CONTACT, QUERY, NOT_FINITE = 0, 1, 2, 3
@@ -79,7 +79,7 @@ def segment_room(scene: ProofScene, movers: Movers) -> Room:
     return Room(work, np.zeros(checks), lists, spans, paths, np.zeros(count, np.bool_), np.empty((PARTS, 2)))
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def place_arm(segment, fraction):
     """Put the arm at a fraction of the segment."""
     for joint in range(6):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.collision.kernels.halving import divide, left_of
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING
 from puncture_twin.planning.collision.kernels.proofs import (
@@ -41,7 +41,7 @@ KEPT = 0.8
 """Of the clearance at the nearer end of a segment, what all of it is to keep: bounds are loose by up to a tenth."""
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _keep(scene, segment, clear_mm, room):
     """Fills ``kept`` (k,), mm: what a check is to keep, ``clear_mm`` or as much as the nearer end does (``KEPT``)."""
     checks, hulls, T_box_base, halves = scene.checks, scene.hulls, scene.T_box_base, scene.halves
@@ -62,7 +62,7 @@ def _keep(scene, segment, clear_mm, room):
                 kept[at] = min(kept[at], KEPT * max(0.0, gap))
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _bound(scene, work, at, frames, needed):
     """Lower bound on the distance of a check, of use above ``needed``: of the spheres about two hulls where they tell.
 
@@ -81,7 +81,7 @@ def _bound(scene, work, at, frames, needed):
     return near_gap(scene, work, at, frames, needed, needed + MIN_GAP_MM, needed)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _prove(scene, movers, segment, at, within, fine_mm, room, answer):
     """Whether a check surely finds something, or keeps less than it is to; else what is left to query joins the answer.
 

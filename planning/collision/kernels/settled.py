@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, Hulls, deep, distance_bounds
 from puncture_twin.planning.collision.kernels.proofs import MIN_GAP_MM, SKIN, near_gap, place_spheres, state_gap
 
@@ -61,15 +61,16 @@ def beside_triangle(hulls: Hulls, stack: int) -> Triangle:
     return Triangle(corners, inner, starts, ends, *scratch)
 
 
-@nb.njit(cache=True)
-def _far(low, high, line, reach):
+@allocation_free()
+def _far(lx, ly, lz, hx, hy, hz, line, reach):
     """Whether a box is farther than ``reach`` from a segment, told by the box and by the sphere about it.
 
-    ``line`` holds the segment's middle, its unit direction and half of its length.
+    The box is given by its lowest and its highest corner; ``line`` holds the segment's middle, its unit direction and
+    half of its length.
     """
     (mx, my, mz), (ux, uy, uz), half = line
-    ex, ey, ez = (high[0] - low[0]) / 2.0, (high[1] - low[1]) / 2.0, (high[2] - low[2]) / 2.0
-    x, y, z = low[0] + ex - mx, low[1] + ey - my, low[2] + ez - mz
+    ex, ey, ez = (hx - lx) / 2.0, (hy - ly) / 2.0, (hz - lz) / 2.0
+    x, y, z = lx + ex - mx, ly + ey - my, lz + ez - mz
     if (
         abs(x) > ex + half * abs(ux) + reach
         or abs(y) > ey + half * abs(uy) + reach
@@ -81,7 +82,15 @@ def _far(low, high, line, reach):
     return x * x + y * y + z * z > (reach + math.sqrt(ex * ex + ey * ey + ez * ez)) ** 2
 
 
-@nb.njit(cache=True)
+@allocation_free()
+def _far_triangle(t, line, reach):
+    """As :func:`_far`, of the box about a triangle (3, 3)."""
+    lx, ly, lz = min(t[0, 0], t[1, 0], t[2, 0]), min(t[0, 1], t[1, 1], t[2, 1]), min(t[0, 2], t[1, 2], t[2, 2])
+    hx, hy, hz = max(t[0, 0], t[1, 0], t[2, 0]), max(t[0, 1], t[1, 1], t[2, 1]), max(t[0, 2], t[1, 2], t[2, 2])
+    return _far(lx, ly, lz, hx, hy, hz, line, reach)
+
+
+@allocation_free()
 def _beyond_plane(t, line, reach):
     """Whether a segment lies on one side of the plane of a triangle (3, 3), farther than ``reach`` from it.
 
@@ -98,35 +107,44 @@ def _beyond_plane(t, line, reach):
     return height - half * abs(ux * nx + uy * ny + uz * nz) > reach * size
 
 
-@nb.njit(cache=True)
+@allocation_free()
+def _mean(corners, begin, end):
+    """The mean of some rows of corners (n, 3), as three numbers."""
+    x, y, z, count = 0.0, 0.0, 0.0, end - begin
+    for row in range(begin, end):
+        x, y, z = x + corners[row, 0] / count, y + corners[row, 1] / count, z + corners[row, 2] / count
+    return x, y, z
+
+
+@allocation_free()
+def _farthest(corners, begin, end, x, y, z):
+    """The largest distance of some rows of corners (n, 3) from a point."""
+    squared = 0.0
+    for row in range(begin, end):
+        dx, dy, dz = corners[row, 0] - x, corners[row, 1] - y, corners[row, 2] - z
+        squared = max(squared, dx * dx + dy * dy + dz * dz)
+    return math.sqrt(squared)
+
+
+@allocation_free()
 def _axis(hulls, hull, T):
     """The axis of the round body in a hull that stands at ``T`` (4, 4): see :func:`_far`; and a radius that holds it.
 
     The hull is a prism: the corners of one end come before those of the other.
     """
     begin, end = hulls.starts[hull], hulls.starts[hull + 1]
-    middle = (begin + end) // 2
-    a, b = np.zeros(3), np.zeros(3)
-    for row in range(begin, end):
-        for i in range(3):
-            if row < middle:
-                a[i] += hulls.corners[row, i] / (middle - begin)
-            else:
-                b[i] += hulls.corners[row, i] / (end - middle)
-    radius = 0.0
-    for row in range(begin, end):
-        squared = 0.0
-        for i in range(3):
-            squared += (hulls.corners[row, i] - (a[i] if row < middle else b[i])) ** 2
-        radius = max(radius, math.sqrt(squared))
-    length = math.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2)
-    x, y, z = (b[0] - a[0]) / length, (b[1] - a[1]) / length, (b[2] - a[2]) / length
+    middle, corners = (begin + end) // 2, hulls.corners
+    ax, ay, az = _mean(corners, begin, middle)
+    bx, by, bz = _mean(corners, middle, end)
+    radius = max(_farthest(corners, begin, middle, ax, ay, az), _farthest(corners, middle, end, bx, by, bz))
+    length = math.sqrt((bx - ax) ** 2 + (by - ay) ** 2 + (bz - az) ** 2)
+    x, y, z = (bx - ax) / length, (by - ay) / length, (bz - az) / length
     u = (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
         T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
     )
-    x, y, z = (a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0, (a[2] + b[2]) / 2.0
+    x, y, z = (ax + bx) / 2.0, (ay + by) / 2.0, (az + bz) / 2.0
     m = (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
@@ -135,7 +153,7 @@ def _axis(hulls, hull, T):
     return (m, u, length / 2.0), radius + MIN_GAP_MM
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _gap_along(hulls, hull, M, triangle, x, y, z):
     """The gap between a triangle (3, 3) and a hull that stands at ``M``, along a direction, by all corners."""
     far = -math.inf
@@ -150,7 +168,7 @@ def _gap_along(hulls, hull, M, triangle, x, y, z):
     return near + M[0, 3] * x + M[1, 3] * y + M[2, 3] * z - far
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def against_triangle(hulls, hull, M, triangle, line, room):
     """Whether the round body in a hull touches a triangle: ``CLEAR``, ``TOUCHES``, or ``OPEN`` where that is not told.
 
@@ -183,7 +201,7 @@ def against_triangle(hulls, hull, M, triangle, line, room):
     return TOUCHES if lower == TOUCHING and deep(room.S, DEEP_MM) else OPEN
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def on_skin(skin, hulls, hull, T, room):
     """What the round body in a hull that stands at ``T`` (4, 4) comes to against each triangle of the skin.
 
@@ -194,12 +212,12 @@ def on_skin(skin, hulls, hull, T, room):
     line, reach = _axis(hulls, hull, T)
     inner, stack, top = len(lows) - len(corners), room.stack, 1
     on_it, beside = CLEAR, CLEAR
-    low, high = np.empty(3), np.empty(3)
     stack[0] = 0
     while top > 0:
         top -= 1
         node = stack[top]
-        if _far(lows[node], highs[node], line, reach):
+        low, high = lows[node], highs[node]
+        if _far(low[0], low[1], low[2], high[0], high[1], high[2], line, reach):
             continue
         if node < inner:
             stack[top], stack[top + 1] = 2 * node + 1, 2 * node + 2
@@ -209,10 +227,7 @@ def on_skin(skin, hulls, hull, T, room):
             triangle, outside = corners[node - inner, k], skin.outside[node - inner, k]
             if outside and beside == TOUCHES:
                 continue
-            for i in range(3):
-                low[i] = min(triangle[0, i], triangle[1, i], triangle[2, i])
-                high[i] = max(triangle[0, i], triangle[1, i], triangle[2, i])
-            if _far(low, high, line, reach) or _beyond_plane(triangle, line, reach):
+            if _far_triangle(triangle, line, reach) or _beyond_plane(triangle, line, reach):
                 continue
             answer = against_triangle(hulls, hull, T, triangle, line, room)
             if outside:
@@ -226,7 +241,7 @@ def on_skin(skin, hulls, hull, T, room):
     return CLEAR if beside == CLEAR else TOUCHES_OUTSIDE
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def settled(scene, work, room, at, frames, gap):
     """What a check comes to whose bound ``gap`` proves nothing, the arm standing at ``frames`` (7, 4, 4).
 
@@ -238,14 +253,14 @@ def settled(scene, work, room, at, frames, gap):
     return OPEN if first < 0 else on_skin(scene.skin, scene.hulls, first, frames[scene.checks[at, 4]], room)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def settled_at(scene, work, room, at, frames):
     """What a check comes to, the arm standing at ``frames`` (7, 4, 4)."""
     gap = near_gap(scene, work, at, frames, MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
     return CLEAR if gap > MIN_GAP_MM else settled(scene, work, room, at, frames, gap)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def first_not_clear(scene, frames, work, room, tested, of_state, begins, found, answers):
     """At each of some states that have nothing to do with one another, the first check that is not proven clear.
 

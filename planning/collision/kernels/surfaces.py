@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.geometry.triangle_distance import to_triangle
 
 CELL_MM = 16.0
@@ -27,7 +27,7 @@ STACK = 64
 """Of the descents: deeper than any tree here (a balanced one of 2^40 triangles needs 41)."""
 
 
-@nb.njit(cache=True, inline="always")
+@allocation_free(inline="always")
 def _to_box(low, high, x, y, z):
     """Squared distance of a point to an axis-aligned box."""
     dx = max(low[0] - x, 0.0, x - high[0])
@@ -36,7 +36,7 @@ def _to_box(low, high, x, y, z):
     return dx * dx + dy * dy + dz * dz
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop, fraction):
     """Distance of a point to a surface in a :class:`TriangleTree`, or ``cutoff`` where it is no nearer.
 
@@ -72,7 +72,7 @@ def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop, fraction):
     return math.sqrt(best)
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def moved(T, c):
     """A point (3,) where the frame ``T`` (4, 4) takes it."""
     x = T[0, 0] * c[0] + T[0, 1] * c[1] + T[0, 2] * c[2] + T[0, 3]
@@ -81,7 +81,7 @@ def moved(T, c):
     return x, y, z
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _field_distance(tree, field, origin, x, y, z, stack):
     """Distance to the skin, ``ROUGH``, of the middle of a point's cell: kept in ``field`` once known; -1 outside."""
     i, j, k = (x - origin[0]) / CELL_MM, (y - origin[1]) / CELL_MM, (z - origin[2]) / CELL_MM
@@ -97,7 +97,7 @@ def _field_distance(tree, field, origin, x, y, z, stack):
     return field[i, j, k]
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
     """Lower bound on the distance of a body's spheres to the skin, the body's frame standing at ``T`` (4, 4).
 
