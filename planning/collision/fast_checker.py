@@ -96,14 +96,11 @@ class FastChecker(CellChecker):
         path = np.asarray(q_path, dtype=np.float64)
         require_finite(path)
         motion, mask = self.motion(path), self._masks[needle_may_touch_patient]
-        open_at = self._proofs.first_unproven(motion, 0, mask)
-        while open_at >= 0:
-            index, check = divmod(open_at, len(self._tested))
+        for index, check in self._proofs.unproven(motion, mask):
             frames = motion.frames[index]
             contact = self._contact_of(check, self._proofs.settled_at(check, frames), frames)
             if contact is not None:
                 return FirstContact(index, contact)
-            open_at = self._proofs.first_unproven(motion, open_at + 1, mask)
         return None
 
     def _contact_of(self, check: int, answer: int, frames: Floats) -> Contact | None:
@@ -136,11 +133,7 @@ class FastChecker(CellChecker):
         """The questions at ``q`` (6,) that are left to FCL."""
         motion = self.motion(np.asarray(q, dtype=np.float64)[None])
         mask = self._masks[needle_may_touch_patient]
-        found, open_at = [], self._proofs.first_unproven(motion, 0, mask)
-        while open_at >= 0:
-            found.append(self._tested[open_at].contact)
-            open_at = self._proofs.first_unproven(motion, open_at + 1, mask)
-        return found
+        return [self._tested[check].contact for _, check in self._proofs.unproven(motion, mask)]
 
     def next_nearer(self, motion: Motion, begin: int, pair: str, body: str, mm: float) -> int:
         """The first state at or after one that is not proven to keep one kind of a body's distance; -1 for none.
@@ -158,8 +151,9 @@ class FastChecker(CellChecker):
         skin = [check.contact.other == PATIENT for check in self._tested]
         tested = np.array(of_body) & (np.array(skin) == (pair != "boxes"))
         rest = Motion(motion.frames[begin:], motion.moved[begin:], motion.rotated[begin:])
-        at = self._proofs.first_unproven(rest, 0, tested, mm - self._padding_mm)
-        return -1 if at < 0 else begin + at // len(self._tested)
+        for index, _ in self._proofs.unproven(rest, tested, mm - self._padding_mm):
+            return begin + index
+        return -1
 
     def motion(self, path: Floats) -> Motion:
         """States (m, 6) with what the bounds need of them."""

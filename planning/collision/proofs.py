@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -96,11 +96,10 @@ class Proofs:
         self._levers = np.array([joint_levers(model, check) for check in checks])
         self.movers = packed_movers(checks)
         self._work = scratch(len(rows), len(self.scene.hulls.radii))
-        self._proven = np.empty(len(rows))
         self.joint_spans = np.array([(row[0] == proof_kernels.PAIR, row[3], row[4]) for row in rows], dtype=np.int64)
 
     def __len__(self) -> int:
-        return len(self._proven)
+        return len(self.scene.checks)
 
     def drop(self, never: Bools) -> None:
         """Drop some checks (k,) for good: the others keep their order."""
@@ -108,24 +107,22 @@ class Proofs:
         self.scene = self.scene._replace(checks=self.scene.checks[kept])
         self.movers = self.movers._replace(of_check=self.movers.of_check[kept])
         self._levers, self.joint_spans = self._levers[kept], self.joint_spans[kept]
-        self._work, self._proven = scratch(int(kept.sum()), len(self.scene.hulls.radii)), self._proven[kept].copy()
+        self._work = scratch(int(kept.sum()), len(self.scene.hulls.radii))
 
-    def first_unproven(
-        self, motion: Motion, begin: int, tested: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
-    ) -> int:
-        """The first check at or after ``begin``, counted as state * checks + check, that is not proven; -1 for none.
+    def unproven(
+        self, motion: Motion, tested: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
+    ) -> Iterator[tuple[int, int]]:
+        """The states of a path, in order, each with a check that is not proven clear there, likewise in order.
 
         Args:
             motion: The states, in order.
-            begin: 0 for a new path.
             tested: Shape (k,): which checks.
             clear_mm: What the distance must exceed.
         """
-        if begin == 0:
-            self._proven.fill(-np.inf)
-        at = divmod(begin, len(self._proven))
-        arguments = (self.scene, self._levers, tuple(motion), self._work, self._proven, *at, tested, clear_mm)
-        return int(proof_kernels.first_unproven(*arguments))
+        due = np.zeros(len(self), np.int64)
+        arguments = (self.scene, self._levers, tuple(motion), self._work, due, tested, clear_mm)
+        while (at := int(proof_kernels.first_unproven(*arguments))) >= 0:
+            yield divmod(at, len(self))
 
     def first_not_clear(self, frames: Floats, begins: Ints, tested: Bools, of_state: Ints) -> NotClear:
         """Of each state by itself the first check that is not proven clear, at or after one.

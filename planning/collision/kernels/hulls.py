@@ -291,7 +291,7 @@ def _inner_bound(hulls, M, axis, at, S):
     return lower
 
 
-@allocation_free()
+@allocation_free(forceinline=True)
 def hull_gap(hulls, first, second, M, axis, at, needed, S):
     """Lower bound on the distance of two hulls, mm; ``TOUCHING`` where the bodies in them surely share a point.
 

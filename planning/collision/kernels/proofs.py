@@ -166,10 +166,50 @@ def state_gap(scene, work, at, frames, enough, far, needed):
 
 
 @allocation_free()
-def first_unproven(scene, levers, motion, work, proven, state, check, tested, clear_mm):
-    """The first state and check, in order, that the bounds do not prove to be more than ``clear_mm`` apart.
+def _moved_apart(checks, levers, motion, at, row):
+    """How far the two bodies of a check may have moved against one another since a path's first state, mm."""
+    kind, frame_a, frame_b = checks[at, 0], checks[at, 3], checks[at, 4]
+    _, moved_mm, rotated = motion
+    if kind != PAIR:
+        return moved_mm[row, frame_b]
+    path = 0.0
+    for joint in range(frame_a, frame_b):
+        path += levers[at, joint] * rotated[row, joint]
+    return path
 
-    A check whose gap was g stays clear until its two bodies have moved by g - ``clear_mm`` against one another.
+
+@allocation_free()
+def _due(checks, levers, motion, at, row, proven):
+    """The first state after ``row`` at which the two bodies of a check may have moved by ``proven``, mm, or more.
+
+    Found by halving, for what they may have moved only grows; the number of states where there is none.
+    """
+    low, high = row + 1, len(motion[0])
+    while low < high:
+        middle = (low + high) // 2
+        if _moved_apart(checks, levers, motion, at, middle) < proven:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@allocation_free()
+def _earliest(due, tested):
+    """The first state at which a check that is tested is due."""
+    earliest = np.iinfo(np.int64).max
+    for at in range(len(due)):
+        if tested[at]:
+            earliest = min(earliest, due[at])
+    return earliest
+
+
+@allocation_free()
+def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
+    """The next state and check, in order, that the bounds do not prove to be more than ``clear_mm`` apart.
+
+    A check whose gap was g stays clear until its two bodies have moved by g - ``clear_mm`` against one another: that is
+    where it is due again. One that is not proven is due at the next state, so that a further call goes on from there.
 
     Args:
         scene: See :class:`ProofScene`.
@@ -179,36 +219,28 @@ def first_unproven(scene, levers, motion, work, proven, state, check, tested, cl
             moved: Shape (m, 7), mm: how far each frame's bodies may have moved since the first state; rising;
             rotated: Shape (m, 6), rad: how far each joint has turned since the first state; rising.
         work: See :class:`ProofScratch`.
-        proven: Shape (k,): scratch, mm: what the motion must stay below; -inf at the beginning.
-        state: Where to begin.
-        check: The first check there.
+        due: Shape (k,): the state at which each check is due; 0 at the beginning.
         tested: Shape (k,): which checks.
         clear_mm: ``MIN_GAP_MM``, or any other distance that is wanted.
 
     Returns:
-        state * k + check; -1 where all is clear.
+        state * k + check; -1 where all that is left is clear.
     """
-    frames, paths, rotated = motion
-    count, stood = len(scene.checks), -1
+    frames, checks = motion[0], scene.checks
     enough, far = (clear_mm + ENOUGH_MM, clear_mm + FAR_MM) if len(frames) > 1 else (clear_mm, clear_mm + MIN_GAP_MM)
-    for row in range(state, len(frames)):
-        for at in range(check if row == state else 0, count):
-            kind, frame_a, frame_b = scene.checks[at, 0], scene.checks[at, 3], scene.checks[at, 4]
-            path = paths[row, frame_b]
-            if kind == PAIR:
-                path = 0.0
-                for joint in range(frame_a, frame_b):
-                    path += levers[at, joint] * rotated[row, joint]
-            if path < proven[at] or not tested[at]:
+    row = _earliest(due, tested)
+    while row < len(frames):
+        place_spheres(scene.hulls, frames[row], work.spheres)
+        for at in range(len(checks)):
+            if not tested[at] or due[at] > row:
                 continue
-            if stood < row:
-                stood = row
-                place_spheres(scene.hulls, frames[row], work.spheres)
             gap = state_gap(scene, work, at, frames[row], enough, far, clear_mm)
             if gap <= clear_mm:
-                proven[at] = -math.inf
-                return row * count + at
-            proven[at] = path + gap - clear_mm
+                due[at] = row + 1
+                return row * len(checks) + at
+            proven = _moved_apart(checks, levers, motion, at, row) + gap - clear_mm
+            due[at] = _due(checks, levers, motion, at, row, proven)
+        row = _earliest(due, tested)
     return -1
 
 
