@@ -19,6 +19,9 @@ from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 N_BRANCHES = 8
 """Shoulder left or right, times wrist flipped or not, times elbow up or down, in this order of weight 4, 2, 1."""
 
+EVERY_BRANCH = (1 << N_BRANCHES) - 1
+"""A bit for each of them."""
+
 BOUNDARY_TOLERANCE = 1e-12
 """How far a cosine may exceed 1 and still count as the stretched pose: rounding of its few products, which moves
 the flange by less than 1e-9 mm."""
@@ -57,23 +60,26 @@ def _inverse_all(lengths, T, q):  # type: ignore[no-untyped-def]  # numba infers
             for j in range(3):
                 R[i, j] = T[row, i, j]
             p[i] = T[row, i, 3]
-        fill_branches(lengths, R, p, q[row], np.int64(-1))
+        fill_branches(lengths, R, p, q[row], np.int64(EVERY_BRANCH))
 
 
 @allocation_free()
-def fill_branches(lengths, R, p, q, only):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``q`` (8, 6) for the flange at ``R`` (3, 3) and ``p`` (3,); one row alone unless ``only`` < 0."""
+def fill_branches(lengths, R, p, q, wanted):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``q`` (8, 6) for the flange at ``R`` (3, 3) and ``p`` (3,).
+
+    ``wanted`` has bit b set where branch b is wanted; of the others some may be filled, and some be NaN.
+    """
     a2, a3, d6 = lengths[1], lengths[2], lengths[5]
     q[:] = math.nan
     for side in range(2):
-        if only >= 0 and only // 4 != side:
+        if not wanted >> 4 * side & 15:
             continue
         q1 = _pan(lengths, p[0] - d6 * R[0, 2], p[1] - d6 * R[1, 2], 1.0 - 2.0 * side)
         if math.isnan(q1):
             continue
         c1, s1 = math.cos(q1), math.sin(q1)
         for flip in range(2):
-            if only >= 0 and only // 2 % 2 != flip:
+            if not wanted >> (4 * side + 2 * flip) & 3:
                 continue
             q5, q6, q234, x, y = _wrist(lengths, R, p, c1, s1, 1.0 - 2.0 * flip)
             cosine = _bend(lengths, x, y)

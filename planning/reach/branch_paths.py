@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import (
+    EVERY_BRANCH,
     N_BRANCHES,
     fill_branches,
     wrapped_angle,
@@ -41,7 +42,7 @@ def _every_branch(lengths, R, target, outward, distances, q):  # type: ignore[no
     for k in range(len(distances)):
         for i in range(3):
             p[i] = target[i] + distances[k] * outward[i]
-        fill_branches(lengths, R, p, here, np.int64(-1))
+        fill_branches(lengths, R, p, here, np.int64(EVERY_BRANCH))
         for branch in range(8):
             for joint in range(6):
                 angle = here[branch, joint]
@@ -69,7 +70,7 @@ def fill_branch_path(lengths, R, target, outward, distances, branch, turn, q):  
     for k in range(len(distances)):
         for i in range(3):
             p[i] = target[i] + distances[k] * outward[i]
-        fill_branches(lengths, R, p, here, branch)
+        fill_branches(lengths, R, p, here, np.int64(1) << branch)
         for joint in range(6):
             angle = here[branch, joint] + turn[joint]
             q[k, joint] = angle if k == 0 else q[k - 1, joint] + wrapped_angle(angle - q[k - 1, joint])

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, first_stop, reach_margin
-from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits, wrap_to_pi
+from puncture_twin.planning.arm.inverse_kinematics import (
+    EVERY_BRANCH,
+    fill_branches,
+    inverse,
+    nearest_within_limits,
+    wrap_to_pi,
+)
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.needle_line import flange_poses, needle_lines
 from puncture_twin.planning.arm.singularity import singularity
@@ -59,6 +65,21 @@ def test_one_branch_alone_and_all_eight_agree() -> None:
             alone = np.empty((len(DISTANCES), 6))
             fill_branch_path(model.lengths, *line, DISTANCES, branch, turn, alone)
             assert np.allclose(alone, every[branch] + turn, rtol=0.0, atol=1e-12, equal_nan=True)
+
+
+def test_the_branches_that_are_wanted_are_the_same_ones_as_of_all() -> None:
+    """To the last bit, whichever others are wanted with them: so a survey may drop those that have ended."""
+    model, rng, there = ur_model("ur3"), np.random.default_rng(5), 0
+    for line in lines(40, seed=5):
+        at = line.target + 300.0 * line.outward
+        every, some = np.empty((2, 8, 6))
+        fill_branches(model.lengths, line[0], at, every, EVERY_BRANCH)
+        wanted = int(rng.integers(256))
+        fill_branches(model.lengths, line[0], at, some, wanted)
+        rows = [branch for branch in range(8) if wanted >> branch & 1]
+        assert some[rows].tobytes() == every[rows].tobytes()
+        there += int((~np.isnan(some[rows, 0])).sum())
+    assert there > 30
 
 
 def test_the_survey_is_what_its_parts_say() -> None:
