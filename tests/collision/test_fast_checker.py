@@ -20,12 +20,13 @@ from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.prisms import prism
-from puncture_twin.planning.collision.bodies.shapes import convex
+from puncture_twin.planning.collision.bodies.shapes import convex, surface
 from puncture_twin.planning.collision.bodies.sphere_tree import halves, sphere_tree
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
-from puncture_twin.planning.collision.kernels.surfaces import ROUGH, STACK, to_surface
+from puncture_twin.planning.collision.kernels.proofs import SKIN
+from puncture_twin.planning.collision.kernels.surfaces import ROUGH, STACK, skin_gap, to_surface
 from puncture_twin.planning.collision.packed.hulls import coarse_hull, inscribed_prism, neighbours
 from puncture_twin.planning.collision.packed.skin import TriangleTree
 from puncture_twin.planning.collision.surroundings import case_boxes
@@ -294,6 +295,51 @@ def test_along_a_path_the_first_contact_is_the_one_that_asking_every_state_finds
         met += expected is not None and expected.at > 0
         clear += expected is None
     assert met >= 15 and clear >= 15, (met, clear)
+
+
+@pytest.mark.parametrize("padding", [0.0, 5.0])
+def test_whatever_touches_along_a_path_is_left_open(padding: float) -> None:
+    """Not only the first: every state of a path with each check that FCL finds a contact by there, in order."""
+    fast, rng, touching = scene(FastChecker, padding), np.random.default_rng(11), 0
+    assert isinstance(fast, FastChecker)
+    tested = np.ones(len(fast._tested), np.bool_)
+    for _ in range(30):
+        begin, end = CLEAR + rng.normal(size=(2, 6)) * 0.5
+        motion = fast.motion(np.linspace(begin, end, 40))
+        left = list(fast._proofs.unproven(motion, tested))
+        assert left == sorted(set(left))
+        found = [
+            (row, at)
+            for row, frames in enumerate(motion.frames)
+            for at, check in enumerate(fast._tested)
+            if check.contact_at(frames) is not None
+        ]
+        assert set(found) <= set(left)
+        touching += len(found)
+    assert touching > 300
+
+
+def test_the_bound_on_the_distance_to_the_skin_is_below_it() -> None:
+    """Whether the field of distances proves enough or the surface is asked: FCL measures no less; often much more."""
+    fast, rng = scene(FastChecker), np.random.default_rng(12)
+    assert isinstance(fast, FastChecker) and fast._surface is not None
+    skin = fcl.CollisionObject(surface(fast._surface))
+    packed, stacks = fast._proofs.scene, (np.empty(STACK, np.int64), np.empty(STACK, np.int64))
+    rows = {check.contact.body: row for check, row in zip(fast._tested, packed.checks, strict=True) if row[0] == SKIN}
+    by_field = near = 0
+    for body in fast._bodies[1:]:
+        for _ in range(60):
+            T = trimesh.transformations.random_rotation_matrix(rng.uniform(size=3))
+            T[:3, 3] = [380.0, 40.0, 60.0] + rng.normal(size=3) * 250.0
+            gap = skin_gap(packed.skin, packed.spheres, rows[body.name][2], T, 12.0, 200.0, 1e-3, *stacks)
+            T_body, mm = T @ body.T_frame_body, np.inf
+            for solid in body.full.solids:
+                solid.setTransform(fcl.Transform(T_body[:3, :3], T_body[:3, 3]))
+                mm = min(mm, fcl.distance(skin, solid, fcl.DistanceRequest(), fcl.DistanceResult()))
+            assert gap <= max(mm, 1e-3) + 1e-6
+            by_field += 12.0 < gap < 0.9 * mm - 5.0
+            near += 1e-3 < gap < 12.0
+    assert by_field > 50 and near > 5
 
 
 def test_the_proof_holds_for_the_whole_stretch_that_is_skipped() -> None:

@@ -101,7 +101,8 @@ def _field_distance(tree, field, origin, x, y, z, stack):
 def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
     """Lower bound on the distance of a body's spheres to the skin, the body's frame standing at ``T`` (4, 4).
 
-    The field is tested first: a sphere's centre is no farther from the middle of its cell than half of its diagonal. A
+    The field is tested first: a sphere's centre is no farther from the middle of its cell than half of its diagonal.
+    What it proves is taken for the distance where that is ``enough``: a later look costs less than a closer one. A
     sphere as clear as ``enough``, mm, is not divided; no bound exceeds ``far``; the first part that is not clear
     by ``needed`` ends the search, and then the answer is no bound, only no more than ``needed``. Both stacks are
     scratch.
@@ -117,7 +118,11 @@ def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
         x, y, z = moved(T, c)
         about, cutoff = _field_distance(tree, field, origin, x, y, z, inner_stack), best + r
         if about >= 0.0:
-            if ROUGH * about - HALF_CELL_MM - r >= best:
+            at_least = ROUGH * about - HALF_CELL_MM - r
+            if at_least >= best:
+                continue
+            if at_least > enough:
+                best = at_least
                 continue
             if about + HALF_CELL_MM + r <= needed:  # no part of the body in this sphere is clear by as much
                 return 0.0
