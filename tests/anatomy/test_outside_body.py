@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_MM,
     CUT_AT_MM,
     OutsideImage,
+    beyond_drawn_sides,
     outside_surface,
 )
 from puncture_twin.planning.geometry.containment import inside_each
@@ -53,8 +55,29 @@ def test_it_is_as_wide_beyond_the_image_as_at_its_border(bar, beyond_mm, end):
             assert inside_each(bar, point[None])[0] == within
 
 
-def test_no_triangle_near_the_image_is_long(bar):
+@pytest.fixture
+def table() -> TriangleMesh:
+    """Beyond a curved section behind the body, of a bed that runs at an angle to the slices' axis."""
+    across = np.arange(5.0, 35.0)
+    side = DrawnSide(1, -1, across, 20.0 + 0.01 * (across - 20.0) ** 2, (0.02, -0.05), 60.0, True)
+    empty = OutsideImage(np.full(SHAPE, -1000.0, np.float32), np.zeros(SHAPE, bool), np.diag([*SPACING, 1.0]), SPACING)
+    (surface,) = beyond_drawn_sides(empty, [side], edges=True)
+    return surface
+
+
+@pytest.mark.parametrize("z_mm", [-1999.0, -480.0, -75.0, 0.0, 28.5, 57.0, 300.0, 2050.0])
+def test_a_table_goes_on_along_its_own_direction(table, z_mm):
+    """Half a millimetre before and behind its section in any slice, in the middle of its width."""
+    at_slice = z_mm / SPACING[2]
+    x, y = (20.0 + 0.02 * at_slice) * SPACING[0], (20.0 - 0.05 * at_slice) * SPACING[1]
+    assert table.closed
+    assert inside_each(table, np.array([[x, y + 0.5, z_mm], [x, y - 0.5, z_mm]])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("name", ["bar", "table"])
+def test_no_triangle_near_the_image_is_long(name, request):
     """Those that begin before a cut end there."""
+    bar = request.getfixturevalue(name)
     last = (SHAPE[2] - 1) * SPACING[2]
     z = np.sort(bar.vertices[bar.faces][..., 2], axis=1)
     for cut, following in zip((0.0, *CUT_AT_MM[:-1]), CUT_AT_MM, strict=True):

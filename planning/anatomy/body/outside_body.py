@@ -41,7 +41,7 @@ EDGE_MM = 40.0
 BEYOND_LONG_MM = (*BEYOND_MM[:2], 1000.0)
 """`BEYOND_MM` where an image is so long that the surface would be larger than any that is plausible."""
 CUT_AT_MM = (30.0, 120.0, 480.0)
-"""What is drawn out along the bed is cut across so far beyond the image: a triangle as long as all of it would lie near
+"""What goes on along the bed is cut across so far beyond the image: a triangle as long as all of it would lie near
 every needle, and the search would measure most axes from most of them."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
@@ -174,8 +174,8 @@ def _beyond_line(image: OutsideImage, side: DrawnSide, *, edges: bool) -> Triang
     across = np.concatenate([before, side.across, after])
     along = np.concatenate([np.full(2, side.along[0] - edge), side.along, np.full(2, side.along[-1] - edge)])
     far = (image.hu.shape[side.axis] - 1.0 if side.end else 0.0) + outward * image.beyond_mm[side.axis] / along_mm
-    reach = image.beyond_mm[2] / step_mm
-    slices = np.array([-reach, image.hu.shape[2] - 1.0 + reach])
+    beyond = np.array([0.0, *CUT_AT_MM, image.beyond_mm[2]]) / step_mm
+    slices = np.unique(np.concatenate([-beyond, image.hu.shape[2] - 1.0 + beyond]))
     sink = outward * abs(side.slope[1]) * float(np.abs(slices).max())
     rows = [_row(side, across, values, z) for z in slices for values in (along, np.full(len(along), far + sink))]
     index = np.concatenate(rows)
@@ -194,16 +194,18 @@ def _row(side: DrawnSide, across: Floats, along: Floats, at_slice: float) -> Flo
 
 
 def _outward_faces(vertices: Floats, n: int) -> NDArray[np.int32]:
-    """Triangles of a strip's prism: near and far row (n vertices each) of its first end, then of its last."""
+    """Triangles of a strip's prism: near and far row (n vertices each) of each of its sections, from end to end."""
     i, j = np.arange(n - 1), np.arange(1, n)
-    quads = [
-        np.stack([i, j, j + n, i + n], axis=1),
-        np.stack([i + 2 * n, i + 3 * n, j + 3 * n, j + 2 * n], axis=1),
-        np.stack([i, i + 2 * n, j + 2 * n, j], axis=1),
-        np.stack([i + n, j + n, j + 3 * n, i + 3 * n], axis=1),
-        np.array([[0, n, 3 * n, 2 * n], [n - 1, 3 * n - 1, 4 * n - 1, 2 * n - 1][::-1]]),
-    ]
-    corners = np.concatenate(quads)
+    last = len(vertices) - 2 * n
+    ends = [np.stack([i, j, j + n, i + n], axis=1), np.stack([i, i + n, j + n, j], axis=1) + last]
+    between = np.concatenate(
+        [
+            np.stack([i, i + 2 * n, j + 2 * n, j], axis=1),
+            np.stack([i + n, j + n, j + 3 * n, i + 3 * n], axis=1),
+            np.array([[0, n, 3 * n, 2 * n], [n - 1, 3 * n - 1, 4 * n - 1, 2 * n - 1][::-1]]),
+        ]
+    )
+    corners = np.concatenate([*ends, *(between + first for first in range(0, last, 2 * n))])
     faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]).astype(np.int32)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     inward = float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0
