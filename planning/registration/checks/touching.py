@@ -101,8 +101,12 @@ def untouchable(
 
 def _crosses(mesh: TriangleMesh, points: Floats, directions: Floats, length_mm: float) -> NDArray[np.bool_]:
     """Which segments from points (n, 3) along directions (n, k, 3) cross a surface, shape (n, k)."""
-    rays = [crossings(mesh, point, some, length_mm).count > 0 for point, some in zip(points, directions, strict=True)]
-    return np.stack(rays)
+    low, high, crossed = mesh.triangles.min(axis=1), mesh.triangles.max(axis=1), []
+    for point, some in zip(points, directions, strict=True):
+        gap = np.maximum(np.maximum(low - point, point - high), 0.0)
+        near = TriangleMesh(mesh.vertices, mesh.faces[np.linalg.norm(gap, axis=1) <= length_mm])
+        crossed.append(crossings(near, point, some, length_mm).count > 0)
+    return np.stack(crossed)
 
 
 def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Floats:
