@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.model_urdf import model_urdf, shapes_digest
+from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
@@ -83,10 +83,11 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
     Raises:
         InputError: If no meshes ship for this model, or one cannot be used.
     """
+    urdf = model_urdf(model)
     made_from = {
         "what": "collision links",
         "lengths": model.lengths.tolist(),
-        "shapes": shapes_digest(model),
+        "urdf": urdf.digest,
         "shipped": model.shipped,
     }
     kept = user_cache().arrays(made_from, lambda: _packed(_convex_links(model)), by=__name__, check=unpacked_meshes)

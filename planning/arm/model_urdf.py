@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from functools import cache
 from pathlib import Path
 
@@ -29,22 +28,12 @@ def model_urdf(model: UrModel) -> ArmUrdf:
     Raises:
         InputError: Nobody has the shapes of such a model.
     """
-    return _shipped(_shipped_name(model)) if model.urdf is None else model.urdf
-
-
-def shapes_digest(model: UrModel) -> str:
-    """Hexadecimal SHA-256 of all bytes that the URDF of a model and its shapes are read from; they are not parsed.
-
-    Raises:
-        InputError: Nobody has the shapes of such a model.
-    """
     if model.urdf is not None:
-        return model.urdf.digest
-    path = _shipped_file(_shipped_name(model))
-    digest = hashlib.sha256()
-    for file in (path, *sorted(path.with_suffix("").glob("*.stl"))):
-        digest.update(f"{file.name} ".encode() + hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()
+        return model.urdf
+    if not model.shipped:
+        what = f"the arm {model.name!r} is known by its numbers alone"
+        raise InputError(what, where="robot", allowed="the case that names its URDF")
+    return _shipped(model.name)
 
 
 def address_file(urdf: ArmUrdf, address: str) -> str:
@@ -54,25 +43,12 @@ def address_file(urdf: ArmUrdf, address: str) -> str:
     return address if MEANS in address else str((urdf.where.parent / address).resolve())
 
 
-def _shipped_name(model: UrModel) -> str:
-    if not model.shipped:
-        what = f"the arm {model.name!r} is known by its numbers alone"
-        raise InputError(what, where="robot", allowed="the case that names its URDF")
-    return model.name
-
-
-def _shipped_file(name: str) -> Path:
-    """The URDF that ships under a name; its shapes are the STL files in a folder of this name beside it."""
+@cache
+def _shipped(name: str) -> ArmUrdf:
     path = meshes.folder() / SHAPES / f"{name}.urdf"
     if not path.is_file():
         allowed = ", ".join(sorted(p.stem for p in path.parent.glob("*.urdf")))
         raise InputError(f"no link meshes for robot {name!r}", where=f"meshes/{SHAPES}", allowed=allowed)
-    return path
-
-
-@cache
-def _shipped(name: str) -> ArmUrdf:
-    path = _shipped_file(name)
     return read_arm_urdf(
         path.read_bytes(),
         path,

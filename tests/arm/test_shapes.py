@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from dataclasses import replace
 from functools import partial
 
@@ -12,7 +11,7 @@ import pytest
 from puncture_twin import meshes
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import LINK_NAMES, visual_links
-from puncture_twin.planning.arm.model_urdf import model_urdf, shapes_digest
+from puncture_twin.planning.arm.model_urdf import model_urdf
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 
@@ -70,26 +69,3 @@ def test_no_arm_without_shapes_is_given_any():
     """An arm that has no URDF here is refused, with those that have one."""
     with pytest.raises(InputError, match="no link meshes for robot 'ur16e'.*ur10, ur10e, ur3, ur3e, ur5, ur5e"):
         model_urdf(replace(ur_model("ur10e"), name="ur16e"))
-    with pytest.raises(InputError, match="no link meshes for robot 'ur16e'"):
-        shapes_digest(replace(ur_model("ur10e"), name="ur16e"))
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_the_shapes_of_an_arm_are_the_files_in_its_folder(name):
-    """What is kept of an arm is kept under the hash of these: a shape that lay elsewhere could change unseen."""
-    addresses = model_urdf(ur_model(name)).document.addresses
-    assert sorted(addresses) == sorted(f"package://ur/{name}/{file.name}" for file in (FOLDER / name).glob("*.stl"))
-
-
-@pytest.mark.parametrize("file", ["ur3.urdf", "ur3/base.stl", "ur3/wrist_3.stl"])
-def test_any_byte_of_an_arm_changes_its_digest(file, tmp_path, monkeypatch):
-    """Of its URDF or of a shape; another arm's stays."""
-    shutil.copytree(FOLDER, tmp_path / "ur")
-    monkeypatch.setattr(meshes, "folder", lambda: tmp_path)
-    arms = [ur_model("ur3"), ur_model("ur5")]
-    before = [shapes_digest(arm) for arm in arms]
-    data = bytearray((tmp_path / "ur" / file).read_bytes())
-    data[-1] ^= 1
-    (tmp_path / "ur" / file).write_bytes(data)
-    after = [shapes_digest(arm) for arm in arms]
-    assert after[0] != before[0] and after[1] == before[1]
