@@ -25,7 +25,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.base_place import refuse_base_in
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.body import BODY_NAMES, NEVER_TESTED, Body
+from puncture_twin.planning.collision.bodies.body import BODY_NAMES, NEVER_TESTED, NEVER_TOUCHING, Body
 from puncture_twin.planning.collision.bodies.shapes import surface
 from puncture_twin.planning.collision.check import Check
 from puncture_twin.planning.collision.hanging import check_hanging
@@ -232,9 +232,10 @@ class CellChecker:
 
     def _self_checks(self) -> Iterator[Check]:
         """Every pair of bodies that might touch, piece by piece; of an own arm's neighbours what is not joined."""
+        left_out = NEVER_TESTED.keys() | (NEVER_TOUCHING.keys() if self.model.urdf is None else set())
         for first, second in combinations(self._bodies, 2):
             joined = self._joined.get((first.name, second.name))
-            if joined is None and (first.name, second.name) in NEVER_TESTED:
+            if joined is None and (first.name, second.name) in left_out:
                 continue
             shapes = product(*(zip(body.bare.solids, body.bare.hulls, strict=True) for body in (first, second)))
             for number, ((a, hull_a), (b, hull_b)) in enumerate(shapes):

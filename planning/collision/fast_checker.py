@@ -151,7 +151,7 @@ class FastChecker(CellChecker):
         skin = [check.contact.other == PATIENT for check in self._tested]
         tested = np.array(of_body) & (np.array(skin) == (pair != "boxes"))
         rest = Motion(motion.frames[begin:], motion.moved[begin:], motion.rotated[begin:])
-        for index, _ in self._proofs.unproven(rest, tested, mm - self._padding_mm):
+        for index, _ in self._proofs.unproven(rest, tested, max(mm - self._padding_mm, 0.0)):
             return begin + index
         return -1
 

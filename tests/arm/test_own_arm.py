@@ -21,6 +21,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.arm.urdf.limits import StatedLimits
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.fast_checker import FastChecker
 
 EXACT_MM = 1e-6
 TOOL = Tool(200.0, 150.0, 1.2, 30.0)
@@ -313,3 +314,28 @@ def test_a_shape_that_hangs_on_nothing_is_refused(plain, tmp_path):
     path = edited(plain, tmp_path, ("</robot>", CAMERA.format(0.3, 0.0, 0.02, 0.3, -0.1)))
     with pytest.raises(InputError, match=r"shape of wrist_3, 20 x \d+ x \d+ mm, hangs on nothing"):
         CellChecker(arm(path), TOOL)
+
+
+def test_holder_and_needle_are_asked_of_what_wrist_2_carries(tmp_path):
+    """A plate that hangs on wrist 2 and stands across the needle, 60 mm before the flange, at every angle."""
+    path = write_own_arm(tmp_path)
+    flange = np.linalg.inv(link_poses(arm(path), np.zeros(6))[4]) @ flange_pose(arm(path), np.zeros(6))
+    reach_mm = LENGTHS[5] + 70.0
+    boxes = ((40, 0, -LENGTHS[5], 90, 20, 20), (80, 0, 35 - LENGTHS[5] / 2, 20, 20, reach_mm), (30, 0, 60, 120, 40, 10))
+    shapes = ""
+    for number, (x, y, z, *size) in enumerate(boxes):
+        box = trimesh.creation.box(size)
+        box.apply_translation((x, y, z))
+        box.apply_transform(flange)
+        box.apply_scale(0.001).export(path.parent / f"bracket{number}.stl")
+        shapes += f'<collision><geometry><mesh filename="bracket{number}.stl"/></geometry></collision>'
+    before, link, after = path.read_text().partition(f'<link name="{LINKS[5]}">')
+    path.write_text(before + link + after.replace("</link>", f"{shapes}</link>", 1))
+    for checker in (CellChecker(arm(path), TOOL), FastChecker(arm(path), TOOL)):
+        for q in np.random.default_rng(0).uniform(-2.5, 2.5, (20, 6)):
+            contact = checker.contact(q, needle_may_touch_patient=False)
+            assert contact is not None
+        assert {("holder", "wrist_2"), ("needle", "wrist_2")} & {
+            tuple(checker.contact(q, needle_may_touch_patient=False))[:2]
+            for q in np.random.default_rng(1).uniform(-2.5, 2.5, (60, 6))
+        }
