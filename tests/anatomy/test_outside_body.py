@@ -35,6 +35,22 @@ def bar() -> TriangleMesh:
     return surface
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("end", [0, -1])
+@pytest.mark.parametrize("beyond_mm", [1.0, 50.0, 99.0])
+def test_it_is_as_wide_beyond_every_other_side(axis, end, beyond_mm):
+    """A flat piece that a side of the image cuts: 6 mm thick to the end of what is drawn out there."""
+    mask = np.zeros(SHAPE, bool)
+    mask[(slice(0, 20), slice(10, 20))[axis], (slice(10, 20), slice(0, 20))[axis], 9:11] = True
+    mask = mask if end == 0 else np.flip(mask, axis)
+    empty = OutsideImage(np.full(SHAPE, -1000.0, np.float32), np.zeros(SHAPE, bool), np.diag([*SPACING, 1.0]), SPACING)
+    surface = outside_surface(empty, mask, where="plate")
+    point = np.array([29.0, 29.0, 28.5])
+    point[axis] = -beyond_mm if end == 0 else (SHAPE[axis] - 1) * SPACING[axis] + beyond_mm
+    just = np.array([[0, 0, 2.99], [0, 0, -2.99], [0, 0, 3.01], [0, 0, -3.01]])
+    assert inside_each(surface, point + just).tolist() == [True, True, False, False]
+
+
 def test_it_goes_on_as_far_as_is_said(bar):
     """Along the bed, from the outer face of the last voxels; it is closed."""
     ends = -0.5 * SPACING[2] - BEYOND_MM[2], (SHAPE[2] - 0.5) * SPACING[2] + BEYOND_MM[2]

@@ -110,9 +110,9 @@ def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> T
     """
     if not mask.any():
         return None
-    layers = len(CUT_AT_MM)
-    layered = np.pad(mask.astype(np.float32) - 0.5, ((0, 0), (0, 0), (layers, layers)), mode="edge")
-    T_ct_layered = image.T_ct_index @ pose(np.eye(3), [0.0, 0.0, -layers])
+    beyond = _layers_mm(image)
+    layered = np.pad(mask.astype(np.float32) - 0.5, [(len(layers), len(layers)) for layers in beyond], mode="edge")
+    T_ct_layered = image.T_ct_index @ pose(np.eye(3), [-float(len(layers)) for layers in beyond])
     drawn = _drawn_out(field_surface(layered, T_ct_layered, where=where), image)
     return joined([drawn, *_hulls_beyond(mask & ~find_unscanned(image.hu).padded, image)])
 
@@ -239,14 +239,23 @@ def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_m
     return np.asarray(beside | unscanned.padded if cut.any() else beside)
 
 
+def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
+    """How far beyond its border voxels' centres an image is continued by layers of voxels, along each axis.
+
+    The last layer is where what is drawn out ends: up to there it keeps its width.
+    """
+    to_side, to_back, along = image.beyond_mm
+    return (to_side,), (to_back,), (*CUT_AT_MM, along)
+
+
 def _drawn_out(surface: TriangleMesh, image: OutsideImage) -> TriangleMesh:
     """The surface with the layers beyond its border voxels' centres, and its caps half a voxel after, moved outward."""
     T = image.T_ct_index
     index = np.linalg.solve(T[:3, :3], (surface.vertices - T[:3, 3]).T).T
-    for axis, cut_at_mm in enumerate(((), (), CUT_AT_MM)):
-        last, layers = image.hu.shape[axis] - 1.0, np.arange(1.0, len(cut_at_mm) + 1)
-        beyond = np.array([*layers, len(cut_at_mm) + 0.5])
-        moved = np.array([*cut_at_mm, image.beyond_mm[axis] + 0.5 * image.spacing_mm[axis]]) / image.spacing_mm[axis]
+    for axis, layers_mm in enumerate(_layers_mm(image)):
+        last, count = image.hu.shape[axis] - 1.0, len(layers_mm)
+        beyond = np.array([*range(1, count + 1), count + 0.5])
+        moved = np.array([*layers_mm, layers_mm[-1] + 0.5 * image.spacing_mm[axis]]) / image.spacing_mm[axis]
         index[:, axis] = np.interp(
             index[:, axis],
             np.concatenate([-beyond[::-1], [0.0, last], last + beyond]),
