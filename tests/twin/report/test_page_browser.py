@@ -286,6 +286,22 @@ def test_the_scene_is_drawn_and_answers_the_map(browser, case, candidates):
     browser.until(visible.format("target", "false", "false"))
 
 
+def test_the_scene_is_true_to_scale(browser):
+    """A millimetre is as long along every axis, whatever is hidden; of itself plotly scales by what is shown."""
+    if browser.evaluate("document.getElementById('scene').hidden"):
+        pytest.skip("this browser has no WebGL")
+    for pose in ("none", "target"):
+        browser.evaluate(f"document.getElementById('pose-{pose}').click()")
+        drawn = "document.getElementById('scene')._fullLayout.scene"
+        ratio, *ranges = json.loads(
+            browser.evaluate(
+                f"JSON.stringify([{drawn}.aspectratio, ...['x', 'y', 'z'].map(n => {drawn}[n + 'axis'].range)])"
+            )
+        )
+        per_mm = [ratio[axis] / (high - low) for axis, (low, high) in zip("xyz", ranges, strict=True)]
+        assert per_mm == pytest.approx([per_mm[0]] * 3)
+
+
 def test_views_look_where_they_say(browser, case, candidates):
     """Along the needle the camera looks along the chosen direction; axial looks to the head."""
     if browser.evaluate("document.getElementById('scene').hidden"):

@@ -41,6 +41,9 @@ VIEW = (1200, 640)
 LEAST_TRIANGLES = 300
 """A body is never cut below this."""
 
+LEAST_OF_ARM = 1_500
+"""Nor a part of an arm below this: the thin shells of its links fell apart into single triangles."""
+
 LABEL_OUT_MM = 45.0
 BORDER = 0.02
 """Of the scene's box, around it."""
@@ -98,7 +101,8 @@ def box_of(points_ct: Floats) -> Floats:
 def lightened(bodies: Sequence[SceneBody], triangles: int, cache: Cache = NO_CACHE) -> list[SceneBody]:
     """The bodies with about so many triangles altogether, each cut by the same share."""
     fraction = min(1.0, triangles / max(1, sum(len(b.mesh.faces) for b in bodies)))
-    wanted = [max(LEAST_TRIANGLES, int(fraction * len(body.mesh.faces))) for body in bodies]
+    least = [LEAST_OF_ARM if body.group.startswith("arm") else LEAST_TRIANGLES for body in bodies]
+    wanted = [max(few, int(fraction * len(body.mesh.faces))) for few, body in zip(least, bodies, strict=True)]
     return [replace(body, mesh=lighter_mesh(body.mesh, most, cache)) for body, most in zip(bodies, wanted, strict=True)]
 
 
@@ -197,7 +201,7 @@ def _layout(case: Any, bodies: Sequence[SceneBody], box: Floats) -> dict[str, An
     return {
         "scene": {
             "domain": {"x": [LEGEND_FRACTION, 1.0]},
-            "aspectmode": "data",
+            **_true_to_scale(box),
             **axes,
             "camera": camera,
         },
@@ -206,6 +210,16 @@ def _layout(case: Any, bodies: Sequence[SceneBody], box: Floats) -> dict[str, An
         "paper_bgcolor": "#f6f7f9",
         "uirevision": "keep",
     }
+
+
+def _true_to_scale(box: Floats) -> dict[str, Any]:
+    """Edges of the drawn box as its ranges: of itself plotly scales each axis by the traces that are shown.
+
+    Divided by their geometric mean, which is the unit in which the page's script places its camera.
+    """
+    extent = box[1] - box[0]
+    ratio = extent / np.cbrt(np.prod(extent))
+    return {"aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio.tolist(), strict=True))}
 
 
 def _axis(low: float, high: float) -> dict[str, Any]:
