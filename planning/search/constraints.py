@@ -96,18 +96,26 @@ def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -
 
 
 def closest_miss(found: Candidates) -> int | None:
-    """Row of the rejected candidate that came closest: the least lack of clearance among those that lack only that.
+    """Row of the rejected candidate that came closest: one that the organs allow, and passed most of what follows.
 
-    Without such a row, the one that passed most constraints; None for no rows at all.
+    Without such a row, the least lack of clearance among those that lack only that; None for no rows at all.
     """
+    late = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY, Reason.UNSAFE_WHEN_BREATHING, Reason.NEEDLE_BENDS)
+    of_arm = (Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
+    allowed = _first_of(found, (*late, *of_arm))
+    if allowed is not None:
+        return allowed
     lacking = np.flatnonzero(found.verdict.reason == Reason.TOO_CLOSE.value)
     if len(lacking):
         demanded = ~np.isnan(found.clearance.margins)
         lack = (found.clearance.margins - found.clearance.distance)[:, demanded].max(axis=1)
         return int(lacking[np.argmin(lack[lacking])])
-    late = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY, Reason.UNSAFE_WHEN_BREATHING, Reason.NEEDLE_BENDS)
-    order = (*late, Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
-    for reason in (*order, Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION):
+    return _first_of(found, (Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION))
+
+
+def _first_of(found: Candidates, reasons: tuple[Reason, ...]) -> int | None:
+    """The first row of the first reason that any row has; None where none has."""
+    for reason in reasons:
         rows = np.flatnonzero(found.verdict.reason == reason.value)
         if len(rows):
             return int(rows[0])

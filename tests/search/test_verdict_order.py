@@ -193,4 +193,6 @@ def test_without_one_that_lacks_clearance_it_is_the_one_that_passed_most():
     assert closest_miss(found) == 2
     assert closest_miss(rejected([Reason.UNKNOWN_REGION, Reason.REENTERS_SKIN, Reason.TOO_LONG])) == 2
     assert closest_miss(rejected([Reason.UNKNOWN_REGION])) == 0
+    near = rejected([Reason.TOO_CLOSE, Reason.UNREACHABLE, Reason.ARM_COLLISION], [[1.99], [9.0], [9.0]], [2.0])
+    assert closest_miss(near) == 2, "organs allow it: the arm is what is to be mended"
     assert closest_miss(rejected([])) is None
