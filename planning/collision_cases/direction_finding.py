@@ -25,7 +25,7 @@ def direction_finding(check: CheckSection, found: Explanation) -> Finding:
     if not differences:
         return Finding()
     case, arm = shlex.quote(str(found.case.path)), "--arm" if check.arm else "--no-arm"
-    command = f"run_twin.py check {case} --theta {check.theta_deg:g} --beta {check.beta_deg:g} {arm} --all"
+    command = f"run-twin check {case} --theta {check.theta_deg:g} --beta {check.beta_deg:g} {arm} --all"
     return Finding(differences, (*found.head(), *found.structure_lines()), f"all of it: {command}")
 
 

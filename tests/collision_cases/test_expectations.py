@@ -119,7 +119,7 @@ def test_a_failure_is_at_most_fifteen_lines_and_ends_with_what_shows_more(carton
     assert max(map(len, lines)) <= 300
     assert any("bolt_m" in line for line in lines)
     assert any("more that differ" in line for line in lines)
-    assert lines[-1].startswith("all of it: run_twin.py check ")
+    assert lines[-1].startswith("all of it: run-twin check ")
 
 
 def test_names_stay_when_others_are_added():

@@ -60,7 +60,7 @@ def test_a_failing_check_prints_the_nearest_structures(pytester, old, new, messa
             message,
             "*theta 0 deg, beta 0 deg: safe*",
             "*bolt_h*avoid*",
-            "all of it: run_twin.py check *case_m.toml*--all",
+            "all of it: run-twin check *case_m.toml*--all",
         ]
     )
 
