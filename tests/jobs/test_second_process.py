@@ -5,6 +5,8 @@ import operator
 import os
 import pickle
 import signal
+import subprocess
+import sys
 import time
 import warnings
 from io import BytesIO
@@ -149,3 +151,26 @@ def test_nothing_begins_on_one_core_or_before_all_is_compiled(two_cores, monkeyp
     monkeypatch.setattr("puncture_twin.planning.base.cache.kernel_cache.is_compiled", lambda kernel: False)
     with second_process(gc.collect) as beside:
         assert isinstance(beside, Here)
+
+
+def test_it_is_ended_while_a_module_loads_without_a_word(tmp_path):
+    """Compiled modules turn an exit inside of them into an error of theirs, and Python would print its traceback."""
+    (tmp_path / "slow_to_load.py").write_text(
+        "import sys, time\n"
+        "print('loading', file=sys.stderr, flush=True)\n"
+        "try:\n    time.sleep(60)\n"
+        "except SystemExit as exit:\n    raise ImportError('already registered') from exit\n"
+    )
+    code = "from puncture_twin.twin.jobs.second_process import serve; serve('slow_to_load', 'get_ready')"
+    child = subprocess.Popen(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stderr.readline() == "loading\n"
+    child.terminate()
+    _, said = child.communicate(timeout=30)
+    assert (child.returncode, said) == (0, "")

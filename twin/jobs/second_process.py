@@ -203,12 +203,15 @@ class _Reply(NamedTuple):
 
 def serve(module: str, get_ready: str) -> NoReturn:
     """Answer requests until nobody asks; what a library prints to standard output goes to standard error."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # by way of what must be closed, such as the encoder
+    signal.signal(
+        signal.SIGTERM, lambda *_: os._exit(0)
+    )  # a module that is loaded takes an exit for an error of its own
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     requests, replies = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     with suppress(SystemExit):
         getattr(__import__(module, fromlist=[get_ready]), get_ready)()
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # by way of what must be closed, such as the encoder
         _answer_all(requests, replies)
     leave(0)
 
