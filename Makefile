@@ -1,4 +1,4 @@
-# make demo: the main job on the embedded abdomen.  make test: everything that must hold.  make quick: most of it, in a minute on two idle cores.
+# make demo: the main job on the embedded abdomen.  make test: everything that must hold.  make quick: most of it, in a minute or two.
 # make mutants: which faults in the plain modules and kernels the tests notice (a quarter of an hour).
 
 PYTHON ?= python3.11
