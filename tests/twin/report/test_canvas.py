@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import example, given, strategies as st
 
 from puncture_twin.twin.report.canvas.canvas import Canvas, Halo, Words, circle, rounded, star
 from puncture_twin.twin.report.canvas.dashes import dashed
@@ -22,11 +22,12 @@ def rotation(angle):
 
 
 @given(ANGLES, st.floats(1.0, 6.0))
+@example(3 * np.pi / 4, 1.0)
 def test_a_line_is_as_wide_as_asked(angle, width):
-    """In every direction: length times width, and a disc for both round ends, to a tenth of a pixel of width."""
+    """In every direction: length times width, and a disc for both round ends, which alone are not exact."""
     canvas, along = Canvas(100, 100, None), 30 * np.array([np.cos(angle), np.sin(angle)])
     canvas.line(np.array([50 - along, 50 + along]), width, (0, 0, 0))
-    assert covered(canvas) == pytest.approx(60 * width + np.pi * width**2 / 4, abs=60 * 0.1)
+    assert covered(canvas) == pytest.approx(60 * width + np.pi * width**2 / 4, abs=2.0)
 
 
 def test_a_line_thinner_than_a_pixel_is_pale():

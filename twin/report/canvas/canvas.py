@@ -91,7 +91,7 @@ class Canvas:
         """Lines from point to point, each alone, shape (n, 2, 2); where they cross nothing is darker."""
         if len(segments) == 0:
             return
-        reach, segments = width / 2 + 1.0, np.asarray(segments, dtype=float)
+        reach, segments = max(width, 1.0) / 2 + 1.0, np.asarray(segments, dtype=float)
         low, high = segments.min(axis=1) - reach, segments.max(axis=1) + reach
         segments = segments[(high >= 0).all(axis=1) & (low <= self.pixels.shape[1::-1]).all(axis=1)]
         if len(segments) == 0:  # all are beside the picture

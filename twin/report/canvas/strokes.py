@@ -13,6 +13,29 @@ LINES = 4
 """In a row of pixels, along which areas are filled."""
 
 
+HALF_DIAGONAL = 0.7072
+"""Of a pixel, rounded up."""
+
+
+@nb.njit(nogil=True, error_model="numpy")
+def _within(beyond, nx, ny):
+    """The share of a pixel on one side of a line: exactly, the square's shadow on the normal is a trapezoid.
+
+    Args:
+        beyond: How far the line lies beyond the pixel's middle, along the normal.
+        nx: Of the normal, of length 1.
+        ny: Of it.
+    """
+    if beyond >= HALF_DIAGONAL:
+        return 1.0
+    long, short = max(abs(nx), abs(ny)), min(abs(nx), abs(ny))
+    if short < 1e-6:
+        return min(max(beyond / max(long, 0.5) + 0.5, 0.0), 1.0)
+    far, near = 0.5 * (long + short), 0.5 * (long - short)
+    corners = max(beyond + far, 0.0) ** 2 + max(beyond - far, 0.0) ** 2
+    return (corners - max(beyond + near, 0.0) ** 2 - max(beyond - near, 0.0) ** 2) / (2.0 * long * short)
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def cover_segments(cover, segments, width):
     """Draw segments with round ends; where several cover a pixel, the most counts.
@@ -23,7 +46,8 @@ def cover_segments(cover, segments, width):
         width: Pixels; below 1 a line is as wide as a pixel, and paler.
     """
     rows, columns = cover.shape
-    reach, most = 0.5 * max(width, 1.0) + 0.5, min(width, 1.0)
+    half, most = 0.5 * max(width, 1.0), min(width, 1.0)
+    reach = half + HALF_DIAGONAL
     for s in range(len(segments)):
         ax, ay, bx, by = segments[s, 0], segments[s, 1], segments[s, 2], segments[s, 3]
         dx, dy = bx - ax, by - ay
@@ -39,8 +63,13 @@ def cover_segments(cover, segments, width):
             for j in range(int(max(0.0, low - 1.0)), int(min(columns - 1.0, high)) + 1):
                 x = j + 0.5 - ax
                 t = min(max(x * dx + y * dy, 0.0), length)
-                far = np.sqrt((x - t * dx) ** 2 + (y - t * dy) ** 2)
-                value = most * min(1.0, reach - far)
+                nx, ny = x - t * dx, y - t * dy
+                far = np.sqrt(nx * nx + ny * ny)
+                if far > 0.0:
+                    nx, ny = nx / far, ny / far
+                else:
+                    nx, ny = dy, dx
+                value = most * (_within(half - far, nx, ny) - _within(-half - far, nx, ny))
                 if value > cover[i, j]:
                     cover[i, j] = value
 
