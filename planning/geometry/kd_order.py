@@ -10,6 +10,12 @@ from puncture_twin.planning.base.numba_kernels import nb
 STACK = 128
 """Ranges that wait while a part is split: one per level, and 2^64 points have 64 levels."""
 
+SAMPLED = 128
+"""One point of so many, and three more, is looked at to guess a pivot."""
+
+MOST_SAMPLED = 63
+"""More bring the guess no nearer than sorting them costs."""
+
 
 def kd_order(points: NDArray[np.float64], leaf: int) -> NDArray[np.int64]:
     """Sort points so that runs of ``leaf``, and aligned runs of 2, 4, 8 ... such runs, are compact.
@@ -18,22 +24,24 @@ def kd_order(points: NDArray[np.float64], leaf: int) -> NDArray[np.int64]:
     runs stay aligned whatever the count.
 
     Args:
-        points: Shape (n, 3), finite.
+        points: Shape (n, 3), finite, n below 2^31.
         leaf: Points in a run, at least 1.
 
     Returns:
         Shape (n,), row numbers in their new order.
     """
-    records = np.array(points, dtype=np.float32, order="C")
-    order = np.arange(len(points))
-    _sort(records, order, leaf)
-    return order
+    records = np.empty((len(points), 4), np.float32)
+    records[:, :3] = points
+    rows = records.view(np.int32)
+    rows[:, 3] = np.arange(len(points))
+    _sort(records, rows, leaf)
+    return rows[:, 3].astype(np.int64)
 
 
 @nb.njit(cache=True, nogil=True)
-def _sort(records, order, leaf):  # type: ignore[no-untyped-def]  # numba infers
+def _sort(records, rows, leaf):  # type: ignore[no-untyped-def]  # numba infers
     """Split range after range, each at its left-balanced middle."""
-    stack = np.empty((STACK, 2), np.int64)
+    stack, sample = np.empty((STACK, 2), np.int64), np.empty(MOST_SAMPLED, np.float32)
     stack[0, 0], stack[0, 1] = 0, len(records)
     waiting = 1
     while waiting > 0:
@@ -45,7 +53,7 @@ def _sort(records, order, leaf):  # type: ignore[no-untyped-def]  # numba infers
         left = leaf
         while 2 * left < count:
             left *= 2
-        _select(records, order, low, high, low + left, _longest_side(records, low, high))
+        _select(records, rows, sample, low, high, low + left, _longest_side(records, low, high))
         stack[waiting, 0], stack[waiting, 1] = low, low + left
         stack[waiting + 1, 0], stack[waiting + 1, 1] = low + left, high
         waiting += 2
@@ -68,27 +76,57 @@ def _longest_side(records, low, high):  # type: ignore[no-untyped-def]  # numba 
 
 
 @nb.njit(cache=True, nogil=True)
-def _select(records, order, low, high, middle, axis):  # type: ignore[no-untyped-def]  # numba infers
-    """Rearrange a range until no point before ``middle`` lies above one behind it (Hoare's selection)."""
-    high -= 1
-    while low < high:
-        a, b, c = records[low, axis], records[(low + high) // 2, axis], records[high, axis]
-        pivot = max(min(a, b), min(max(a, b), c))
-        i, j = low, high
-        while i <= j:
-            while records[i, axis] < pivot:
-                i += 1
-            while records[j, axis] > pivot:
-                j -= 1
-            if i <= j:
-                for k in range(3):
-                    records[i, k], records[j, k] = records[j, k], records[i, k]
-                order[i], order[j] = order[j], order[i]
-                i += 1
-                j -= 1
-        if middle <= j:
-            high = j
-        elif middle >= i:
-            low = i
+def _select(records, rows, sample, low, high, middle, axis):  # type: ignore[no-untyped-def]  # numba infers
+    """Rearrange a range until no point before ``middle`` lies above one behind it.
+
+    Quickselect whose pivot is where a sample expects the middle: the next range is short (Floyd and Rivest 1975).
+    """
+    while high - low > 1:
+        pivot = _expected(records, sample, low, high, middle, axis)
+        border = _part(records, rows, low, high, axis, pivot, False)
+        if border == low:  # none lies below: those that equal the pivot come first
+            border = _part(records, rows, low, high, axis, pivot, True)
+            if middle <= border:
+                return
+        if middle < border:
+            high = border
+        elif middle > border:
+            low = border
         else:
             return
+
+
+@nb.njit(cache=True, nogil=True)
+def _expected(records, sample, low, high, middle, axis):  # type: ignore[no-untyped-def]  # numba infers
+    """What a sample of a range, sorted by insertion, has where the middle is: one of the range's own values."""
+    many = min(MOST_SAMPLED, 3 + (high - low) // SAMPLED)
+    step = (high - low) // many
+    for k in range(many):
+        value, place = records[low + k * step + step // 2, axis], k
+        while place > 0 and sample[place - 1] > value:
+            sample[place] = sample[place - 1]
+            place -= 1
+        sample[place] = value
+    return sample[(middle - low) * many // (high - low)]
+
+
+@nb.njit(cache=True, nogil=True)
+def _part(records, rows, low, high, axis, pivot, equal):  # type: ignore[no-untyped-def]  # numba infers
+    """Bring what lies below a pivot, or equals it, to the front of a range; where the rest begins.
+
+    Every record changes its place with the first of the rest, and only the border's step depends on it: no branch is
+    guessed wrong. Rows are the records as integers, whose bits a copy keeps; unsigned numbers count from the front.
+    """
+    border = np.uint64(low)
+    for i in range(np.uint64(low), np.uint64(high)):
+        value = records[i, axis]
+        x, y, z, row = rows[border, 0], rows[border, 1], rows[border, 2], rows[border, 3]
+        rows[border, 0], rows[border, 1], rows[border, 2], rows[border, 3] = (
+            rows[i, 0],
+            rows[i, 1],
+            rows[i, 2],
+            rows[i, 3],
+        )
+        rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = x, y, z, row
+        border += np.uint64(value < pivot or (equal and value == pivot))
+    return np.int64(border)

@@ -7,7 +7,6 @@ from oracles import segment_mesh_distance
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 150.0
@@ -149,15 +148,6 @@ def test_a_million_triangles(rng):
     fcl = FclEngine([TriangleMesh(vertices, faces)]).measure(np.zeros(3), directions, 60.0)
     assert len(faces) > 990_000
     np.testing.assert_allclose(found.distance, fcl.distance, atol=TIGHT_MM)
-
-
-def test_a_kd_order_is_a_permutation_of_compact_runs(rng):
-    """Every point appears once, and runs of 16 are far smaller than the whole."""
-    points = rng.uniform(0, 1, (5000, 3))
-    order = kd_order(points, 16)
-    np.testing.assert_array_equal(np.sort(order), np.arange(5000))
-    runs = points[order][:4992].reshape(-1, 16, 3)
-    assert np.median(np.ptp(runs, axis=1)) < 0.2
 
 
 def test_a_surface_beyond_the_top_and_one_across_it(rng, ball):
