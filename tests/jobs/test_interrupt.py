@@ -6,8 +6,10 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from functools import partial
 
 import pytest
+from llvmlite.binding import ffi, parse_assembly
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.jobs.exit_codes import INTERRUPTED, exit_code_of
@@ -120,6 +122,50 @@ def test_a_block_that_puts_the_signal_off_is_left_whole():
 
     assert exit_code_of(command, lambda _: None) == INTERRUPTED
     assert renamed == [1] and came
+
+
+def test_a_module_is_imported_to_its_end(tmp_path, monkeypatch):
+    """One that is written in C would stay half made; what imports it is not made of its failure."""
+    (tmp_path / "half_imported.py").write_text(
+        "import signal, time\nsignal.raise_signal(signal.SIGINT)\ntime.sleep(0.1)\nwhole = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def command():
+        __import__("half_imported")
+        time.sleep(5)
+
+    assert exit_code_of(command, lambda _: None) == INTERRUPTED
+    assert sys.modules.pop("half_imported").whole
+
+
+def test_llvms_memory_is_freed_once(capfd):
+    """Wherever Ctrl-C comes while a module is made and closed; broken there, the process ended with a signal."""
+    places = []
+
+    def command(number):
+        left = [number]
+
+        def at_event(frame, *_):
+            if frame.f_globals["__name__"] == ffi.__name__:
+                left[0] -= 1
+                if left[0] == 0:
+                    places.append((frame.f_code.co_name, frame.f_lineno))
+                    signal.raise_signal(signal.SIGINT)
+
+        sys.setprofile(at_event)
+        module = parse_assembly("")
+        module.close()
+        sys.setprofile(None)
+        assert module.closed
+        if left[0] <= 0:
+            time.sleep(5)
+
+    number = 1
+    while exit_code_of(partial(command, number), lambda _: None) == INTERRUPTED:
+        number += 1
+    assert {"__call__", "__enter__", "__exit__", "close", "detach"} <= {name for name, _ in places}
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_command_goes_on_after_the_block_that_ctrl_c_ends():

@@ -1,6 +1,7 @@
 """The end of a process: at once, but after all that Python's own end does for others."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -45,3 +46,16 @@ def test_an_output_that_cannot_be_written_is_told():
         buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
         done = subprocess.run([sys.executable, "-c", code], stdout=full, env=buffered, check=False)
     assert done.returncode == 120
+
+
+def test_who_does_not_wait_for_the_end_sees_no_traceback():
+    """Ctrl-C once the command is over ends the process, as it does one that knows nothing of it."""
+    code = (
+        "import os, signal, threading, time\nfrom puncture_twin.twin.jobs.leave import leave\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "def interrupt():\n    time.sleep(0.5)\n    os.kill(os.getpid(), signal.SIGINT)\n    time.sleep(20)\n"
+        "threading.Thread(target=interrupt).start()\n"
+        "leave(0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, b"", b"")

@@ -3,6 +3,9 @@
 Python raises ``KeyboardInterrupt`` at whatever line runs when the signal comes. Where that line is called from a
 library's callback, a destructor or a lookup in C, or where a library catches whatever the import of another raises, the
 exception is dropped there, and the command would run to its end.
+
+And put off where it would break what is not made for it: a compiled module that is half imported stays so, and LLVM's
+memory is freed twice where its Python side learns not that it was freed, which ends the process without a word.
 """
 
 from __future__ import annotations
@@ -12,10 +15,14 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 AGAIN_S = 0.02
-"""How soon an interruption that was swallowed comes again."""
+"""How soon an interruption that was swallowed, or put off, comes again."""
+
+UNBREAKABLE = frozenset({"importlib", "llvmlite"})
+"""Packages whose functions are not left by an interruption, nor what they have called."""
 
 
 @contextmanager
@@ -65,12 +72,22 @@ def _is_on_its_way() -> bool:
     return signal.getitimer(signal.ITIMER_REAL)[1] > 0.0
 
 
-def _first(*_: object) -> None:
+def _first(_: int, frame: FrameType | None) -> None:
     """The signal: from now on what is dropped is a consequence of it, and not worth a traceback."""
     sys.unraisablehook = _silent
     signal.signal(signal.SIGALRM, _again)
     signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
-    raise KeyboardInterrupt
+    if not _is_unbreakable(frame):
+        raise KeyboardInterrupt
+
+
+def _is_unbreakable(frame: FrameType | None) -> bool:
+    """Whether a frame, or one that led to it, is of `UNBREAKABLE`."""
+    while frame is not None:
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in UNBREAKABLE:
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _again(*_: object) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
+import signal
 import sys
 import threading
 from typing import NoReturn
@@ -17,8 +18,10 @@ def leave(code: int) -> NoReturn:
     """End this process with an exit code.
 
     Threads are waited for and what was registered for the end is called, as at Python's own end; what was printed is
-    written, and where nobody takes it, that is the code of Python's own: 120.
+    written, and where nobody takes it, that is the code of Python's own: 120. Ctrl-C ends what is still waited for.
     """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading._shutdown()  # type: ignore[attr-defined]  # Python's own, by which executors end their threads
     atexit._run_exitfuncs()
     os._exit(code if _written() else 120)
