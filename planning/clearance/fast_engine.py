@@ -30,8 +30,9 @@ MOST_THREADS = 16
 """More were never tried."""
 
 PIECE_TRIANGLES = 20_000
-"""For every so many a structure is searched in one more piece, each with its share of the directions, so that no thread
-waits long for another at the end. Pieces do not depend on threads: which of equally near triangles is named may."""
+"""A structure is searched in two pieces and one more for every so many triangles, each with its share of the
+directions, so that no thread waits long for another at the end: a small one close to the target takes as long as a
+large one. Pieces do not depend on threads: which of equally near triangles is named may."""
 
 WORTH_THREADS = 20_000
 """Answers, or triangles to pack: a few milliseconds of work. Below, starting threads takes as long."""
@@ -110,7 +111,7 @@ class FastEngine:
         for row in sorted(range(len(self._blocks)), key=lambda row: -len(self._blocks[row].triangles)):
             blocks = self._blocks[row]
             own = AxisDistances(answer.distance[row], answer.depth[row], answer.nearest[row])
-            for part in tiles.parts(1 + len(blocks.triangles) // PIECE_TRIANGLES):
+            for part in tiles.parts(2 + len(blocks.triangles) // PIECE_TRIANGLES):
                 pieces.append((part, blocks, seen[row], float(lengths[row]), own))
         return pieces
 
