@@ -74,14 +74,14 @@ def fill_branches(lengths, R, p, q, wanted):  # type: ignore[no-untyped-def]  # 
     for side in range(2):
         if not wanted >> 4 * side & 15:
             continue
-        q1 = _pan(lengths, p[0] - d6 * R[0, 2], p[1] - d6 * R[1, 2], 1.0 - 2.0 * side)
+        q1 = pan_angle(lengths, p[0] - d6 * R[0, 2], p[1] - d6 * R[1, 2], 1.0 - 2.0 * side)
         if math.isnan(q1):
             continue
         c1, s1 = math.cos(q1), math.sin(q1)
         for flip in range(2):
             if not wanted >> (4 * side + 2 * flip) & 3:
                 continue
-            q5, q6, q234, x, y = _wrist(lengths, R, p, c1, s1, 1.0 - 2.0 * flip)
+            q5, q6, q234, x, y = wrist_angles(lengths, R, p, c1, s1, 1.0 - 2.0 * flip)
             cosine = _bend(lengths, x, y)
             if math.isnan(cosine):
                 continue
@@ -101,7 +101,7 @@ def fill_branches(lengths, R, p, q, wanted):  # type: ignore[no-untyped-def]  # 
 
 
 @allocation_free()
-def _pan(lengths, px, py, side):  # type: ignore[no-untyped-def]  # numba infers
+def pan_angle(lengths, px, py, side):  # type: ignore[no-untyped-def]  # numba infers
     """q1 for the wrist centre's (x, y): the arm's plane passes it at the distance d4. NaN inside that circle."""
     d4 = lengths[3]
     radius = math.sqrt(px * px + py * py)
@@ -115,7 +115,7 @@ def _pan(lengths, px, py, side):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @allocation_free()
-def _wrist(lengths, R, p, c1, s1, flip):  # type: ignore[no-untyped-def]  # numba infers
+def wrist_angles(lengths, R, p, c1, s1, flip):  # type: ignore[no-untyped-def]  # numba infers
     """q5, q6, q234, and where they leave wrist 1: in the arm's plane and up, seen from the shoulder."""
     # The three parallel axes point along (s1, -c1, 0); their parts along the flange's axes give the wrist.
     along_x, along_y = s1 * R[0, 0] - c1 * R[1, 0], s1 * R[0, 1] - c1 * R[1, 1]
@@ -152,40 +152,6 @@ def wrapped_angle(angle):  # type: ignore[no-untyped-def]  # numba infers
         return angle
     angle = math.pi - (math.pi - angle) % TURN
     return math.pi if angle <= -math.pi else angle
-
-
-def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
-    """By how much upper arm and forearm are too short (or too long, folded) to reach each flange pose.
-
-    Args:
-        model: The arm.
-        T_base_flange: Shape (n, 4, 4), mm.
-
-    Returns:
-        Shape (n,), mm: the least over all branches; 0 where a solution exists; infinite where no branch can turn its
-        wrist so, because the wrist centre stands inside the cylinder of radius d4 about axis 1.
-    """
-    poses = np.array(T_base_flange, dtype=np.float64, order="C").reshape(-1, 4, 4)
-    missing = np.empty(len(poses))
-    _missing_reach(model.lengths, poses, missing)
-    return missing
-
-
-@allocation_free()
-def _missing_reach(lengths, T, missing):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``missing`` (n,) in mm: how far upper arm and forearm are too short or too long for ``T`` (n, 4, 4)."""
-    upper, fore, d6 = abs(lengths[1]), abs(lengths[2]), lengths[5]
-    for row in range(len(T)):
-        R, p = T[row, :3, :3], T[row, :3, 3]
-        missing[row] = math.inf
-        for side in (1.0, -1.0):
-            q1 = _pan(lengths, p[0] - d6 * R[0, 2], p[1] - d6 * R[1, 2], side)
-            if math.isnan(q1):
-                continue
-            for flip in (1.0, -1.0):
-                _, _, _, x, y = _wrist(lengths, R, p, math.cos(q1), math.sin(q1), flip)
-                far = math.sqrt(x * x + y * y)
-                missing[row] = min(missing[row], max(far - (upper + fore), abs(upper - fore) - far, 0.0))
 
 
 def branch_of(model: UrModel, q: Floats) -> Ints:
