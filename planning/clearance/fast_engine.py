@@ -91,7 +91,7 @@ class FastEngine:
         lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[:1])
         _refuse_unsound(target, outward, lengths)
         answer = AxisDistances(np.empty(shape), np.empty(shape), np.empty(shape, np.int32))
-        pieces = self._pieces(self._seen_from(target), lengths, answer, bundle(outward))
+        pieces = self._pieces(target, outward, lengths, answer)
         counts = np.zeros((len(pieces), len(COUNTED)), np.int64)
         threads = self._threads if np.prod(shape) >= WORTH_THREADS else 1
         for done in on_threads(lambda k: measure_structure(target, *pieces[k], counts[k]), len(pieces), threads):
@@ -101,13 +101,13 @@ class FastEngine:
         return AxisDistances(answer.distance.T, answer.depth.T, answer.nearest.T)
 
     def _pieces(
-        self, seen: tuple[PlacedSurface, ...], lengths: Floats, answer: AxisDistances, tiles: Tiles
+        self, target: Floats, outward: Floats, lengths: Floats, answer: AxisDistances
     ) -> list[tuple[Tiles, Blocks, PlacedSurface, float, AxisDistances]]:
         """What `measure_structure` is given in turn: the largest structures first, in runs of directions.
 
         Here rows of ``answer`` are structures.
         """
-        pieces = []
+        seen, tiles, pieces = self._seen_from(target), bundle(outward), []
         for row in sorted(range(len(self._blocks)), key=lambda row: -len(self._blocks[row].triangles)):
             blocks = self._blocks[row]
             own = AxisDistances(answer.distance[row], answer.depth[row], answer.nearest[row])
