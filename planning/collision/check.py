@@ -6,14 +6,11 @@ from typing import NamedTuple
 
 import fcl
 
-from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies.body import Body
 from puncture_twin.planning.collision.bodies.shapes import touch
-from puncture_twin.planning.collision.patient import FclPatient, FclSkin
-from puncture_twin.planning.collision.state_checker import (
-    Contact,
-)
+from puncture_twin.planning.collision.patient import FclPatient
+from puncture_twin.planning.collision.state_checker import Contact
 
 
 class Check(NamedTuple):
@@ -42,12 +39,5 @@ class Check(NamedTuple):
         """The contact, if the two shapes touch where they are: ``outside_body`` where that is all of the patient."""
         if not isinstance(self.first, FclPatient):
             return self.contact if touch(self.first, self.second) else None
-        if self._meets(self.first.skin):
-            return self.contact
-        if self.first.outside is not None and self._meets(self.first.outside):
-            return self.contact._replace(other=OUTSIDE_BODY)
-        return None
-
-    def _meets(self, skin: FclSkin) -> bool:
-        """Whether the second body touches a surface, or a part of it lies within the body."""
-        return skin.touches(self.second, self.second_body.box) or skin.has_part_within(self.second_body)
+        part = self.first.touched_part(self.second_body)
+        return None if part is None else self.contact._replace(other=part)

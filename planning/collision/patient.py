@@ -8,11 +8,13 @@ from typing import NamedTuple
 import fcl
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.body import Body
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.collision.loose_parts import LooseParts, within
+from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -55,6 +57,10 @@ class FclSkin:
         low, high = _bounds_at(solid, box)
         near = np.all((self._bounds[:, 1] >= low) & (self._bounds[:, 0] <= high), axis=1)
         return any(touch(self._tree(part), solid) for part in np.flatnonzero(near).tolist())
+
+    def collides_with(self, body: Body) -> bool:
+        """Whether a body touches the surface where it stands, or has a part of it within."""
+        return self.touches(body.full.surface, body.box) or self.has_part_within(body)
 
     def has_part_within(self, body: Body) -> bool:
         """Whether a connected part of the surface lies within a link where it stands.
@@ -106,6 +112,12 @@ class FclPatient(NamedTuple):
 
     skin: FclSkin
     outside: FclSkin | None
+
+    def touched_part(self, body: Body) -> str | None:
+        """What of it a body touches where it stands: the skin, ``outside_body`` where that is all, or None."""
+        if self.skin.collides_with(body):
+            return PATIENT
+        return OUTSIDE_BODY if self.outside is not None and self.outside.collides_with(body) else None
 
 
 def _bounds_at(solid: fcl.CollisionObject, box: Floats) -> tuple[Floats, Floats]:
