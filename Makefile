@@ -1,4 +1,4 @@
-# make demo: the main job on the embedded abdomen.  make test: everything that must hold.  make quick: most of it, in a minute or two.
+# make demo: the main job on the embedded abdomen.  make test: everything that must hold.  make quick: most of it, in under a minute on two idle cores.
 # make mutants: which faults in the plain modules and kernels the tests notice (a quarter of an hour).
 
 PYTHON ?= python3.11
@@ -12,7 +12,7 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test quick durations fuzz kill kill-batch lint mutants install docs pictures meshes clean
+.PHONY: demo test quick durations fuzz kill kill-batch lint mutants install reinstall docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -52,12 +52,17 @@ mutants: install
 
 install: $(VENV)/installed
 
+# The stamp holds what was installed: files that are only newer, as after a checkout, install nothing again.
 $(VENV)/installed: pyproject.toml constraints.txt
+	@cat $^ | cmp -s - $@ || $(MAKE) --no-print-directory reinstall
+	@touch $@
+
+reinstall:
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
 	@command -v chromium chromium-browser google-chrome >/dev/null || $(BIN)/playwright install chromium || \
 	  echo "no browser: the page's tests in one will skip"
-	touch $@
+	cat pyproject.toml constraints.txt > $(VENV)/installed
 
 # The pages and the API reference, as a site in out/site.
 docs: install
