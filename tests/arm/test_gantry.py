@@ -7,6 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import trimesh
+from kept_checkers import built
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.gantry import SIDES, gantry_boxes
@@ -52,7 +53,7 @@ def test_in_a_gantry_both_checkers_agree() -> None:
     ahead = trimesh.transformations.rotation_matrix(np.pi / 2.0 + 0.35, [1.0, 0.0, 0.0])
     ahead[:3, 3] = (0.0, 600.0, 150.0)
     boxes = gantry_boxes(ahead, **SIZES)
-    slow, fast = (kind(ur_model("ur3"), tool, boxes, padding_mm=5.0) for kind in (CellChecker, FastChecker))
+    slow, fast = (built(kind, ur_model("ur3"), tool, boxes, padding_mm=5.0) for kind in (CellChecker, FastChecker))
     met = set()
     for q in np.random.default_rng(1).uniform(-np.pi, np.pi, (300, 6)):
         contact = slow.contact(q, needle_may_touch_patient=False)

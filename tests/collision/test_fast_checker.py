@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy
 import trimesh
+from kept_checkers import built
 from numba import typeof
 from places import ROOT
 
@@ -62,7 +63,7 @@ def scene(kind: type[CellChecker], padding_mm: float = 5.0) -> CellChecker:
     light = np.eye(4)
     light[:3, 3] = (150.0, 250.0, 420.0)
     boxes = [Box("table", T, (600.0, 900.0, 60.0)), Box("lamp", light, (120.0, 80.0, 60.0))]
-    return kind(UR3, TOOL, boxes, patient, padding_mm=padding_mm)
+    return built(kind, UR3, TOOL, boxes, patient, padding_mm=padding_mm)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +76,7 @@ def test_leaf_balls_cover_every_body(name: str, padding: float) -> None:
         tree = sphere_tree(body.full.hulls)
         for corners in body.full.hulls:
             points = np.concatenate([corners, points_within(corners, 500, rng)])
-            distances = np.linalg.norm(points[:, None] - tree.centres, axis=2) - tree.radii
+            distances = scipy.spatial.distance.cdist(points, tree.centres) - tree.radii
             assert distances[:, tree.leaves].min(axis=1).max() <= 0.0, body.name
             assert distances[:, 0].max() <= 0.0
 
@@ -87,7 +88,7 @@ def test_leaf_balls_cover_a_stout_cylinder(radius_mm: float, length_mm: float) -
     corners = prism(radius_mm, length_mm)
     tree = sphere_tree([corners])
     points = points_within(corners, 20000, rng)
-    distances = np.linalg.norm(points[:, None] - tree.centres[tree.leaves], axis=2) - tree.radii[tree.leaves]
+    distances = scipy.spatial.distance.cdist(points, tree.centres[tree.leaves]) - tree.radii[tree.leaves]
     assert distances.min(axis=1).max() <= 0.0
 
 
@@ -380,7 +381,7 @@ def test_reach_answers_over_the_abdomen_are_those_of_fcl(abdomen: CaseContext) -
     found = organ_candidates(case, anatomy, abdomen.engine, case.directions())
     requests = [reach_request(case, found, int(row), reach.T_base_ct) for row in np.flatnonzero(found.safe)]
     room = (case_tool(case), case_boxes(case, reach.T_base_ct), anatomy.skin.mesh.transformed(reach.T_base_ct))
-    slow, fast = (kind(UR3, *room, padding_mm=ARM_PADDING_MM) for kind in (CellChecker, FastChecker))
+    slow, fast = (built(kind, UR3, *room, padding_mm=ARM_PADDING_MM) for kind in (CellChecker, FastChecker))
     reports: list[tuple[int, int]] = []
     answers = assess_reach_all(fast, requests, lambda done, total: reports.append((done, total)))
     assert reports[-1] == (len(requests), len(requests)) and len(requests) > 300

@@ -6,6 +6,7 @@ import fcl
 import numpy as np
 import pytest
 import trimesh
+from kept_checkers import built
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
@@ -104,14 +105,14 @@ def test_a_loose_part_within_a_link_is_a_contact(kind: type[CellChecker]) -> Non
         for corners in body.full.hulls:
             middle = apply(frames[body.frame] @ body.T_frame_body, corners.mean(axis=0))
             loose = TriangleMesh(np.asarray(block.vertices) + middle, np.asarray(block.faces))
-            found = kind(model, tool, (), skin, outside=loose, padding_mm=5.0).contact(
+            found = built(kind, model, tool, (), skin, outside=loose, padding_mm=5.0).contact(
                 q, needle_may_touch_patient=False
             )
             assert found is not None and found.other == OUTSIDE_BODY
             met.add(found.body)
     assert met == set(BODY_NAMES[1:]) - {"tool"}
     beside = TriangleMesh(np.asarray(block.vertices) + [0.0, 900.0, 0.0], np.asarray(block.faces))
-    checker = kind(model, tool, (), skin, outside=beside, padding_mm=5.0)
+    checker = built(kind, model, tool, (), skin, outside=beside, padding_mm=5.0)
     assert checker.contact(q, needle_may_touch_patient=False) is None
 
 

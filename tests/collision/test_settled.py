@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcl
 import numpy as np
 import trimesh
+from kept_checkers import built
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
@@ -53,7 +54,7 @@ def cell(kind: type[CellChecker]) -> CellChecker:
     skin, outside = surfaces()
     T = np.eye(4)
     T[:3, 3] = (150.0, 250.0, 420.0)
-    return kind(UR3, TOOL, [Box("lamp", T, (120.0, 80.0, 60.0))], skin, outside=outside, padding_mm=5.0)
+    return built(kind, UR3, TOOL, [Box("lamp", T, (120.0, 80.0, 60.0))], skin, outside=outside, padding_mm=5.0)
 
 
 def test_the_finer_prism_encloses_the_same_cylinder_more_closely() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import given, settings, strategies as st
+from kept_checkers import built
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, slowed
@@ -84,7 +85,7 @@ KINDS = pytest.mark.parametrize("kind", [CellChecker, FastChecker])
 @KINDS
 def test_a_free_way_is_straight(kind: type[CellChecker]) -> None:
     """With nothing between, home and goal are all there is."""
-    checker = kind(UR3, TOOL, [floor()])
+    checker = built(kind, UR3, TOOL, [floor()])
     path = plan_approach(checker, LEFT, RIGHT, seed=1)
     assert len(path.waypoints) == 2 and path.attempts == 1
     assert path_length(path.waypoints) == pytest.approx(np.linalg.norm(RIGHT - LEFT))
@@ -95,7 +96,7 @@ def test_a_free_way_is_straight(kind: type[CellChecker]) -> None:
 def test_the_straight_way_leads_to_the_nearest_goal_that_is_free(kind: type[CellChecker]) -> None:
     """A nearer goal where the needle touches the arm is passed over; where no goal or home is free, that is said."""
     folded, near = LEFT + [0.0, 0.0, 0.0, 0.7, 0.0, 0.0], LEFT + [0.8, 0.0, 0.0, 0.0, 0.0, 0.0]
-    checker = kind(UR3, TOOL, [floor()])
+    checker = built(kind, UR3, TOOL, [floor()])
     path = plan_approach(checker, LEFT, np.stack([RIGHT, folded, near]), seed=1)
     assert path.goal_index == 2 and len(path.waypoints) == 2
     assert_sound(checker, path, LEFT, np.stack([RIGHT, folded, near]))
@@ -108,7 +109,7 @@ def test_the_straight_way_leads_to_the_nearest_goal_that_is_free(kind: type[Cell
 @KINDS
 def test_a_wall_is_gone_around(kind: type[CellChecker]) -> None:
     """The straight way collides; the planned one does not, is longer, and does not stop at its corners."""
-    checker = kind(UR3, TOOL, [floor(), wall()])
+    checker = built(kind, UR3, TOOL, [floor(), wall()])
     on_the_way_in_contact(checker)
     path = plan_approach(checker, LEFT, RIGHT, seed=1)
     assert path_length(path.waypoints) > np.linalg.norm(RIGHT - LEFT)
@@ -137,7 +138,7 @@ def plate() -> Box:
 
 def test_a_proven_segment_steps_over_nothing() -> None:
     """The fast checker's first plan holds where FCL at samples needs several."""
-    checker = FastChecker(UR3, TOOL, [floor(), plate()])
+    checker = built(FastChecker, UR3, TOOL, [floor(), plate()])
     path = plan_approach(checker, LEFT, RIGHT, seed=1)
     assert path.attempts == 1
     assert_sound(checker, path, LEFT, RIGHT)
@@ -147,7 +148,7 @@ def test_a_proven_segment_steps_over_nothing() -> None:
 def test_padding_keeps_its_distance_all_along(kind: type[CellChecker]) -> None:
     """With 5 mm of padding the arm as it is never comes nearer than 4 mm: half a sweep less, between checked states."""
     boxes = [floor(), wall()]
-    checker = kind(UR3, TOOL, boxes, padding_mm=5.0)
+    checker = built(kind, UR3, TOOL, boxes, padding_mm=5.0)
     path = plan_approach(checker, LEFT, RIGHT, seed=3)
     bare = CellChecker(UR3, TOOL, boxes)
     assert least_clearance(checker, path.checked_q).boxes.mm >= 5.0
@@ -159,10 +160,10 @@ def test_padding_keeps_its_distance_all_along(kind: type[CellChecker]) -> None:
 @KINDS
 def test_the_same_seed_gives_the_same_path_whatever_ran_before(kind: type[CellChecker]) -> None:
     """Bit by bit, though OMPL's generator serves the whole process; another seed goes another way."""
-    checker = kind(UR3, TOOL, [floor(), wall()])
+    checker = built(kind, UR3, TOOL, [floor(), wall()])
     first = plan_approach(checker, LEFT, RIGHT, seed=7)
     other = plan_approach(checker, LEFT, RIGHT, seed=28)
-    again = plan_approach(kind(UR3, TOOL, [floor(), wall()]), LEFT, RIGHT, seed=7)
+    again = plan_approach(built(kind, UR3, TOOL, [floor(), wall()]), LEFT, RIGHT, seed=7)
     assert np.array_equal(first.waypoints, again.waypoints) and np.array_equal(first.checked_q, again.checked_q)
     assert not np.array_equal(first.waypoints, other.waypoints)
 
@@ -170,7 +171,7 @@ def test_the_same_seed_gives_the_same_path_whatever_ran_before(kind: type[CellCh
 @KINDS
 def test_of_several_goals_a_free_one_is_taken(kind: type[CellChecker]) -> None:
     """A goal in the wall is left out; the answer says which of the others it is."""
-    checker = kind(UR3, TOOL, [floor(), wall()])
+    checker = built(kind, UR3, TOOL, [floor(), wall()])
     in_wall = on_the_way_in_contact(checker)
     goals = np.stack([in_wall, RIGHT])
     path = plan_approach(checker, LEFT, goals, seed=1)
@@ -180,7 +181,7 @@ def test_of_several_goals_a_free_one_is_taken(kind: type[CellChecker]) -> None:
 
 def test_of_several_goals_the_cheapest_that_is_reached_is_taken() -> None:
     """RIGHT is nearer but behind the wall; a pose a little farther, on this side, costs less than the way around."""
-    checker = FastChecker(UR3, TOOL, [floor(), wall()])
+    checker = built(FastChecker, UR3, TOOL, [floor(), wall()])
     this_side = LEFT + np.array([0.9, 0.0, 0.0, 0.0, 0.0, 1.6])
     assert np.linalg.norm(RIGHT - LEFT) < np.linalg.norm(this_side - LEFT)
     path = plan_approach(checker, LEFT, np.stack([RIGHT, this_side]), seed=1)
@@ -217,7 +218,7 @@ def test_a_walled_in_goal_ends_in_a_bounded_number_of_samples(kind: type[CellChe
         T = flange.copy()
         T[:3, 3] = flange[:3, 3] + 120.0 * flange[:3, 2] + turn * 25.0 * flange[:3, 1]
         plates.append(Box(f"y_{name}", T, (300.0, 4.0, 150.0)))
-    checker = kind(UR3, TOOL, plates)
+    checker = built(kind, UR3, TOOL, plates)
     assert checker.contact(RIGHT, needle_may_touch_patient=False) is None
     for home, goal, where in ((LEFT, RIGHT, "the goals lie"), (RIGHT, LEFT, "home lies")):
         message = rf"unknown after 150 samples \(seed 1\): {where} in a part of the space.*touches [xy]_"
@@ -287,7 +288,7 @@ def test_the_least_clearance_is_that_of_every_state(kind: type[CellChecker]) -> 
     skin = TriangleMesh(np.asarray(ball.vertices) + np.array([-330.0, -100.0, 10.0]), np.asarray(ball.faces))
     ways = np.stack([LEFT, LEFT + 0.3, LEFT + np.array([0.2, -0.1, 0.0, 0.3, 0.0, 0.0])])
     for padding in (0.0, 5.0):
-        checker = kind(UR3, TOOL, [floor(), wall()], skin, padding_mm=padding)
+        checker = built(kind, UR3, TOOL, [floor(), wall()], skin, padding_mm=padding)
         states = dense_states(checker, ways, 0.02)[::2]
         found = least_clearance(checker, states)
         every = [checker.distances(q) for q in states]
@@ -494,7 +495,7 @@ def test_the_tips_speed_is_that_of_the_samples() -> None:
 
 def test_slower_limits_make_a_slower_approach() -> None:
     """Less of the tip's speed, or of the joints', takes longer and is kept."""
-    checker = FastChecker(UR3, TOOL, [floor(), wall()])
+    checker = built(FastChecker, UR3, TOOL, [floor(), wall()])
     usual = plan_approach(checker, LEFT, RIGHT, seed=1).trajectory
     for speeds in (SpeedLimits(tip_speed_mm_s=100.0), SpeedLimits(joint_speed_fraction=0.05)):
         path = plan_approach(checker, LEFT, RIGHT, seed=1, speeds=speeds).trajectory

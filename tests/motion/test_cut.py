@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from kept_checkers import built
 
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
@@ -58,7 +59,7 @@ def test_the_upper_arm_moves_with_the_first_two_joints() -> None:
 
 def test_a_whole_turn_through_the_table_is_proven_impossible() -> None:
     """The same pose a turn of the shoulder on is cut off by the table; a turn of the base is not; both are said."""
-    checker = FastChecker(ur_model("ur3"), TOOL, [floor()])
+    checker = built(FastChecker, ur_model("ur3"), TOOL, [floor()])
     base_turned = FREE - 2.0 * np.pi * np.eye(6)[0]
     assert cut_of(checker, np.stack([TURNED, base_turned])).off.tolist() == [True, False]
     with pytest.raises(NoAnswerError, match=r"impossible, proven: .*upper_arm would have to pass through table"):
@@ -68,7 +69,7 @@ def test_a_whole_turn_through_the_table_is_proven_impossible() -> None:
 
 def test_what_is_not_proven_is_unknown() -> None:
     """A table too thin to prove anything by: nothing is cut off, and the refusal counts the samples."""
-    checker = FastChecker(ur_model("ur3"), TOOL, [floor(2.0)])
+    checker = built(FastChecker, ur_model("ur3"), TOOL, [floor(2.0)])
     assert not cut_of(checker, TURNED[None]).off.any()
     with pytest.raises(NoAnswerError, match=r"unknown after 200 samples"):
         plan_approach(checker, FREE, TURNED, seed=1, max_samples=200)
