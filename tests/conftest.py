@@ -1,12 +1,11 @@
 """What many tests share."""
 
+import gc
+
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import settings
 from slow_tests import listed, names_of, plugins
-
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 settings.register_profile("shared machine", deadline=None)  # the first call of compiled code takes seconds
 settings.load_profile("shared machine")
@@ -14,9 +13,14 @@ settings.load_profile("shared machine")
 LONG_S = 1e6
 """No test takes so long."""
 
+LOOK_EVERY = 50_000
+"""Objects after which Python looks for circles of them. Thousands of tests and their modules stay until the end; to
+look through them after every 700 took a sixth of the time to collect them."""
+
 
 def pytest_configure(config):
     """Measure what tests take, where that is wanted."""
+    gc.set_threshold(LOOK_EVERY, 50, 50)
     for plugin in plugins():
         config.pluginmanager.register(plugin)
 
@@ -40,6 +44,9 @@ def rng():
 @pytest.fixture(scope="session")
 def ball():
     """A function: a closed, fine sphere (320 triangles for 2 subdivisions)."""
+    import trimesh  # here: the process that hands out tests needs none, and waits a second for it
+
+    from puncture_twin.planning.geometry.mesh import TriangleMesh
 
     def make(radius, center=(0, 0, 0), subdivisions=3):
         mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
@@ -51,6 +58,9 @@ def ball():
 @pytest.fixture(scope="session")
 def box():
     """A function: a closed box of 12 triangles."""
+    import trimesh
+
+    from puncture_twin.planning.geometry.mesh import TriangleMesh
 
     def make(size, center=(0, 0, 0)):
         mesh = trimesh.creation.box(extents=size)
