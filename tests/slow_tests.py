@@ -19,8 +19,15 @@ SLOW_S = 0.07
 SLOW_FIXTURE_S = 1.5
 """Of a shared fixture, without others below it: whatever uses it is slow, since one test alone pays for all of it."""
 
-COUNTED_LATE = frozenset({"tests/jobs/test_hostile.py::runner"})
-"""Fixtures whose processes are waited for, and so counted, at their end: half a minute."""
+COUNTED_LATE = frozenset(
+    {
+        "tests/batch/test_cohort_page.py::browser",
+        "tests/jobs/test_hostile.py::runner",
+        "tests/twin/report/test_page_browser.py::browser",
+        "tests/twin/report/test_page_widths.py::browser",
+    }
+)
+"""Fixtures whose processes are waited for, and so counted, at their end: a browser's take seconds, half a minute."""
 
 
 def slow_names(report):
