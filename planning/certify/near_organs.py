@@ -95,19 +95,17 @@ def organ_facts(
 def _checked(  # type: ignore[no-untyped-def]  # numba infers
     corners, group, limits, zone, lengths, start, items, parent, witness, shape, wide, pad, out
 ):
-    axis, cosine, sine, nearest = zone
     centres, ends, radius, bulge = shape
     found, rejected, largest = out
     out_start, kept = np.zeros(len(parent) + 1, np.int64), np.empty(max(1024, len(items)), np.int64)
-    filled, measured = 0, 0
+    measured = 0
     for i in range(len(parent)):
-        u, four = (centres[i, 0], centres[i, 1], centres[i, 2]), ends[i]
-        cos_radius, sin_radius, narrow = np.cos(radius[i]), np.sin(radius[i]), radius[i] <= wide
-        first, last = start[parent[i]], start[parent[i] + 1]
+        u, four, narrow = (centres[i, 0], centres[i, 1], centres[i, 2]), ends[i], radius[i] <= wide
+        candidates = items[start[parent[i]] : start[parent[i] + 1]]
         filled = out_start[i]
         out_start[i + 1] = filled
-        if filled + last - first > len(kept):
-            kept = _grown(kept, filled, 2 * (filled + last - first))
+        if filled + len(candidates) > len(kept):
+            kept = _grown(kept, filled, 2 * (filled + len(candidates)))
         if narrow and witness[i] >= 0:
             t = witness[i]
             hit, worst = _corners(corners[t], four, lengths[group[t]], limits[group[t]] - pad, bulge[i])
@@ -117,32 +115,69 @@ def _checked(  # type: ignore[no-untyped-def]  # numba infers
             if hit > 0 and radius[i] <= SURELY_MIXED:
                 narrow = False
                 found[i] = t
-        best, looked = np.inf, False
-        for k in range(first, last):
-            t = items[k]
-            if sin_radius * cosine[t] + cos_radius * sine[t] > 0.0:
-                # otherwise their sum passes pi, and the triangle matters everywhere
-                toward = axis[t, 0] * u[0] + axis[t, 1] * u[1] + axis[t, 2] * u[2]
-                if toward < cos_radius * cosine[t] - sin_radius * sine[t]:
-                    continue
-            if narrow:
-                looked = True
-                limit, length = limits[group[t]], lengths[group[t]]
-                width, side = _beside(u, corners[t])
-                if _apart(corners[t], side, u, four, bulge[i], limit + pad, length):
-                    continue
-                if width + HOPELESS * radius[i] * nearest[t] < limit or width <= 0.0:
-                    hit, worst = _corners(corners[t], four, length, limit - pad, bulge[i])
-                    if hit == 4:
-                        rejected[i], largest[i], found[i] = True, worst, t
-                        break
-                if width - limit < best:
-                    best, found[i] = width - limit, t
-            kept[filled] = t
-            filled += 1
+        organs, cell = (corners, group, limits, lengths), (u, four, radius[i], bulge[i])
+        count, t, looked, reject, worst = _near(organs, zone, candidates, cell, narrow, pad, kept[filled:])
+        out_start[i + 1] = filled + count
         measured += looked
-        out_start[i + 1] = out_start[i] if rejected[i] else filled
+        if t >= 0:
+            found[i] = t
+        if reject:
+            rejected[i], largest[i] = True, worst
     return out_start, kept[: out_start[-1]].copy(), measured
+
+
+@nb.njit(cache=True)
+def _near(organs, zone, candidates, cell, narrow, pad, kept):  # type: ignore[no-untyped-def]  # numba infers
+    """Keep the triangles that matter to a cell and, where it is narrow, are not proven clear of it.
+
+    Returns:
+        How many were kept, none of a rejected cell; the triangle that rejects it, or else lies nearest, -1 for none;
+        whether one was measured; whether the cell is rejected, and how far an axis of it is from that triangle at most.
+    """
+    corners, group, limits, lengths = organs
+    axis, cosine, sine, nearest = zone
+    u, four, radius, bulge = cell
+    cos_radius, sin_radius = np.cos(radius), np.sin(radius)
+    count, best, found, looked = 0, np.inf, -1, False
+    for t in candidates:
+        toward = axis[t, 0] * u[0] + axis[t, 1] * u[1] + axis[t, 2] * u[2]
+        if _elsewhere(toward, cosine[t], sine[t], cos_radius, sin_radius):
+            continue
+        if narrow:
+            looked = True
+            limit, unlike = limits[group[t]], HOPELESS * radius * nearest[t]
+            clear, hit, worst, gap = _beside_cell(corners[t], u, four, bulge, limit, pad, lengths[group[t]], unlike)
+            if clear:
+                continue
+            if hit == 4:
+                return 0, t, looked, True, worst
+            if gap < best:
+                best, found = gap, t
+        kept[count] = t
+        count += 1
+    return count, found, looked, False, np.nan
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _elsewhere(toward, cosine, sine, cos_radius, sin_radius):  # type: ignore[no-untyped-def]  # numba infers
+    """Whether two cones have no direction in common: by the cosine between their axes, and cosines, sines of radii."""
+    sine_of_both = sin_radius * cosine + cos_radius * sine
+    return sine_of_both > 0.0 and toward < cos_radius * cosine - sin_radius * sine  # else they pass pi together
+
+
+@nb.njit(cache=True, error_model="numpy", forceinline=True)
+def _beside_cell(t, u, four, bulge, limit, pad, length, unlike):  # type: ignore[no-untyped-def]  # numba infers
+    """What a triangle is to a cell about u: clear of it or not; its `_corners`, where a witness is not too unlike.
+
+    Last, by how much the line along u is farther from it than the limit.
+    """
+    width, side = _beside(u, t)
+    if _apart(t, side, u, four, bulge, limit + pad, length):
+        return True, 0, 0.0, 0.0
+    hit, worst = 0, 0.0
+    if width + unlike < limit or width <= 0.0:
+        hit, worst = _corners(t, four, length, limit - pad, bulge)
+    return False, hit, worst, width - limit
 
 
 @nb.njit(cache=True)
