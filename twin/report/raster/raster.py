@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 
 NEAR = 1.0
 """mm before the eye, along the view, from which on an outline is drawn."""
@@ -139,10 +139,8 @@ def draw(points, faces, bodies, spans, grid, corner, before, inverse, triangle):
         inverse: Shape (k, h, w), 1/z of the surfaces, nearest first; written to.
         triangle: Shape (k, h, w), their triangles, -1 for none; written to.
     """
-    scale, height, width = grid
-    step, left = 1.0 / scale, (0.5 - width / 2) / scale
     row0, column0 = corner
-    most, rows, columns = inverse.shape
+    rows, columns = inverse.shape[1:]
     for s in range(len(spans)):
         first, last = max(spans[s, 1], row0), min(spans[s, 2], row0 + rows - 1)
         begin, end = max(spans[s, 3], column0), min(spans[s, 4], column0 + columns - 1)
@@ -150,44 +148,50 @@ def draw(points, faces, bodies, spans, grid, corner, before, inverse, triangle):
             continue
         f = spans[s, 0]
         facing, p, q, r = _edges(_row(points, faces[f, 0]), _row(points, faces[f, 1]), _row(points, faces[f, 2]))
-        if facing == 0.0:
-            continue
-        per_facing = 1.0 / facing
-        pu, qu, ru = p[0] * step, q[0] * step, r[0] * step  # what one column more adds
-        for row in range(first, last + 1):
-            y = (height / 2 - row - 0.5) * step
-            pe, qe, re = (
-                p[0] * left + (p[1] * y + p[2]),
-                q[0] * left + (q[1] * y + q[2]),
-                r[0] * left + (r[1] * y + r[2]),
-            )
-            lo, hi = begin, end
-            if end - begin > WIDE:
-                lo, hi = _inside(pu, pe, qu, qe, ru, re, begin, end)
-            for column in range(lo, hi + 1):
-                wa, wb, wc = pu * column + pe, qu * column + qe, ru * column + re
-                if wa < 0.0 or wb < 0.0 or wc < 0.0:
-                    continue
-                value = (wa + wb + wc) * per_facing
-                i, j = row - row0, column - column0
-                slack = TIE * value * value
-                if value <= before[i, j] + slack:
-                    continue
-                mine = f
-                # Written out: a function that takes arrays costs more here than all that it does.
-                for k in range(most):
-                    other, known = triangle[k, i, j], inverse[k, i, j]
-                    if other < 0:
+        if facing != 0.0:
+            planes, span = (p, q, r, 1.0 / facing), (first, last, begin, end)
+            _draw_one(bodies, f, planes, span, grid, corner, before, inverse, triangle)
+
+
+@allocation_free(nogil=True, error_model="numpy")
+def _draw_one(bodies, f, planes, span, grid, corner, before, inverse, triangle):
+    """Keep triangle f in the samples of its span that it covers: its edges' planes, and what makes them 1/z."""
+    p, q, r, per_facing = planes
+    first, last, begin, end = span
+    scale, height, width = grid
+    step, left = 1.0 / scale, (0.5 - width / 2) / scale
+    row0, column0 = corner
+    pu, qu, ru = p[0] * step, q[0] * step, r[0] * step  # what one column more adds
+    for row in range(first, last + 1):
+        y = (height / 2 - row - 0.5) * step
+        pe, qe, re = _at(p, left, y), _at(q, left, y), _at(r, left, y)
+        lo, hi = begin, end
+        if end - begin > WIDE:
+            lo, hi = _inside(pu, pe, qu, qe, ru, re, begin, end)
+        for column in range(lo, hi + 1):
+            wa, wb, wc = pu * column + pe, qu * column + qe, ru * column + re
+            if wa < 0.0 or wb < 0.0 or wc < 0.0:
+                continue
+            value = (wa + wb + wc) * per_facing
+            i, j = row - row0, column - column0
+            slack = TIE * value * value
+            if value <= before[i, j] + slack:
+                continue
+            mine = f
+            # Written out: a function that takes arrays costs more here than all that it does.
+            for k in range(len(inverse)):
+                other, known = triangle[k, i, j], inverse[k, i, j]
+                if other < 0:
+                    inverse[k, i, j], triangle[k, i, j] = value, mine
+                    break
+                if abs(value - known) <= slack:
+                    first_named = bodies[mine] < bodies[other]
+                    if first_named or (bodies[mine] == bodies[other] and value > known):
                         inverse[k, i, j], triangle[k, i, j] = value, mine
-                        break
-                    if abs(value - known) <= slack:
-                        first_named = bodies[mine] < bodies[other]
-                        if first_named or (bodies[mine] == bodies[other] and value > known):
-                            inverse[k, i, j], triangle[k, i, j] = value, mine
-                        break
-                    if value > known:
-                        inverse[k, i, j], triangle[k, i, j] = value, mine
-                        value, mine = known, other
+                    break
+                if value > known:
+                    inverse[k, i, j], triangle[k, i, j] = value, mine
+                    value, mine = known, other
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -227,6 +231,12 @@ def _edges(a, b, c):
     if facing < 0.0:
         p, q, r = (-p[0], -p[1], -p[2]), (-q[0], -q[1], -q[2]), (-r[0], -r[1], -r[2])
     return abs(facing), p, q, r
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _at(plane, x, y):
+    """How far a ray (x, y, 1) leads to the side of a plane through the eye."""
+    return plane[0] * x + (plane[1] * y + plane[2])
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
