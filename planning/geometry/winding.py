@@ -23,33 +23,27 @@ def winding_number(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
         mesh: The surface, mm.
         point: Shape (3,), mm, in the mesh's frame.
     """
-    a, b, c = np.moveaxis(mesh.triangles - point, 1, 0)
-    na, nb, nc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    triple = np.einsum("ij,ij->i", a, np.cross(b, c))
-    denominator = na * nb * nc
-    denominator += np.einsum("ij,ij->i", a, b) * nc
-    denominator += np.einsum("ij,ij->i", b, c) * na
-    denominator += np.einsum("ij,ij->i", c, a) * nb
-    return float(2 * np.sum(np.arctan2(triple, denominator)) / (4 * np.pi))
+    return float(winding_numbers(mesh, point[None])[0])
 
 
 def winding_numbers(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """`winding_number` of many points (n, 3), mm: shape (n,)."""
     found = np.empty(len(points))
-    _solid_angles(np.ascontiguousarray(mesh.triangles), np.ascontiguousarray(points, dtype=np.float64), found)
+    _solid_angles(mesh.vertices, mesh.faces, np.array(points, dtype=np.float64, order="C"), found)
     return found / (4 * np.pi)
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _solid_angles(triangles, points, found):  # type: ignore[no-untyped-def]  # numba infers
-    """The sum over all triangles (m, 3, 3), as in `winding_number`, of each point."""
+def _solid_angles(vertices, faces, points, found):  # type: ignore[no-untyped-def]  # numba infers
+    """The sum over all triangles (m, 3) of vertices (n, 3), as in `winding_number`, of each point."""
     for row in range(len(points)):
         x, y, z = points[row]
         total = 0.0
-        for t in triangles:
-            ax, ay, az = t[0, 0] - x, t[0, 1] - y, t[0, 2] - z
-            bx, by, bz = t[1, 0] - x, t[1, 1] - y, t[1, 2] - z
-            cx, cy, cz = t[2, 0] - x, t[2, 1] - y, t[2, 2] - z
+        for face in faces:
+            a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
+            ax, ay, az = a[0] - x, a[1] - y, a[2] - z
+            bx, by, bz = b[0] - x, b[1] - y, b[2] - z
+            cx, cy, cz = c[0] - x, c[1] - y, c[2] - z
             na, nb_ = np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(bx * bx + by * by + bz * bz)
             nc = np.sqrt(cx * cx + cy * cy + cz * cz)
             triple = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)

@@ -297,13 +297,22 @@ def test_an_open_skin_is_known_as_open() -> None:
     assert not CellChecker(UR3, TOOL).patient_closed
 
 
-def test_winding_numbers_of_many_points_are_those_of_each() -> None:
-    """Inside, outside and next to a face, of a closed and of an open surface."""
+def test_winding_numbers_are_the_sums_of_solid_angles() -> None:
+    """By numpy, of each point by itself: inside, outside and next to a face, of a closed and of an open surface."""
     box = cuboid(np.full(3, -50.0), np.full(3, 50.0))
     points = np.random.default_rng(5).uniform(-60.0, 70.0, (50, 3))
     for mesh in (box, TriangleMesh(box.vertices, box.faces[:-2])):
-        alone = [winding_number(mesh, point) for point in points]
-        assert winding_numbers(mesh, points) == pytest.approx(alone, abs=1e-12)
+        by_numpy = [solid_angle(mesh, point) / (4 * np.pi) for point in points]
+        assert winding_numbers(mesh, points) == pytest.approx(by_numpy, abs=1e-12)
+        assert [winding_number(mesh, point) for point in points] == pytest.approx(by_numpy, abs=1e-12)
+
+
+def solid_angle(mesh: TriangleMesh, point: np.ndarray) -> float:
+    """Signed, of all triangles as seen from a point."""
+    corners = mesh.triangles - point
+    a, b, c = np.moveaxis(corners / np.linalg.norm(corners, axis=2, keepdims=True), 1, 0)
+    below = 1.0 + (a * b + b * c + c * a).sum(axis=1)
+    return float(2 * np.arctan2(np.linalg.det(np.stack([a, b, c], axis=1)), below).sum())
 
 
 def test_winding_number_counts_the_inside() -> None:
