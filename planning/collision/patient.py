@@ -16,7 +16,7 @@ from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.collision.loose_parts import LooseParts, within
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.kd_order import kd_order
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of
 
 PART_TRIANGLES = 8192
 """So many triangles share a tree: FCL takes some 4 us to build for each, and 20 us to ask a tree."""
@@ -91,8 +91,7 @@ class FclSkin:
     @cached_property
     def _bounds(self) -> Floats:
         """Shape (parts, 2, 3), mm: a box about each part."""
-        corners = [self._mesh.triangles[part].reshape(-1, 3) for part in self._parts]
-        return np.array([(points.min(axis=0), points.max(axis=0)) for points in corners])
+        return np.array([box_of(self._mesh.triangles[part].reshape(-1, 3)) for part in self._parts])
 
     @cached_property
     def _trees(self) -> dict[int, fcl.CollisionObject]:

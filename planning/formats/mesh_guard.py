@@ -6,6 +6,7 @@ empty one.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -127,7 +128,7 @@ def _check_not_tiny(used: NDArray[np.float64], *, where: str | Path) -> None:
 
 
 def _any_area(surface: _Surface) -> bool:
-    """Whether any triangle has an area: looked at in chunks, since the first nearly always answers."""
-    step = 4096
-    chunks = (surface.indices[i : i + step] for i in range(0, len(surface.indices), step))
+    """Whether any triangle has an area: looked at in chunks, since the first triangles nearly always answer."""
+    starts = (0, 16, *range(4096, len(surface.indices), 4096), len(surface.indices))
+    chunks = (surface.indices[start:end] for start, end in pairwise(starts))
     return any(bool((twice_areas(surface.points, chunk) > 0.0).any()) for chunk in chunks)

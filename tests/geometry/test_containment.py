@@ -26,6 +26,20 @@ def test_points_about_a_box_are_on_the_side_where_they_lie(rng, box, winding, sc
         assert side_of(mesh, center + 0.51 * size * way) is Side.OUTSIDE
 
 
+@pytest.mark.parametrize("left_out", [0, 1])
+def test_corners_in_one_place_are_one(box, left_out):
+    """However corners are numbered, and whatever zero's sign: closed, wound alike and distinct are of places alone."""
+    shared = box(np.array([40.0, 20.0, 10.0]), np.array([20.0, 10.0, 0.0]))
+    faces = shared.faces[left_out:]
+    apart = shared.vertices[faces].reshape(-1, 3)
+    apart[::2][apart[::2] == 0.0] = -0.0
+    for vertices, numbers in ((shared.vertices, faces), (apart, np.arange(len(apart)).reshape(-1, 3))):
+        once, twice = (TriangleMesh(vertices, np.tile(numbers, (times, 1))) for times in (1, 2))
+        assert once.closed == once.wound_alike == (left_out == 0)
+        assert once.distinct.all() and twice.distinct.tolist() == [True] * len(faces) + [False] * len(faces)
+        assert np.array_equal(once.bounds, [[0, 0, -5], [40, 20, 5]])
+
+
 @pytest.mark.parametrize("winding", ["alike", "mixed"])
 def test_a_point_in_the_box_of_a_surface_may_lie_outside(rng, ball, winding):
     """Near a corner of a ball's bounding box there is no ball; behind a face and before it are different sides."""

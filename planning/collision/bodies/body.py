@@ -14,6 +14,7 @@ import numpy as np
 from puncture_twin.planning.arm.links import LINK_NAMES
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.loose_parts import half_spaces
+from puncture_twin.planning.geometry.mesh import box_of
 
 BODY_NAMES = (*LINK_NAMES, "tool", "holder", "needle")
 """The bodies of the arm, from the base on; not every arm has a tool."""
@@ -80,8 +81,7 @@ class Body:
     @cached_property
     def box(self) -> Floats:
         """Shape (2, 3), mm: lowest and highest corner of a box about ``full``, in the frame of the shapes."""
-        corners = np.concatenate(self.full.hulls)
-        return np.array([corners.min(axis=0), corners.max(axis=0)])
+        return box_of(np.concatenate(self.full.hulls))
 
     @property
     def hollow(self) -> bool:
