@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from puncture_twin.planning.base.html import Facts, card, never_raises
+
+CLEARANCE_TEXT = MappingProxyType(
+    {
+        "approach": "arm's least clearance, approach",
+        "insertion": "arm's least clearance, insertion",
+        "needle": "needle's least clearance to a structure",
+    }
+)
+"""What each of a plan's clearances is of."""
 
 
 @never_raises
@@ -30,8 +40,8 @@ def _facts(plan: Any) -> Facts:
     for name in ("approach", "insertion"):
         phase = getattr(plan, name)
         yield name, f"{phase.times_s[-1]:.1f} s, {len(phase.times_s):,} samples"
-    for what, millimetres in plan.clearance_mm.items():
-        yield f"least distance, {what}", f"{millimetres:.1f} mm"
+    for phase, millimetres in plan.clearance_mm.items():
+        yield CLEARANCE_TEXT[phase], f"{millimetres:.1f} mm"
     yield "seed", str(plan.seed)
     yield "warnings", "not known: an older file" if plan.warnings is None else "; ".join(plan.warnings) or "none"
 

@@ -264,7 +264,7 @@ class Explanation:
             margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
             lines.append(
                 f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.{decimals(structure)}f} {margin}"
-                + ("  too close" if short[column] else "")
+                + _beside(float(clearances[column]), bool(short[column]))
             )
         left = len(order) - len(shown)
         return [*lines, f"  and {left} more, farther away"] if left else lines
@@ -292,6 +292,12 @@ def decimals(structure: Structure) -> int:
     return 1 if structure.voxel_mm >= COARSE_VOXEL_MM else 2
 
 
+def _beside(clearance_mm: float, short: bool) -> str:
+    """What a clearance means for people: one below zero is a needle that goes through."""
+    said = ["too close"] * short + ["crossed"] * (clearance_mm < 0)
+    return f"  {', '.join(said)}" if said else ""
+
+
 def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
     """What to say where the needle is too short for most of the directions."""
     short = int((candidates.verdict.reason == Reason.TOO_LONG.value).sum())
@@ -310,24 +316,29 @@ def reason_text(candidates: Candidates, row: int) -> str:
         parts.append(f"({candidates.verdict.named[row]})")
     if np.isfinite(candidates.verdict.depth[row]):
         parts.append(f"at {candidates.verdict.depth[row]:.1f} mm from the target")
+    said = " ".join(parts)
     if np.isfinite(candidates.verdict.amount[row]):
-        parts.append(f"with {candidates.verdict.amount[row]:.2f} {_unit(str(candidates.verdict.reason[row]))}")
-        parts += _wanted(candidates, row)
+        said += _amount_text(candidates, row)
     if candidates.verdict.detail[row]:
-        parts.append(f"- {candidates.verdict.detail[row]}")
-    return " ".join(parts)
+        said += f" - {candidates.verdict.detail[row]}"
+    return said
 
 
-def _wanted(candidates: Candidates, row: int) -> list[str]:
-    """The margin that was not kept."""
-    if candidates.verdict.reason[row] != Reason.TOO_CLOSE.value:
-        return []
-    at = candidates.clearance.structures.index(str(candidates.verdict.structure[row]))
-    return [f"where {candidates.clearance.margins[at]:g} mm is demanded"]
+def _amount_text(candidates: Candidates, row: int) -> str:
+    """The number that fell short; a clearance ends at minus the radius, how much deeper an axis is nobody measures."""
+    reason, amount = str(candidates.verdict.reason[row]), float(candidates.verdict.amount[row])
+    margin = _margin(candidates, row) if reason == Reason.TOO_CLOSE.value else np.nan
+    if reason not in UNITS and amount < 0:
+        wanted = f"; {margin:g} mm clearance is demanded" if np.isfinite(margin) else ""
+        return f": the needle crosses it, at least {-amount:.2g} mm deep{wanted}"
+    wanted = f" where {margin:g} mm is demanded" if np.isfinite(margin) else ""
+    return f" with {amount:.2f} {UNITS.get(reason, 'mm clearance')}{wanted}"
 
 
-def _unit(reason: str) -> str:
-    return UNITS.get(reason, "mm clearance")
+def _margin(candidates: Candidates, row: int) -> float:
+    """What the structure that the reason names demands, mm."""
+    found = candidates.clearance
+    return float(found.margins[found.structures.index(str(candidates.verdict.structure[row]))])
 
 
 def finite(value: float) -> float | None:

@@ -307,7 +307,8 @@ def test_check_explains_a_refusal(carton, capfd):
     said = capfd.readouterr().out
     assert "rejected" in said
     assert "too_close (bolt_h) at" in said
-    assert "-1.00 mm clearance" in said
+    assert ": the needle crosses it, at least 1 mm deep; 2 mm clearance is demanded" in said
+    assert "-1.00 mm clearance" not in said and "too close, crossed" in said
     for line in ("skin entry", "path length", "skin angle", "standoff", "bolt_l", "arm reaches it"):
         assert line in said
 

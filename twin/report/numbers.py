@@ -67,6 +67,15 @@ def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
     return candidates.clearance.structures[best], float(candidates.clearance.distance[row, best])
 
 
+def nearest_text(candidates: Candidates, row: int) -> str:
+    """The nearest structure and its clearance, or that the needle crosses it."""
+    name, clearance = nearest_structure(candidates, row)
+    if not name:
+        return "no structure has a margin"
+    spoken = name.replace("_", " ")
+    return f"crosses {spoken}" if clearance < 0 else f"nearest: {spoken}, {number(clearance, 1, 'mm')}"
+
+
 def needle_text(case: Any) -> str:
     """The needle in one line."""
     n = case.needle

@@ -120,3 +120,19 @@ def test_one_direction_is_one_dot(case, candidates):
     assert len(pole) > MOST_DOTS
     shown = shown_front(front_of(candidates, pole), map_view(case, candidates))
     assert len(shown.rows) == 1 and shown.text == "Pareto front"
+
+
+def test_a_needle_through_a_structure_crosses_it(monkeypatch, case, candidates, tmp_path):
+    """Nobody reads of a distance below zero: not beside the map, and not in the reason; a touch is none yet."""
+    through = with_clearance(candidates, -0.6)
+    texts = written(monkeypatch, through, case, tmp_path / "map.png")
+    box = next(text for text in texts if text.startswith("Best"))
+    assert "\ncrosses rib right 9" in box and "nearest" not in box
+    row = int(np.flatnonzero(candidates.verdict.reason == "too_close")[0])
+    amounts = {mm: replace(through.verdict, amount=np.full(len(through), mm)) for mm in (-0.6, 0.0)}
+    assert reason_text(replace(through, verdict=amounts[-0.6]), row).endswith(
+        ": the needle crosses it, at least 0.6 mm deep; 1 mm clearance is demanded"
+    )
+    assert reason_text(replace(through, verdict=amounts[0.0]), row).endswith(
+        " with 0.00 mm clearance where 1 mm is demanded"
+    )

@@ -182,7 +182,8 @@ def _clearance(side: Side, name: str) -> str:
     if side.explained is None:
         return NOTHING
     digits = next(decimals(one) for one in side.explained.anatomy.checked if one.name == name)
-    return f"{side.explained.clearances()[name]:.{digits}f}"
+    clearance = side.explained.clearances()[name]
+    return f"{clearance:.{digits}f}" if clearance >= 0 else "crossed"
 
 
 def _shown(value: float, form: str) -> str:

@@ -222,7 +222,9 @@ def _line(row: dict[str, Any], wide: int) -> str:
     angles, lengths = ("theta_deg", "beta_deg"), ("path_length_mm", "skin_angle_deg")
     cells = [*(_number(row[name], 7, 1) for name in angles), _number(row["min_clearance_mm"], 11, 2)]
     cells += [_number(row[name], 7, 1) for name in lengths]
-    return f"{row['row']:6d}  {row['name']:{wide}s}  {row['verdict']:8s} {''.join(cells)}  {row['nearest']}".rstrip()
+    crosses = "crosses " if (row["min_clearance_mm"] or 0) < 0 else ""
+    line = f"{row['row']:6d}  {row['name']:{wide}s}  {row['verdict']:8s} {''.join(cells)}  {crosses}{row['nearest']}"
+    return line.rstrip()
 
 
 def _number(value: float | None, width: int, digits: int) -> str:

@@ -123,9 +123,15 @@ def _rehearsal(run: Run) -> list[str]:
         f"  lateral {done['lateral_mm']:.2f} mm, depth {done['depth_mm']:+.2f} mm (+ is too deep)",
         f"  insertion {run.rehearsal.followed_text}",
         f"  {run.rehearsal.force_text}",
-        f"  least clearance of the true needle to what it must avoid: {nearest[1]:.2f} mm, {nearest[0]}",
+        f"  {_true_needle(*nearest)}",
         f"  arm contacts: {'; '.join(done['contacts']) or 'none'}",
     ]
+
+
+def _true_needle(name: str, clearance_mm: float) -> str:
+    if clearance_mm < 0:
+        return f"the true needle crosses what it must avoid: {name}, at least {-clearance_mm:.2g} mm deep"
+    return f"least clearance of the true needle to what it must avoid: {clearance_mm:.2f} mm, {name}"
 
 
 def distribution_lines(rooms: dict[str, Any]) -> list[str]:

@@ -19,7 +19,7 @@ from puncture_twin.twin.report.map.map_layout import POINT, SIDE_HEIGHT, side_pi
 from puncture_twin.twin.report.map.map_marks import mark_dot, mark_ring, mark_star
 from puncture_twin.twin.report.map.map_raster import SCALE_DIGITS, ClearanceScale, clearance_scale
 from puncture_twin.twin.report.map_view import BEYOND, MapView
-from puncture_twin.twin.report.numbers import ReasonCount, arm_text, nearest_structure, number, percent, reason_counts
+from puncture_twin.twin.report.numbers import ReasonCount, arm_text, nearest_text, number, percent, reason_counts
 from puncture_twin.twin.report.palette import safe_shades
 
 MOST_LEGEND, LINE, GAP = 0.45, 0.0215, 0.6
@@ -156,13 +156,12 @@ def _chosen(canvas: Canvas, candidates: Candidates, pick: Pick | None, y: float)
         return
     word = "Best" if pick == best_pick(candidates) else "Chosen"
     candidates, row = pick
-    name, clearance = nearest_structure(candidates, row)
     theta, beta = np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row])
     lines = (
         f"{word}: θ {theta:.4g}°, β {beta:.4g}°{_chances(candidates, row)}",
         f"path in the body {number(candidates.path.length[row], 1, 'mm')}, "
         f"skin angle {number(float(np.degrees(candidates.path.skin_angle[row])), 0)}°",
-        f"nearest: {name.replace('_', ' ') or 'none'}, {number(clearance, 1, 'mm')}",
+        nearest_text(candidates, row),
     )
     _boxed(canvas, "\n".join(lines), y, NUMBERS, ((238, 247, 242), (0, 104, 74)))
 

@@ -19,7 +19,7 @@ from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.numbers import (
     TRUTH_IS_BELIEF,
     demanding,
-    nearest_structure,
+    nearest_text,
     needle_text,
     number,
     percent,
@@ -210,9 +210,6 @@ def _location(case: Any) -> str:
 
 
 def _direction_card(candidates: Candidates, row: int, *, best: bool) -> Card:
-    name, clearance = nearest_structure(candidates, row)
     where = f"θ {np.degrees(candidates.theta[row]):.4g}°, β {np.degrees(candidates.beta[row]):.4g}°"
-    detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body"
-    if name:
-        detail += f"; nearest {name.replace('_', ' ')}, {number(clearance, 1, 'mm')}"
+    detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body; {nearest_text(candidates, row)}"
     return Card("best direction" if best else "chosen direction", where, detail)

@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.reasons import Reason, css
+from puncture_twin.planning.plan.html import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.numbers import arm_text, nearest_structure, number, percent, reason_counts
@@ -208,7 +209,7 @@ def plan_section(plan: Any | None, at_patient: Iterable[tuple[str, str]] = (), r
         ("target, CT frame", _point(plan.target_ct)),
         ("approach", f"{plan.approach.times_s[-1]:.1f} s, {len(plan.approach.q)} waypoints"),
         ("insertion", f"{plan.insertion.times_s[-1]:.1f} s, {len(plan.insertion.q)} waypoints"),
-        *((f"least clearance: {phase}", number(float(mm), 1, "mm")) for phase, mm in plan.clearance_mm.items()),
+        *((CLEARANCE_TEXT[phase], number(float(mm), 1, "mm")) for phase, mm in plan.clearance_mm.items()),
         ("expected error at the target (rms)", number(plan.expected_target_error_mm, 2, "mm")),
         ("seed", str(plan.seed)),
     ]
@@ -248,7 +249,7 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
     )
     nearest = table(
         ("structure", "least clearance mm"),
-        [(n.replace("_", " "), number(v, 1)) for n, v in least[:12]],
+        [(n.replace("_", " "), "crossed" if v < 0 else number(v, 1)) for n, v in least[:12]],
         kind="numbers",
     )
     more = faint(f"The 12 nearest of {len(least)} structures to keep away from.") if len(least) > 12 else ""

@@ -167,7 +167,7 @@ def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float
     phase = str(source.rehearsal.phase[row])
     nearest = source.clearance(moment)
     contacts = len(source.contacts(moment))
-    near = "– (not yet)" if nearest is None else f"{number(nearest[1], 1, 'mm')}  {_short(nearest[0])}"
+    near = "– (not yet)" if nearest is None else _nearness(*nearest)
     values = (
         (f"{moment:.1f}/{source.rehearsal.times_s[-1]:.1f} s", annotate.INK),
         (PHASES.get(phase, phase), annotate.INK),
@@ -186,6 +186,10 @@ def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float
         annotate.write(draw, (12, 51), result, size=VALUE, bold=True)
     else:
         annotate.write(draw, (12, 54), source.note, size=11, colour=annotate.FAINT)
+
+
+def _nearness(name: str, clearance_mm: float) -> str:
+    return f"crosses {_short(name)}" if clearance_mm < 0 else f"{number(clearance_mm, 1, 'mm')}  {_short(name)}"
 
 
 def _alarm(draw: ImageDraw.ImageDraw, fresh: Sequence[Any]) -> None:

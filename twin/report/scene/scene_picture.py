@@ -15,7 +15,7 @@ from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate, palette
-from puncture_twin.twin.report.numbers import nearest_structure, number, target_text
+from puncture_twin.twin.report.numbers import nearest_text, number, target_text
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
 from puncture_twin.twin.report.scene.scene_parts import (
@@ -226,8 +226,7 @@ def _path_text(plan: Any | None, pick: Pick | None, failed: bool) -> str:
         length = float(pick.candidates.path.length[pick.row])
     text = f"θ {theta:g}°, β {beta:g}°, {number(length, 1, 'mm')} in the body"
     if pick is not None:
-        name, clearance = nearest_structure(*pick)
-        text += f", nearest {name.replace('_', ' ')} {number(clearance, 1, 'mm')}" if name else ""
+        text += f"; {nearest_text(*pick)}"
     if plan is not None:
         return text
     return text + ("  PLANNING FAILED: no arm is shown" if failed else "  (no plan was requested: no arm is shown)")

@@ -33,7 +33,8 @@ class Near(NamedTuple):
     def text(self) -> str:
         """For a legend."""
         margin = f", margin {number(self.margin_mm, 0)}" if np.isfinite(self.margin_mm) else ""
-        return f"{self.name.replace('_', ' ')}: {number(self.clearance_mm, 1, 'mm')}{margin}"
+        clearance = "crossed" if self.clearance_mm < 0 else number(self.clearance_mm, 1, "mm")
+        return f"{self.name.replace('_', ' ')}: {clearance}{margin}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -101,7 +101,8 @@
       const parts = [`reason ${code}`];
       if (structure) parts.push(structure === map.not_seen ? structure : `structure: ${words(structure)}`);
       if (map.depth[row] !== null) parts.push(`${shown(map.depth[row], 1, "mm")} from the target`);
-      if (map.amount[row] !== null) parts.push(`${what || "amount"} ${shown(map.amount[row], 1, unit || "mm")}`);
+      if (what === "clearance" && map.amount[row] < 0) parts.push("the needle crosses it");
+      else if (map.amount[row] !== null) parts.push(`${what || "amount"} ${shown(map.amount[row], 1, unit || "mm")}`);
       add("div", parts.join("; "));
       const sentence = map.sentences[map.sentence[row]];
       if (sentence) add("div", sentence);
@@ -110,8 +111,10 @@
       const cone = map.safe_cone[row] === null ? "" : `; safe cone ${shown(map.safe_cone[row], 1, "°")}`;
       add("div", `window ${map.window[row]}${cone}`);
     }
-    if (map.nearest[row] >= 0)
-      add("div", `least clearance ${shown(map.clearance[row], 1, "mm")} (${words(map.structures[map.nearest[row]])})`);
+    if (map.nearest[row] >= 0) {
+      const name = words(map.structures[map.nearest[row]]);
+      add("div", map.clearance[row] < 0 ? `crosses ${name}` : `least clearance ${shown(map.clearance[row], 1, "mm")} (${name})`);
+    }
     add("div", `path in the body ${shown(map.path[row], 1, "mm")}; skin angle ${shown(map.skin_angle[row], 0, "°")}`);
     if (map.p_hit && map.p_hit[row] !== null)
       add("div", `chance to hit ${chanceWords(map.p_hit[row])}, to touch anything forbidden ${chanceWords(map.p_touch_any[row])}`);
