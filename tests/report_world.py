@@ -219,6 +219,7 @@ def make_registration():
         "spread_ratio": 0.15,
         "altitude_mm": 25.0,
         "leverage": 2.5,
+        "expected_tre_target_mm": 1.31,
         "flags": ["markers nearly in one line"],
     }
 

@@ -33,8 +33,8 @@ def _facts(plan: Any) -> Facts:
     yield "standoff", f"{plan.standoff_mm:g} mm, tip to target"
     error = plan.expected_target_error_mm
     yield (
-        "expected target error",
-        f"{error:.2f} mm (rms)" if np.isfinite(error) else "not known: a stated base",
+        "expected tip error",
+        f"{error:.2f} mm (rms)" if np.isfinite(error) else "not known: no markers",
     )
     yield "robot", plan.model.name
     for name in ("approach", "insertion"):

@@ -136,8 +136,9 @@ class Doubt:
         fractions = ", ".join(f"{SOURCES[source].text} {100 * fraction:.0f} %" for source, fraction in self.sources())
         return [
             self.sentence(),
-            f"  expected error {budget.rms_mm:8.2f} mm (rms): {budget.lateral_mm:.2f} across the needle, "
-            f"{budget.depth_mm:.2f} along it; half axes of the 95 % ellipsoid {axes} mm",
+            f"  expected tip error {budget.rms_mm:.2f} mm (rms), as the arm stands for it: "
+            f"{budget.lateral_mm:.2f} across the needle, {budget.depth_mm:.2f} along it; "
+            f"half axes of the 95 % ellipsoid {axes} mm",
             f"  of its variance: {fractions}",
             f"  {self.declaration}",
             f"  touches anything: {chance_text(self.p_touch_any)} at most, to first order",

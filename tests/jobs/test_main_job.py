@@ -74,6 +74,23 @@ def test_the_page_says_where_the_needle_enters_as_check_does(carton, rehearsed, 
     assert f"<td>{words}</td>" in (rehearsed / "report.html").read_text()
 
 
+def test_an_expected_error_says_of_what_it_is(carton, rehearsed, capfd):
+    """Of the markers alone register and page say the same number; of the tip, page and plan do."""
+    _, registered = run(capfd, "register", carton)
+    page = (rehearsed / "report.html").read_text()
+    tre, tip = (
+        registered["expected_tre_target_mm"],
+        json.loads((rehearsed / "plan.json").read_text())["expected_target_error_mm"],
+    )
+    assert abs(tre - tip) > 0.1  # else they may be mixed up here
+    assert f"expected TRE at the target (rms), markers alone</th><td><b>{tre:.2f} mm" in page
+    assert f"expected tip error (rms), as the arm stands in the plan</th><td>{tip:.2f} mm" in page
+    assert main(["register", str(carton)]) == OK
+    said = capfd.readouterr().out
+    assert f"expected TRE at the target {tre:.3f} mm (rms), markers alone" in said
+    assert "expected tip error, markers and arm together, inserted at theta" in said
+
+
 @pytest.mark.parametrize("name", ["urscript", "ros2", "csv", "moveit"])
 def test_an_export_carries_the_warnings_of_its_plan(carton, rehearsed, name, tmp_path, capsys):
     """Printed, in the answer, and in a file that is written; with the direction that it goes."""

@@ -51,7 +51,7 @@ def budget_png(facts: Mapping[str, Any]) -> bytes:
     _changes(what_if, facts)
     best = facts["best"]
     figure.suptitle(
-        f"expected error of the needle's tip {facts['expected_mm']:.2f} mm (rms); least with {best['text']}: "
+        f"expected tip error {facts['expected_mm']:.2f} mm (rms); least with {best['text']}: "
         f"{best['expected_mm']:.2f} mm",
         fontsize=11.5,
     )

@@ -286,7 +286,7 @@ def _use_lines(run: TouchRun) -> list[str]:
     without = f" without {failed}, {plan.expected_mm:.2f} with" if failed else ""
     worst = f"of the worst poses {plan.worst_mm:.2f} mm"
     return [
-        f"expected error at the target: {use.expected_mm:.2f} mm rms{without}; {worst}",
+        f"expected tip error: {use.expected_mm:.2f} mm rms{without}; {worst}",
         f"error of this truth (seed {run.seed}): {use.tip_error_mm:.2f} mm; FRE {use.registration.fre_mm:.2f} mm",
         *(f"  {flag}" for flag in use.registration.flags),
     ]

@@ -121,8 +121,9 @@ def budget_lines(facts: dict[str, Any] | None) -> list[str]:
         return []
     now = facts["expected_mm"]
     parts = f"{facts['expected_lateral_mm']:.2f} across it and {facts['expected_depth_mm']:.2f} along it"
+    at = f"theta {facts['theta_deg']:.0f}, beta {facts['beta_deg']:.0f}"
     lines = [
-        f"  the needle's whole error, inserted at theta {facts['theta_deg']:.0f}, beta {facts['beta_deg']:.0f}: "
+        f"  expected tip error, markers and arm together, inserted at {at}: "
         f"{now:.2f} mm (rms), {parts}; not modelled: {facts['not_modelled']}",
         f"    {'source':34s} {'alone':>7s} {'all but it':>11s}",
     ]

@@ -64,8 +64,7 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
     """The run with its pictures, and with the page of all that is known."""
     context, found = run.context, run.candidates
     case, anatomy, stages = context.case, context.anatomy, context.stages
-    registration = context.placement.registration if context.placement is not None else None
-    shown = None if registration is None else registration_summary(registration)
+    shown = _registration(context)
     film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
     with stages.time("page"):
         page, uncertainty = out / PAGE, _uncertainty(run)
@@ -86,6 +85,14 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
             raster=drawn.raster,
         )
     return run.with_files(*drawn.files, out / PAGE)
+
+
+def _registration(context: CaseContext) -> dict[str, Any] | None:
+    """As ``register --json`` has it; None without markers."""
+    placement = context.placement
+    if placement is None or placement.registration is None:
+        return None
+    return {**registration_summary(placement.registration), "expected_tre_target_mm": placement.target_error_mm}
 
 
 def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:

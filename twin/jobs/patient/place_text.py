@@ -47,6 +47,6 @@ def _line(rank: str, one: RatedPlacement, run: PlaceRun) -> str:
     where = "     -       -       -" if one.site is None else "{:6.0f}  {:6.0f}  {:6.0f}".format(*one.site.position)
     name = one.name if one.site is None else mounting_text(one.site.region, run.found.T_ct_bed, space)
     home = f"; home: {verdict.home_contact}" if verdict.home_contact else ""
-    expected = "" if one.expected_mm is None else f"; expected error {one.expected_mm:.2f} mm"
+    expected = "" if one.expected_mm is None else f"; expected tip error {one.expected_mm:.2f} mm"
     worth = f"{rank}  {100 * verdict.fraction:7.1f}  {verdict.reached:5d}  {verdict.margin:6.2f}"
     return f"{worth}  {where}  {name}{expected}{home}"

@@ -78,16 +78,20 @@ def _plan(run: Run) -> list[str]:
         f"plan: theta {plan['theta_deg']:g} deg, beta {plan['beta_deg']:g} deg, standoff {plan['standoff_mm']:.1f} mm",
         *(f"  {label:18s} {value}" for label, value in (() if run.facts is None else run.facts.rows())),
         f"  approach {plan['approach_s']:.1f} s, insertion {plan['insertion_s']:.1f} s",
-        "  expected error at the target: "
-        + ("unknown (no markers)" if error is None else f"{error:.2f} mm (rms){_straight(run)}"),
+        f"  {_expected(run, error)}",
         *_otherwise(run.candidates, run.plan),
         *_other_aim(run),
     ]
 
 
-def _straight(run: Run) -> str:
-    """A plan's number is of a straight needle; only rooms count the bend."""
-    return "" if run.context.case.bending is None else ", of a needle that does not bend"
+def _expected(run: Run, error_mm: float | None) -> str:
+    """What the tip is expected to miss the target by, and of what: only rooms count a needle that bends."""
+    if error_mm is None:
+        return "expected tip error: unknown (no markers)"
+    if run.context.chance is None:
+        return f"expected TRE at the target: {error_mm:.2f} mm (rms), markers alone: no [errors] declare the arm's"
+    straight = "" if run.context.case.bending is None else ", of a needle that does not bend"
+    return f"expected tip error: {error_mm:.2f} mm (rms), as the arm stands in the plan{straight}"
 
 
 def _otherwise(found: Candidates, plan: Plan) -> list[str]:
@@ -98,7 +102,9 @@ def _otherwise(found: Candidates, plan: Plan) -> list[str]:
     other = float(np.hypot(found.chances.lateral_mm[row[0]], found.chances.depth_mm[row[0]]))
     if not abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
         return []
-    return [f"    in the configuration of the table and of check {other:.2f} mm: an approach may end in another one"]
+    return [
+        f"    as the arm stands in the table and in check {other:.2f} mm: an approach may end in another configuration"
+    ]
 
 
 def _other_aim(run: Run) -> list[str]:
@@ -231,7 +237,7 @@ def registration_text(report: dict[str, Any]) -> str:
         f"  FRE {report['fre_mm']:.3f} mm, mean residual {report['mean_error_mm']:.3f} mm",
         "  (the residuals are not the accuracy at the target)",
         f"  FLE {report['fle_mm']:.3f} mm, {report['fle_source']}{_interval(report['fle_interval_mm'])}",
-        f"  expected error at the target {report['expected_tre_target_mm']:.3f} mm"
+        f"  expected TRE at the target {report['expected_tre_target_mm']:.3f} mm (rms), markers alone"
         + _interval(report["expected_tre_target_interval_mm"]),
         *_along_shaft(report["expected_tre_along_shaft_mm"]),
         f"  spread s2/s1 {report['spread_ratio']:.2f}, altitude {report['altitude_mm']:.0f} mm, "
@@ -260,7 +266,7 @@ def _declared_lines(report: dict[str, Any]) -> list[str]:
         f"  {report['declaration']['text']}",
     ]
     lines += [
-        f"  without {name}: expected {one['rms_mm']:.3f} mm, p of the residuals {one['probability']:.2g}"
+        f"  without {name}: expected TRE {one['rms_mm']:.3f} mm, p of the residuals {one['probability']:.2g}"
         for name, one in report["without"].items()
     ]
     if report["one_more"] is not None:

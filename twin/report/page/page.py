@@ -108,8 +108,10 @@ def write_page(
         cards=_cards(candidates, pick, plan, rehearsal, doubt, refusal),
         counts=tables.counts_table(candidates),
         best=tables.best_table(candidates),
-        plan=tables.plan_section(plan, () if facts is None else facts.rows(), refusal),
-        registration=tables.registration_section(registration, plan),
+        plan=tables.plan_section(
+            plan, () if facts is None else facts.rows(), refusal, declared=uncertainty is not None
+        ),
+        registration=tables.registration_section(registration),
         rehearsal=tables.rehearsal_section(rehearsal, demanding(anatomy), film),
         warnings=tables.warnings_section(anatomy.warnings),
         inputs=tables.inputs_table(case.inputs),
@@ -192,7 +194,7 @@ def _cards(
     if rehearsal is not None:
         touched = len(rehearsal.contacts)
         detail = f"{touched} contact{'s' if touched != 1 else ''}" if touched else "no contact"
-        expected = f"expected (rms) {number(rehearsal.predicted_error_mm, 2, 'mm')}; {detail}"
+        expected = f"expected {number(rehearsal.predicted_error_mm, 2, 'mm')} (rms); {detail}"
         if rehearsal.standing is not None:
             expected = f"{rehearsal.standing.text}; {expected}"
         cards.append(Card("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))

@@ -24,7 +24,7 @@ def budget_section(facts: Mapping[str, Any]) -> Markup:
 
     now, best = facts["expected_mm"], facts["best"]
     won = now - best["expected_mm"]
-    head = f"The tip is expected to miss the target by {now:.2f} mm (rms)"
+    head = f"Expected tip error of this insertion: {now:.2f} mm (rms)"
     text = f"{head}. The next {won:.2f} mm is won by {best['text']}." if won >= SHOWN_MM else f"{head}."
     form = (
         "<p>{}</p>"

@@ -22,8 +22,11 @@ NO_CHANCES = "No chances: they need markers, the arm, and a direction that organ
 
 def chance_card(doubt: Doubt) -> Card:
     """Both chances and the expected error, for the top of the page."""
-    expected = f"touches anything forbidden {chance_text(doubt.p_touch_any)}; expected error (rms) "
-    return Card("chance to hit", chance_text(doubt.p_hit), expected + number(doubt.budget.rms_mm, 2, "mm"))
+    detail = (
+        f"touches anything forbidden {chance_text(doubt.p_touch_any)}; expected tip error "
+        f"{number(doubt.budget.rms_mm, 2, 'mm')} (rms); not modelled: {doubt.not_modelled}"
+    )
+    return Card("chance to hit", chance_text(doubt.p_hit), detail)
 
 
 def chances_section(doubt: Doubt | None, registration: Mapping[str, Any] | None) -> Markup:
@@ -40,7 +43,7 @@ def chances_section(doubt: Doubt | None, registration: Mapping[str, Any] | None)
         ("chance to hit the target", Markup("<b>{}</b>").format(chance_text(doubt.p_hit))),
         ("chance to touch anything forbidden, at most", chance_text(doubt.p_touch_any)),
         *([("most likely touched", f"{name.replace('_', ' ')}, {chance_text(chance)}")] if name else []),
-        ("expected error of the tip (rms)", number(budget.rms_mm, 2, "mm")),
+        ("expected tip error (rms), this insertion", number(budget.rms_mm, 2, "mm")),
         ("across the needle (rms)", number(budget.lateral_mm, 2, "mm")),
         ("along the needle (rms)", number(budget.depth_mm, 2, "mm")),
         ("half axes of the 95 % ellipsoid", ", ".join(number(float(mm), 2) for mm in budget.half_axes_mm) + " mm"),

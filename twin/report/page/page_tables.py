@@ -135,7 +135,12 @@ def counts_table(candidates: Candidates) -> Markup:
     return table(("verdict", "of solid angle", "directions", "code"), rows, kind="numbers") + text
 
 
-def registration_section(registration: Mapping[str, Any] | None, plan: Any | None) -> Markup:
+TRE_TEXT = "expected TRE at the target (rms), markers alone"
+TIP_ERROR_TEXT = "expected tip error (rms), as the arm stands in the plan"
+"""Of the registration, and of the whole insertion with the arm's declared errors."""
+
+
+def registration_section(registration: Mapping[str, Any] | None) -> Markup:
     """The registration's numbers from a mapping of plain values; absent ones are left out."""
     if not registration:
         return Markup("<p>The case has no markers: where the patient lies was stated, or is not known.</p>")
@@ -149,9 +154,8 @@ def registration_section(registration: Mapping[str, Any] | None, plan: Any | Non
         ("altitude_mm", "least altitude of the triangle", "mm", 1),
         ("leverage", "TRE(target)/FLE", "", 2),
     )
-    rows: list[tuple[str, str]] = [
-        ("expected error (TRE, rms) at the target", _bold(number(_tre(registration, plan), 2, "mm")))
-    ]
+    expected = float(registration.get("expected_tre_target_mm", math.nan))
+    rows: list[tuple[str, str]] = [(TRE_TEXT, _bold(number(expected, 2, "mm")))]
     for key, text, unit, digits in names:
         if registration.get(key) is not None:
             rows.append((text, _value(registration[key], unit, digits)))
@@ -169,14 +173,6 @@ def _bold(text: str) -> Markup:
     return Markup("<b>{}</b>").format(text)
 
 
-def _tre(registration: Mapping[str, Any], plan: Any | None) -> float:
-    if registration.get("expected_tre_target_mm") is not None:
-        return float(registration["expected_tre_target_mm"])
-    if registration.get("fle_mm") is not None and registration.get("leverage") is not None:
-        return float(registration["fle_mm"]) * float(registration["leverage"])
-    return math.nan if plan is None else float(plan.expected_target_error_mm)
-
-
 def _value(value: Any, unit: str, digits: int) -> str:
     if isinstance(value, int | float):
         return number(float(value), digits, unit)
@@ -187,13 +183,16 @@ NOT_REQUESTED = "this run searched only; the plan command plans the arm's motion
 """Where no plan was made because nobody wanted one."""
 
 
-def plan_section(plan: Any | None, at_patient: Iterable[tuple[str, str]] = (), refusal: str = "") -> Markup:
+def plan_section(
+    plan: Any | None, at_patient: Iterable[tuple[str, str]] = (), refusal: str = "", *, declared: bool = False
+) -> Markup:
     """The plan's numbers, or why there is none, and how its path, or that of the best direction, is found.
 
     Args:
         plan: The plan, or None.
         at_patient: Names and values for whoever stands at the patient.
         refusal: Why there is no plan although one was requested; "" where none was.
+        declared: Whether the case declares the arm's errors, which a plan's expected error then counts.
     """
     if plan is None:
         best = (("path of the best direction", ""), *at_patient)
@@ -210,7 +209,7 @@ def plan_section(plan: Any | None, at_patient: Iterable[tuple[str, str]] = (), r
         ("approach", f"{plan.approach.times_s[-1]:.1f} s, {len(plan.approach.q)} waypoints"),
         ("insertion", f"{plan.insertion.times_s[-1]:.1f} s, {len(plan.insertion.q)} waypoints"),
         *((CLEARANCE_TEXT[phase], number(float(mm), 1, "mm")) for phase, mm in plan.clearance_mm.items()),
-        ("expected error at the target (rms)", number(plan.expected_target_error_mm, 2, "mm")),
+        (TIP_ERROR_TEXT if declared else TRE_TEXT, number(plan.expected_target_error_mm, 2, "mm")),
         ("seed", str(plan.seed)),
     ]
     return pairs(rows)
@@ -232,7 +231,7 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
         *([] if rehearsal.standing is None else [("of all", rehearsal.standing.text)]),
         ("its lateral part", number(rehearsal.lateral_mm, 2, "mm")),
         ("its depth part", depth),
-        ("expected beforehand (rms)", number(rehearsal.predicted_error_mm, 2, "mm")),
+        ("expected by the plan (rms)", number(rehearsal.predicted_error_mm, 2, "mm")),
         ("contacts", listed(touched) if touched else "none"),
         ("insertion", rehearsal.followed_text),
         ("force", rehearsal.force_text),
