@@ -83,12 +83,12 @@ def test_what_a_command_outdates_goes(planned):
 
 
 def test_a_smaller_set_leaves_nothing_of_the_larger(tmp_path):
-    """The same command without pictures: the old pictures go, without a word."""
+    """The same command without pictures: the old pictures go, and one line names them."""
     said = []
     write(tmp_path, "search", {"candidates.parquet": "1", "report.html": "72 safe", "map.png": "m"})
     write(tmp_path, "search", {"candidates.parquet": "0"}, note=said.append)
     assert names(tmp_path) == {"candidates.parquet"} | OURS
-    assert said == []
+    assert said == [f"{tmp_path}: map.png, report.html of an earlier run removed: not of this search"]
 
 
 def test_commands_that_have_nothing_to_do_with_each_other_share_a_folder(planned):

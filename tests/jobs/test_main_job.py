@@ -188,7 +188,13 @@ def test_a_new_search_leaves_nothing_of_an_old_one(carton, tmp_path, capfd):
     assert main(["search", str(carton), "--no-arm", "--out", str(tmp_path)]) == OK
     assert (tmp_path / "report.html").is_file()
     (tmp_path / "notes.txt").write_text("mine")
+    capfd.readouterr()
     assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
+    said = capfd.readouterr().err
+    went = "map.png, report.html, scene.png, slices.png of an earlier run removed: not of this search"
+    assert f"{tmp_path}: {went}" in said
+    assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
+    assert "removed" not in capfd.readouterr().err
     names = {"candidates.parquet", "manifest.json", "timings.json", "notes.txt"}
     assert {path.name for path in tmp_path.iterdir()} == names
     assert problems(tmp_path) == ()

@@ -37,6 +37,9 @@ from puncture_twin.planning.base.output.manifest import (
 )
 from puncture_twin.planning.base.strict_json import read_json
 
+MOST_NAMED = 8
+"""Of the files that went; a series of slices has hundreds."""
+
 
 def publish(draft: Draft, started: datetime) -> None:
     """Make the draft's files the command's set."""
@@ -59,7 +62,9 @@ def publish(draft: Draft, started: datetime) -> None:
         _remove(out, left - files)
         (state / "timings").replace(out / TIMINGS_NAME)
         (state / "after").replace(out / MANIFEST_NAME)
-    _report_removed(draft, gone - {draft.command, *new} - _dependents(old, {draft.command, *new}))
+    others = gone - {draft.command, *new} - _dependents(old, {draft.command, *new})
+    _report_outdated(draft, {name for entry in gone - others for name in old.entries[entry].files} - files)
+    _report_removed(draft, others)
 
 
 def _entries(draft: Draft) -> dict[str, ManifestEntry]:
@@ -128,6 +133,15 @@ def _remove(out: Path, names: Iterable[str]) -> None:
             with suppress(OSError):
                 for parent in path.relative_to(out).parents[:-1]:
                     (out / parent).rmdir()
+
+
+def _report_outdated(draft: Draft, names: set[str]) -> None:
+    """Name what the command itself wrote earlier, or was made from that, and is not written anew."""
+    if not names:
+        return
+    first, more = sorted(names)[:MOST_NAMED], max(len(names) - MOST_NAMED, 0)
+    named = ", ".join(first) + (f" and {more} more" if more else "")
+    draft.note(f"{draft.out}: {named} of an earlier run removed: not of this {draft.command}")
 
 
 def _report_removed(draft: Draft, others: set[str]) -> None:
