@@ -109,21 +109,38 @@ def parse_toml(
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, a number that Python does not read
         raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
+    data = data if change is None else change(data)
     try:
-        return model.model_validate(data if change is None else change(data))
+        return model.model_validate(data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place, said = _said(first["loc"], first["msg"].removeprefix("Value error, "), first["type"])
+        place, said = _said(data, first["loc"], first["msg"].removeprefix("Value error, "), first["type"])
         value = "" if isinstance(first["input"], dict | list | tuple) else f" (given: {first['input']!r:.60})"
         allowed = f"the keys, types and ranges of {keys}"
         raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error
 
 
-def _said(keys: tuple[str | int, ...], message: str, kind: str) -> tuple[str, str]:
+def _said(data: object, keys: tuple[str | int, ...], message: str, kind: str) -> tuple[str, str]:
     """Which key, and what is wrong with it; of a list that is too short the list's own."""
     if kind == "missing" and keys and isinstance(keys[-1], int):
-        return ".".join(map(str, keys[:-1])), f"number {keys[-1] + 1} of the list is missing"
-    return ".".join(map(str, keys)) or "top level", message
+        return _place(data, keys[:-1]), f"number {keys[-1] + 1} of the list is missing"
+    return _place(data, keys) or "top level", message
+
+
+def _place(data: Any, keys: tuple[str | int, ...]) -> str:
+    """A key as who reads the file finds it: entries of a list are counted from 1, and named where they have a name."""
+    said = ""
+    for key in keys:
+        try:
+            data = data[key]
+        except (KeyError, IndexError, TypeError):  # a key that is missing, or the schema's own step, not the file's
+            data = None
+        if isinstance(key, int):
+            name = data.get("name") if isinstance(data, dict) else None
+            said += f" number {key + 1}" + (f" ('{name:.40}')" if isinstance(name, str) else "")
+        else:
+            said += f".{key}" if said else key
+    return said
 
 
 def check_toml_bounds(text: str, where: Path | str, allowed: str) -> None:

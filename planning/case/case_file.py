@@ -30,7 +30,7 @@ from puncture_twin.planning.case.tables.structures_section import (
 )
 from puncture_twin.planning.case.tables.surroundings_section import GantrySection, ObstacleSection
 from puncture_twin.planning.case.tables.target_section import TargetSection
-from puncture_twin.planning.case.toml_types import CaseSchema, Name, Section, Text
+from puncture_twin.planning.case.toml_types import CaseName, CaseSchema, Section, Text
 
 COUNT_KEY = "structures = N"
 """The name under which the count at the top reaches the model: TOML knows ``structures`` as an array of tables too."""
@@ -87,7 +87,7 @@ class CaseFile(Section):
     schema_: CaseSchema = Field(alias="schema")
     structure_count: Annotated[int, Strict(), Field(ge=1)] | None = Field(None, alias="structures = N")
     region: Region | None = None
-    name: Name
+    name: CaseName
     space: Literal["LPS", "RAS", "local"]
     target: TargetSection
     needle: NeedleSection

@@ -63,10 +63,10 @@ def named_files(content: CaseFile, path: Path) -> Iterator[NamedFile]:
             yield NamedFile("labelmap", one.labelmap, key, volumes.MAX_FILE_BYTES)
         if one.ct is not None:
             yield NamedFile("ct", one.ct, key, volumes.MAX_FILE_BYTES)
-    for number, many in enumerate(content.structures):
-        yield from _many_files(many, f"structures.{number}", path)
+    for number, many in enumerate(content.structures, start=1):
+        yield from _many_files(many, f"structures number {number}", path)
         if many.naming is not None and naming.is_naming_file(many.naming):
-            yield NamedFile("naming", many.naming, f"structures.{number}.naming", naming.MAX_CSV_BYTES)
+            yield NamedFile("naming", many.naming, f"structures number {number}.naming", naming.MAX_CSV_BYTES)
     if content.ct.file is not None:
         yield NamedFile("ct", content.ct.file, "ct.file", volumes.MAX_FILE_BYTES)
     for side in ("markers_ct", "markers_base", "transform"):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import re
+import unicodedata
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    AfterValidator,
     AllowInfNan,
     BaseModel,
     BeforeValidator,
@@ -17,6 +20,13 @@ from pydantic import (
 )
 
 from puncture_twin.planning.base.text_names import MAX_NAME
+
+
+def _plain_name(value: str) -> str:
+    if not re.fullmatch(r"[^\W_]([\w .\-]*[\w.\-])?", unicodedata.normalize("NFC", value)):
+        raise ValueError("letters, digits, spaces and . _ - alone, a letter or digit first")
+    return value
+
 
 Number = Annotated[float, Strict(), AllowInfNan(False)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -30,6 +40,8 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 Sextuple = tuple[JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees]
 Text = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
+CaseName = Annotated[str, StringConstraints(max_length=80), AfterValidator(_plain_name)]
+"""Of any alphabet: a patient may be called Müller. What must be ASCII (exports to robots) writes it plainly."""
 StructureName = Annotated[str, StringConstraints(pattern=r"^\S(.*\S)?$", max_length=MAX_NAME)]
 """As other programs name structures, such as "right lung"; that it is printable is checked for the whole file."""
 Degrees360 = Annotated[Number, Field(ge=0, le=360)]

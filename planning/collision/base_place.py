@@ -15,6 +15,10 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.winding import winding_number
 
 
+class BaseInPatientError(InputError):
+    """The robot's base stands where the patient is, or their table."""
+
+
 def refuse_base_in(
     model: UrModel, base: Body, placed: FclPatient, patient: TriangleMesh, outside: TriangleMesh | None
 ) -> None:
@@ -28,15 +32,16 @@ def refuse_base_in(
         outside: What the CT shows besides, likewise.
 
     Raises:
-        InputError: It does.
+        BaseInPatientError: It does.
     """
     centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
     met = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
     if met or _encloses(patient, centre):
-        raise InputError("the robot's base stands in the patient", where="cell", allowed="a base outside the skin")
+        what = "the robot's base stands in the patient"
+        raise BaseInPatientError(what, where="workcell", allowed="a base outside the skin")
     if outside is not None and _encloses(joined([patient, outside]), centre):
         what = "the robot's base stands in what the CT shows outside of the body (its table?)"
-        raise InputError(what, where="cell", allowed="a base outside of it")
+        raise BaseInPatientError(what, where="workcell", allowed="a base outside of it")
 
 
 def _encloses(mesh: TriangleMesh, point: Floats) -> bool:

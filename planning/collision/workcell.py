@@ -12,6 +12,7 @@ from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.collision.base_place import BaseInPatientError
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.surroundings import case_boxes, check_gantry
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -59,10 +60,14 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
     model, tool = case.robot.model, case_tool(case)
 
     def make() -> FastChecker:
-        surfaces = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in (skin, outside))
-        return FastChecker(
-            model, tool, boxes, next(surfaces), outside=next(surfaces), padding_mm=ARM_PADDING_MM, cache=user_cache()
-        )
+        placed, beside = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in (skin, outside))
+        try:
+            return FastChecker(
+                model, tool, boxes, placed, outside=beside, padding_mm=ARM_PADDING_MM, cache=user_cache()
+            )
+        except BaseInPatientError as error:
+            where = f"{case.path}: {_placing_key(case)}"
+            raise BaseInPatientError(error.what, where=where, allowed=error.allowed) from error
 
     if memory is NO_MEMORY:
         return make()
@@ -71,6 +76,13 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
     place = np.ascontiguousarray(T_base_ct, np.float64).tobytes()
     key = (__name__, model, tool, stated, tuple(mesh.digest for mesh in meshes), place, ARM_PADDING_MM)
     return memory.get(key, make, lambda _: CHECKER_BYTES + TREE_COPIES * sum(mesh.nbytes for mesh in meshes))
+
+
+def _placing_key(case: Case) -> str:
+    """Where the case says where its robot's base is."""
+    if case.registration is not None:
+        return "registration"
+    return "robot.mount" if case.robot.transform is None else "registration.transform"
 
 
 def home_configuration(case: Case) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -103,7 +104,7 @@ def case_text(parts: CaseParts) -> str:
 
 def case_name(folder: str) -> str:
     """A folder's name as a case may be called."""
-    plain = re.sub(r"[^A-Za-z0-9_.\-]+", "_", folder).strip("_.-")[:80]
+    plain = re.sub(r"[^\w.\-]+", "_", unicodedata.normalize("NFC", folder)).strip("_.-")[:80]
     return plain or "case"
 
 

@@ -98,7 +98,7 @@ def test_a_mask_on_another_grid_is_refused(tmp_path):
 def test_what_is_no_folder_of_masks_is_refused(tmp_path):
     """No folder, an empty one, a label map among the masks, two files of one name, both sources at once."""
     path = case_of(tmp_path, 'masks = "seg"')
-    with pytest.raises(InputError, match=r"structures.0.masks: 'seg' is no folder"):
+    with pytest.raises(InputError, match=r"structures number 1.masks: 'seg' is no folder"):
         load_case(path)
     (tmp_path / "seg").mkdir()
     with pytest.raises(InputError, match="'seg' holds 0 masks"):

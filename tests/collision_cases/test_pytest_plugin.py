@@ -69,12 +69,12 @@ def test_a_failing_check_prints_the_nearest_structures(pytester, old, new, messa
     ("text", "message"),
     [
         ("[[check]", "*some.collision.toml: is not TOML*line 1*"),
-        (GOOD.replace("theta_deg", "theta"), "*toml:3: check.0: unknown key 'theta'; did you mean 'theta_deg'*"),
-        (GOOD + GOOD[GOOD.index("[[") :].replace('"safe"', '"free"'), "*toml:12: check.1.verdict*"),
+        (GOOD.replace("theta_deg", "theta"), "*toml:3: check number 1: unknown key 'theta'; did you mean 'theta_deg'*"),
+        (GOOD + GOOD[GOOD.index("[[") :].replace('"safe"', '"free"'), "*toml:12: check number 2*.verdict*"),
         (f'case = "{CARTON}"', "*nothing is expected; there are no*"),
         (GOOD.replace(f'case = "{CARTON}"', ""), "*toml:3: no case; allowed: case = FILE*"),
-        (GOOD + "tolerance = 1", "*toml:3: check.0: unknown key 'tolerance'*"),
-        (GOOD + 'name = "a::b"', "*toml:9: check.0.name*"),
+        (GOOD + "tolerance = 1", "*toml:3: check number 1: unknown key 'tolerance'*"),
+        (GOOD + 'name = "a::b"', "*toml:9: check number 1*.name*"),
     ],
 )
 def test_a_broken_file_says_what_is_allowed(pytester, text, message):

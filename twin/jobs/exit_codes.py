@@ -21,6 +21,7 @@ from puncture_twin.planning.base.errors import (
 )
 from puncture_twin.twin.jobs.interrupt import insistent_ctrl_c
 from puncture_twin.twin.jobs.terminal import flush_output, leave_unread, reader_is_gone, refusal_of
+from puncture_twin.twin.jobs.usage import allowed_text
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 130, 141
 """The last two as the shell gives them for a program that Ctrl-C, or a closed pipe, has ended."""
@@ -88,10 +89,8 @@ def _failed(error: Exception, print_line: PrintLine) -> int:
 
 def _line_and_code(error: PlanningError | ClickException) -> tuple[str, int]:
     if isinstance(error, ClickException):
-        return (
-            f"command line: {one_line(error.format_message(), MOST_WHAT).rstrip('.')}; allowed: see --help",
-            BAD_INPUT,
-        )
+        what = one_line(error.format_message().replace("Value error, ", ""), MOST_WHAT).rstrip(".")
+        return f"command line: {what}; allowed: {allowed_text(error)}", BAD_INPUT
     if isinstance(error, NoAnswerError):
         return one_line(str(error)), ANSWER_IS_NO
     return str(error), BAD_INPUT if isinstance(error, InputError) else PROGRAM_FAILED

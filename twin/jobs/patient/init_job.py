@@ -78,6 +78,11 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     return InitRun(path, start, context, (*start.notes, *found))
 
 
+def _source(place: str) -> str:
+    """A file or folder below the case's; meshes may lie in that itself."""
+    return "the meshes beside it" if place == "." else place
+
+
 def init_text(run: InitRun) -> str:
     """What was found, and the next command."""
     parts, counts = run.start.parts, Counter(row.kind for row in run.start.parts.rows)
@@ -86,7 +91,7 @@ def init_text(run: InitRun) -> str:
     lines = [
         f"{run.path}",
         f"  skin           {parts.ct or 'a mesh'}",
-        f"  structures     {roles}, of {', '.join(one.source for one, _ in parts.sources)}",
+        f"  structures     {roles}, of {', '.join(_source(one.source) for one, _ in parts.sources)}",
         f"  target         {position} mm {parts.space}, in {parts.structure or 'no structure'}",
         f"  region         {parts.region}",
         "  needle         200 mm, shaft 150 mm, diameter 1.2 mm",

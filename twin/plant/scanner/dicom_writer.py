@@ -66,6 +66,8 @@ def _identified(identity: str, k: int, name: str) -> FileDataset:
     data.SOPClassUID, data.SOPInstanceUID = CTImageStorage, meta.MediaStorageSOPInstanceUID
     data.StudyInstanceUID, data.SeriesInstanceUID = uid(identity, "study"), uid(identity, "series")
     data.FrameOfReferenceUID = uid(identity, "frame of reference")
+    if not name.isascii():
+        data.SpecificCharacterSet = "ISO_IR 192"
     data.PatientName, data.PatientID, data.Modality = name[:64], name[:64], "CT"
     for keyword in (
         *("StudyDate", "StudyTime", "ReferringPhysicianName", "StudyID", "AccessionNumber", "PatientBirthDate"),
