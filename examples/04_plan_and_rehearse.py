@@ -5,6 +5,7 @@ python examples/04_plan_and_rehearse.py [CASE] [PLAN_FILE]
 
 import sys
 import tempfile
+from math import isnan
 from pathlib import Path
 
 import puncture_twin as pt
@@ -25,7 +26,13 @@ def main() -> None:
         plan = pt.read_plan(file, context)
     print(f"approach {plan.approach.times_s[-1]:.1f} s, insertion {plan.insertion.times_s[-1]:.1f} s")
     done = pt.rehearse(context, plan)
-    print(f"the tip ended {done.tip_error_mm:.2f} mm from the target; {plan.expected_target_error_mm:.2f} was expected")
+    expected = plan.expected_target_error_mm
+    known = (
+        "nobody knows what to expect without markers" if isnan(expected) else f"{expected:.2f} mm (rms) was expected"
+    )
+    print(f"the tip ended {done.tip_error_mm:.2f} mm from the target; {known}")
+    if done.truth_is_belief:
+        print("the patient lay exactly where they were believed to lie: that is the joints' error alone")
     print(f"contacts: {', '.join(one.body for one in done.contacts) or 'none'}")
 
 

@@ -90,6 +90,11 @@ def number(value: float, digits: int = 1, unit: str = "") -> str:
     return f"{text} {unit}" if unit else text
 
 
+def expected_text(error_mm: float) -> str:
+    """An expected error (rms), or why there is none."""
+    return number(error_mm, 2, "mm") if math.isfinite(error_mm) else "unknown (no markers)"
+
+
 def percent(fraction: float) -> str:
     """A share 0..1 in percent; what is there never reads as zero."""
     return "<0.1 %" if 0 < fraction < 0.0005 else f"{100 * fraction:.1f} %"

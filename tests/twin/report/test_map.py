@@ -14,6 +14,7 @@ from puncture_twin.twin.report.map.front import MOST_DOTS, shown_front
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import row_colours
 from puncture_twin.twin.report.map_view import map_view
+from puncture_twin.twin.report.numbers import ReasonCount
 from puncture_twin.twin.report.page.page_map import map_data
 
 
@@ -136,3 +137,27 @@ def test_a_needle_through_a_structure_crosses_it(monkeypatch, case, candidates, 
     assert reason_text(replace(through, verdict=amounts[0.0]), row).endswith(
         " with 0.00 mm clearance where 1 mm is demanded"
     )
+
+
+def test_a_legends_text_ends_before_its_number(monkeypatch, case, candidates, tmp_path):
+    """A long name ran into 27,164: whatever the words and the count, there is white between them."""
+    drawn, write = [], Canvas.write
+    monkeypatch.setattr(
+        Canvas,
+        "write",
+        lambda canvas, at, text, look, **more: drawn.append((*at, text, look)) or write(canvas, at, text, look, **more),
+    )
+    monkeypatch.setattr("puncture_twin.twin.report.map.map_side.reason_counts", lambda _: LONG_LEGEND)
+    draw_map(candidates, case, tmp_path / "map.png")
+    for entry in LONG_LEGEND:
+        number = next(item for item in drawn if item[2] == f"{entry.count:,}")
+        words = next(item for item in drawn if item[2].replace("\n", " ") == entry.text)
+        assert words[1] == number[1]
+        assert words[0] + words[3].width(words[2]) + 5 < number[0] - number[3].width(number[2])
+
+
+LONG_LEGEND = (
+    ReasonCount("safe for the organs", "safe", (0, 158, 115), 27_164, 0.8, 0.8),
+    ReasonCount("may bend into a structure's margin", "needle_bends", (170, 68, 153), 1_234_567, 0.1, 0.1),
+    ReasonCount("unknown region (image ends, or not named)", "unknown_region", (110, 110, 110), 8, 0.1, 0.1),
+)

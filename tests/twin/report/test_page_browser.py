@@ -184,6 +184,19 @@ def test_hover_shows_what_kept_the_arm(browser, case, candidates):
     assert "the shaft ends at 150 mm" in point_at(browser, case, candidates, 80, 200)
 
 
+def test_the_rims_own_angle_stands_within_it(browser):
+    """Not over the line, as on the picture of the map."""
+    script = """(() => {
+        const circles = [...document.querySelectorAll("#map-lines circle")], rim = circles[0];
+        const label = [...document.querySelectorAll("#map-lines text")].find((t) => t.textContent === "θ 90°");
+        const at = (element, name) => Number(element.getAttribute(name));
+        const aside = Math.hypot(at(label, "x") - at(rim, "cx"), at(label, "y") - at(rim, "cy"));
+        return [aside, at(rim, "r")];
+    })()"""
+    aside, radius = browser.evaluate(script)
+    assert radius - 30 < aside < radius - 8
+
+
 def test_hover_shows_a_safe_direction(browser, case, candidates):
     """Over a safe cell: verdict, rank, clearance with the nearest structure, path."""
     words = point_at(browser, case, candidates, 40, 220)

@@ -581,6 +581,7 @@ def test_the_page_holds_the_numbers(report):
         "ab" * 32,
         "rib right 9",
         "0.345 mm",  # FRE
+        "Scripts are switched off",
         "1.31 mm",  # the registration's own expectation: leverage times FLE, 1.25 mm, ignores the markers' weights
         "markers nearly in one line",
         "rib_right_9 is open",
@@ -590,6 +591,20 @@ def test_the_page_holds_the_numbers(report):
     ):
         assert words.lower() in text.lower(), words
     assert text.count("<tr><td>") >= 10
+
+
+def test_without_markers_the_page_says_what_is_not_known(tmp_path):
+    """No dash and no NaN where an error would be expected; and that the truth was the belief."""
+    case = world.make_case()
+    candidates = world.make_candidates(case)
+    plan = world.make_plan(case, candidates)
+    plan.expected_target_error_mm = float("nan")
+    rehearsal = world.make_rehearsal(plan)
+    rehearsal.predicted_error_mm, rehearsal.truth_is_belief = float("nan"), True
+    write_page(case, world.make_anatomy(), candidates, plan, rehearsal, None, tmp_path / "page.html")
+    text = visible((tmp_path / "page.html").read_text(encoding="utf-8"))
+    assert text.count("unknown (no markers)") == 3 and "NaN" not in text
+    assert "The truth equals the belief" in text
 
 
 def test_the_page_needs_no_network(report):

@@ -178,6 +178,19 @@ def test_unknown_structures_are_beads_and_a_refused_direction_is_drawn_too():
     assert draw_slices(one).units is None
 
 
+def test_the_legend_names_the_nearest_and_no_beads_that_are_not_there():
+    """However far the nearest is; of beads it speaks where something is unknown."""
+    one = subject()
+    one.pick.candidates.clearance.distance.setflags(write=True)
+    one.pick.candidates.clearance.distance[:] = [48.0, 55.0]
+    assert one.near == () and one.margin_mm == 0
+    drawn = draw_slices(one)
+    assert drawn.legend[-1][0] == "rib right 9: 48.0 mm, margin 1"
+    assert not any("Beads" in note for note in drawn.notes)
+    one.anatomy.structures[1].role = "unknown"
+    assert any("Beads: the edge of what is unknown." in note for note in draw_slices(one).notes)
+
+
 @given(UNITS, st.floats(5, 200), st.floats(0.3, 20), st.integers(0, 3))
 def test_the_needles_cut_ends_at_its_tip(direction, length, radius, which):
     """A cut's points lie on the capsule about the axis, so none is beyond the target by more than the radius."""

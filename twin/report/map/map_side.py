@@ -15,7 +15,7 @@ from puncture_twin.twin.report.canvas.canvas import Canvas, Words, rounded
 from puncture_twin.twin.report.canvas.fonts import Anchor, Face
 from puncture_twin.twin.report.map.chance_layer import chance_legend
 from puncture_twin.twin.report.map.front import shown_front
-from puncture_twin.twin.report.map.map_layout import POINT, SIDE_HEIGHT, side_pixels
+from puncture_twin.twin.report.map.map_layout import POINT, SIDE_HEIGHT, SIDE_WIDTH, side_pixels
 from puncture_twin.twin.report.map.map_marks import mark_dot, mark_ring, mark_star
 from puncture_twin.twin.report.map.map_raster import SCALE_DIGITS, ClearanceScale, clearance_scale
 from puncture_twin.twin.report.map_view import BEYOND, MapView
@@ -33,6 +33,9 @@ NOTHING = Words(13 * POINT, "bold", (160, 32, 0))
 
 PATCH = 0.06
 """Width of a patch of colour, of the column's."""
+
+TEXT_AT, COUNT_ENDS, ENTRY, MOST_LETTERS = 0.085, 0.62, 10.5 * POINT, 19
+"""Of the legend's entries: where text begins and the number ends; its height at most, and its letters in a line."""
 
 PADDING = 9.0
 """Pixels about the words in a box."""
@@ -62,22 +65,34 @@ def draw_side(canvas: Canvas, candidates: Candidates, view: MapView, pick: Pick 
 
 def _legend(canvas: Canvas, counts: Sequence[ReasonCount]) -> float:
     """A patch, a text and numbers for each reason; an entry of more lines is higher."""
-    for x, text in ((0.62, "directions"), (0.79, "of grid")):
+    for x, text in ((COUNT_ENDS, "directions"), (0.79, "of grid")):
         canvas.write(side_pixels(x, 0.012), text, HEAD, anchor="rs")
     for line, text in enumerate(("of solid", "angle")):
         canvas.write(side_pixels(1.0, 0.012 - 0.018 * (1 - line)), text, HEAD, anchor="rs")
-    texts = [_folded(one.text) for one in counts]
+    texts = [_beside_count(one) for one in counts]
     heights = np.array([text.count("\n") + 1 + GAP for text in texts])
     unit = min(LINE, MOST_LEGEND / float(heights.sum()))
     ends = 0.022 + unit * np.cumsum(heights)
     for one, text, y in zip(counts, texts, (ends - unit * heights / 2).tolist(), strict=True):
         face: Face = "bold" if one.code == "safe" else "plain"
-        look = Words(min(10.5 * POINT, unit * SIDE_HEIGHT / 1.08), face, spacing=1.08)
+        look = Words(min(ENTRY, unit * SIDE_HEIGHT / 1.08), face, spacing=1.08)
         canvas.rectangle(_box(0.0, y - 0.016, PATCH, 0.032 * min(1.0, unit / 0.015)), one.colour, 0.8 * POINT)
-        canvas.write(side_pixels(0.085, y), text, look, anchor="lm")
-        for x, value in ((0.62, f"{one.count:,}"), (0.79, percent(one.fraction)), (1.0, percent(one.solid_angle))):
+        canvas.write(side_pixels(TEXT_AT, y), text, look, anchor="lm")
+        for x, value in (
+            (COUNT_ENDS, f"{one.count:,}"),
+            (0.79, percent(one.fraction)),
+            (1.0, percent(one.solid_angle)),
+        ):
             canvas.write(side_pixels(x, y), value, look, anchor="rm")
     return float(ends[-1])
+
+
+def _beside_count(one: ReasonCount) -> str:
+    """What a reason means, in lines that end before its number."""
+    look = Words(ENTRY, "bold" if one.code == "safe" else "plain")
+    room = (COUNT_ENDS - TEXT_AT) * SIDE_WIDTH - look.width(f"{one.count:,}") - PADDING
+    folded = (_folded(one.text, width) for width in range(MOST_LETTERS, 0, -1))
+    return next((text for text in folded if look.width(text) <= room), one.text)
 
 
 def _box(x: float, y: float, wide: float, high: float) -> tuple[float, float, float, float]:
@@ -85,7 +100,7 @@ def _box(x: float, y: float, wide: float, high: float) -> tuple[float, float, fl
     return (*side_pixels(x, y), *side_pixels(x + wide, y + high))
 
 
-def _folded(text: str, width: int = 19) -> str:
+def _folded(text: str, width: int) -> str:
     lines = [""]
     for word in text.split():
         if len(lines[-1]) + len(word) + 1 > width and lines[-1]:

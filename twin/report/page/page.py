@@ -19,6 +19,7 @@ from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.numbers import (
     TRUTH_IS_BELIEF,
     demanding,
+    expected_text,
     nearest_text,
     needle_text,
     number,
@@ -194,7 +195,7 @@ def _cards(
     if rehearsal is not None:
         touched = len(rehearsal.contacts)
         detail = f"{touched} contact{'s' if touched != 1 else ''}" if touched else "no contact"
-        expected = f"expected {number(rehearsal.predicted_error_mm, 2, 'mm')} (rms); {detail}"
+        expected = f"expected (rms) {expected_text(rehearsal.predicted_error_mm)}; {detail}"
         if rehearsal.standing is not None:
             expected = f"{rehearsal.standing.text}; {expected}"
         cards.append(Card("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))

@@ -17,7 +17,7 @@ from puncture_twin.planning.base.reasons import Reason, css
 from puncture_twin.planning.plan.html import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
-from puncture_twin.twin.report.numbers import arm_text, nearest_structure, number, percent, reason_counts
+from puncture_twin.twin.report.numbers import arm_text, expected_text, nearest_structure, number, percent, reason_counts
 
 PROJECT = "puncture-twin"
 
@@ -209,7 +209,7 @@ def plan_section(
         ("approach", f"{plan.approach.times_s[-1]:.1f} s, {len(plan.approach.q)} waypoints"),
         ("insertion", f"{plan.insertion.times_s[-1]:.1f} s, {len(plan.insertion.q)} waypoints"),
         *((CLEARANCE_TEXT[phase], number(float(mm), 1, "mm")) for phase, mm in plan.clearance_mm.items()),
-        (TIP_ERROR_TEXT if declared else TRE_TEXT, number(plan.expected_target_error_mm, 2, "mm")),
+        (TIP_ERROR_TEXT if declared else TRE_TEXT, expected_text(plan.expected_target_error_mm)),
         ("seed", str(plan.seed)),
     ]
     return pairs(rows)
@@ -231,7 +231,7 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
         *([] if rehearsal.standing is None else [("of all", rehearsal.standing.text)]),
         ("its lateral part", number(rehearsal.lateral_mm, 2, "mm")),
         ("its depth part", depth),
-        ("expected by the plan (rms)", number(rehearsal.predicted_error_mm, 2, "mm")),
+        ("expected by the plan (rms)", expected_text(rehearsal.predicted_error_mm)),
         ("contacts", listed(touched) if touched else "none"),
         ("insertion", rehearsal.followed_text),
         ("force", rehearsal.force_text),

@@ -182,6 +182,8 @@ def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float
         deeper = "deep" if r.depth_mm >= 0 else "shallow"
         parts = f"lateral {number(r.lateral_mm, 2)}, {number(abs(r.depth_mm), 2)} too {deeper}"
         place = "" if r.standing is None else f"; {r.standing.place}"
+        if r.truth_is_belief:  # what matters more than the parts of so small an error, and there is room for one
+            parts, place = "the joints' alone, the patient lies exactly as believed", ""
         result = f"tip error at the end {number(r.tip_error_mm, 2, 'mm')}: {parts}{place}"
         annotate.write(draw, (12, 51), result, size=VALUE, bold=True)
     else:

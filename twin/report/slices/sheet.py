@@ -49,9 +49,8 @@ class Slices:
         shown = f"Needle ⌀ {needle.diameter_mm:g} mm as thick as it is{dashed if subject.margin_mm > 0 else ''}"
         region = "" if subject.region_ct is None else "; pink: cut of the 95 % region of the tip"
         ct = NO_CT if subject.anatomy.scan is None else "The CT's nearest voxels, not smoothed."
-        dotted = (
-            "Thin and dotted: the needle's shadow, where it is not in the plane. Beads: the edge of what is unknown."
-        )
+        beads = " Beads: the edge of what is unknown." if subject.has_unknown else ""
+        dotted = f"Thin and dotted: the needle's shadow, where it is not in the plane.{beads}"
         bends = "" if subject.bent_mm is None else "Lime: where its bevel may take it, to either side."
         return tuple(filter(None, (ct, f"{shown}{region}.", bends, dotted)))
 
@@ -62,7 +61,7 @@ class Slices:
         target = subject.case.target_structure
         first = [("needle", NEEDLE_COLOUR), ("target", TARGET_POINT)]
         region = [] if subject.region_ct is None else [("95 % region", REGION_COLOUR)]
-        return [*first, *region, (target, subject.colours[target]), *((one.text, one.colour) for one in subject.near)]
+        return [*first, *region, (target, subject.colours[target]), *((one.text, one.colour) for one in subject.named)]
 
 
 def draw_slices(subject: Subject) -> Slices:

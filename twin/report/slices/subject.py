@@ -70,17 +70,32 @@ class Subject:
         inside = organ_colours(tuple(s.name for s in self.anatomy.structures))
         return {**{s.name: OUTSIDE for s in self.anatomy.surroundings}, **inside}
 
-    @cached_property
+    @property
     def near(self) -> tuple[Near, ...]:
-        """The structures with a margin that lie nearest to the needle, nearest first."""
+        """The structures with a margin that lie near the needle, nearest first."""
+        return tuple(one for one in self._demanding if one.clearance_mm < NEAR_MM)[:MOST_NEAR]
+
+    @property
+    def named(self) -> tuple[Near, ...]:
+        """Those that a legend names: the near ones, or the nearest, however far it lies."""
+        return self.near or self._demanding[:1]
+
+    @property
+    def has_unknown(self) -> bool:
+        """Whether there is anything of which nobody knows what it is."""
+        return any(str(one.role) == "unknown" for one in self.anatomy.checked)
+
+    @cached_property
+    def _demanding(self) -> tuple[Near, ...]:
+        """All with a margin, nearest first."""
         found, row = self.pick.candidates.clearance, self.pick.row
         rows = zip(found.structures, found.distance[row], found.margins, strict=True)
         demanding = [
             Near(name, self.colours.get(name, OUTSIDE), float(mm), float(margin))
             for name, mm, margin in rows
-            if np.isfinite(margin) and mm < NEAR_MM
+            if np.isfinite(margin)
         ]
-        return tuple(sorted(demanding, key=lambda one: one.clearance_mm)[:MOST_NEAR])
+        return tuple(sorted(demanding, key=lambda one: one.clearance_mm))
 
     @property
     def margin_mm(self) -> float:

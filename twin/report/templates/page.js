@@ -4,6 +4,7 @@
   const config = { displaylogo: false, responsive: true };
   const LEFT = 70, TOP = 60;
   const RAD = Math.PI / 180;
+  const RIM_LABEL = 0.95; // of the disc's radius
 
   // ---- the map -------------------------------------------------------------------------------------------------
   const rows = new Int32Array(map.size * map.size);
@@ -43,7 +44,8 @@
   for (let theta = spacing; theta <= map.theta_max_deg; theta += spacing) {
     const r = theta / map.theta_max_deg * half, thick = theta === 90 && map.theta_max_deg > 92 ? 2 : 0.8;
     draw("circle", { cx, cy, r, fill: "none", stroke: "#000", "stroke-opacity": 0.4, "stroke-width": thick });
-    label(cx + r * Math.cos(67.5 * RAD), cy - r * Math.sin(67.5 * RAD), `θ ${theta}°`, {});
+    const at = Math.min(r, RIM_LABEL * half); // a ring's angle at the rim stands within it
+    label(cx + at * Math.cos(67.5 * RAD), cy - at * Math.sin(67.5 * RAD), `θ ${theta}°`, {});
   }
   for (const rim of map.rim) {
     const c = Math.cos(rim.angle_deg * RAD), s = Math.sin(rim.angle_deg * RAD);
