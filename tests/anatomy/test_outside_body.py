@@ -8,12 +8,13 @@ import pytest
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_MM,
+    BULKY_ML,
     CUT_AT_MM,
     OutsideImage,
     beyond_drawn_sides,
     outside_surface,
 )
-from puncture_twin.planning.geometry.containment import inside_each
+from puncture_twin.planning.geometry.containment import Side, inside_each, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 SPACING = np.array([2.0, 2.0, 3.0])
@@ -49,6 +50,27 @@ def test_it_is_as_wide_beyond_every_other_side(axis, end, beyond_mm):
     point[axis] = -beyond_mm if end == 0 else (SHAPE[axis] - 1) * SPACING[axis] + beyond_mm
     just = np.array([[0, 0, 2.99], [0, 0, -2.99], [0, 0, 3.01], [0, 0, -3.01]])
     assert inside_each(surface, point + just).tolist() == [True, True, False, False]
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("end", [0, -1])
+def test_beyond_a_bulky_piece_nothing_counts_as_outside_twice(axis, end):
+    """What is drawn out lies in the prism over all cut sections too: both look outward, and within both is inside."""
+    mask = np.zeros(SHAPE, bool)
+    mask[(slice(0, 30), slice(5, 25))[axis], (slice(5, 25), slice(0, 25))[axis], 5:15] = True
+    mask = mask if end == 0 else np.flip(mask, axis)
+    assert mask.sum() * SPACING.prod() / 1000.0 > BULKY_ML
+    empty = OutsideImage(np.full(SHAPE, -1000.0, np.float32), np.zeros(SHAPE, bool), np.diag([*SPACING, 1.0]), SPACING)
+    surface = outside_surface(empty, mask, where="table")
+    assert surface.closed and surface.wound_alike
+    a, b, c = np.moveaxis(surface.triangles, 1, 0)
+    whole = float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
+    drawn = float(mask.take(end, axis=axis).sum() * SPACING.prod() / SPACING[axis]) * BEYOND_MM[axis]
+    assert whole > 1.9 * drawn  # both look outward: neither takes away from the other
+    point = np.array([29.0, 29.0, 28.5])
+    point[axis] = -50.0 if end == 0 else (SHAPE[axis] - 1) * SPACING[axis] + 50.0
+    assert inside_each(surface, point[None]).tolist() == [True]
+    assert side_of(surface, point) is Side.INSIDE
 
 
 def test_it_goes_on_as_far_as_is_said(bar):

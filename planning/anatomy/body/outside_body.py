@@ -19,7 +19,7 @@ from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, pose
@@ -193,7 +193,7 @@ def _row(side: DrawnSide, across: Floats, along: Floats, at_slice: float) -> Flo
     return index
 
 
-def _outward_faces(vertices: Floats, n: int) -> NDArray[np.int32]:
+def _outward_faces(vertices: Floats, n: int) -> Ints32:
     """Triangles of a strip's prism: near and far row (n vertices each) of each of its sections, from end to end."""
     i, j = np.arange(n - 1), np.arange(1, n)
     last = len(vertices) - 2 * n
@@ -207,6 +207,15 @@ def _outward_faces(vertices: Floats, n: int) -> NDArray[np.int32]:
     )
     corners = np.concatenate([*ends, *(between + first for first in range(0, last, 2 * n))])
     faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]).astype(np.int32)
+    return _turned_outward(vertices, faces)
+
+
+def _turned_outward(vertices: Floats, faces: Ints32) -> Ints32:
+    """Triangles that are wound alike, seen counter-clockwise from outside.
+
+    Surfaces that overlap are joined: where one looked inward, or was wound against itself, what lies in both would
+    count as outside.
+    """
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     inward = float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0
     return faces[:, ::-1] if inward else faces
@@ -295,7 +304,7 @@ def _prism(section: Floats, axis: int, end: int, image: OutsideImage) -> Triangl
     index = np.concatenate([np.insert(rim, axis, near, axis=1), np.insert(rim, axis, far, axis=1)])
     i, j = np.arange(n), np.roll(np.arange(n), -1)
     fan = np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
-    sides = np.concatenate([np.stack([i, j, i + n], axis=1), np.stack([j, j + n, i + n], axis=1)])
-    faces = np.concatenate([fan, fan[:, ::-1] + n, sides])
-    T = image.T_ct_index
-    return TriangleMesh(apply(T, index), faces)
+    sides = np.concatenate([np.stack([i, i + n, j], axis=1), np.stack([j, i + n, j + n], axis=1)])
+    faces = np.concatenate([fan, fan[:, ::-1] + n, sides]).astype(np.int32)
+    vertices = apply(image.T_ct_index, index)
+    return TriangleMesh(vertices, _turned_outward(vertices, faces))
