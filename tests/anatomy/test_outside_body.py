@@ -108,7 +108,7 @@ def test_a_table_goes_on_along_its_own_direction(table, z_mm):
     """Half a millimetre before and behind its section in any slice, in the middle of its width."""
     at_slice = z_mm / SPACING[2]
     x, y = (20.0 + 0.02 * at_slice) * SPACING[0], (20.0 - 0.05 * at_slice) * SPACING[1]
-    assert table.closed
+    assert table.closed and table.wound_alike
     assert inside_each(table, np.array([[x, y + 0.5, z_mm], [x, y - 0.5, z_mm]])).tolist() == [True, False]
 
 

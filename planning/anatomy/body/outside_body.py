@@ -202,7 +202,7 @@ def _outward_faces(vertices: Floats, n: int) -> Ints32:
         [
             np.stack([i, i + 2 * n, j + 2 * n, j], axis=1),
             np.stack([i + n, j + n, j + 3 * n, i + 3 * n], axis=1),
-            np.array([[0, n, 3 * n, 2 * n], [n - 1, 3 * n - 1, 4 * n - 1, 2 * n - 1][::-1]]),
+            np.array([[0, n, 3 * n, 2 * n], [3 * n - 1, 4 * n - 1, 2 * n - 1, n - 1]]),
         ]
     )
     corners = np.concatenate([*ends, *(between + first for first in range(0, last, 2 * n))])
