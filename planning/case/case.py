@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from puncture_twin.planning.arm.tool_body import ToolBody
 from puncture_twin.planning.base.arrays import Floats, read_only
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.provenance import Input, InputFiles
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case_volumes import CaseVolumes
@@ -86,6 +87,10 @@ class Case:
     bending: Bending | None = None
     own_target: bool = False
     tool: ToolBody | None = None
+
+    @brief
+    def __repr__(self) -> str:
+        return f"{self.name}, {self.path}: target {self.target_name} in {self.target_structure}"
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""

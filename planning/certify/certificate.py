@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -104,6 +105,12 @@ class Certificate:
     triangle: Ints
     bound: Floats
     queries: int
+
+    @brief
+    def __repr__(self) -> str:
+        words = {SAFE: "safe for the organs", REJECTED: "rejected", UNDECIDED: "undecided"}
+        areas = ", ".join(f"{self.areas[letter]:.1f} square degrees {word}" for letter, word in words.items())
+        return f"case {self.question.case_name}, {len(self.verdict):,} cells to {np.degrees(self.size):g} deg: {areas}"
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""

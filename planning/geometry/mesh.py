@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.geometry.rigid import apply
 
 Faces = NDArray[np.int32]
@@ -34,6 +35,10 @@ class TriangleMesh:
 
     vertices: Floats
     faces: Faces
+
+    @brief
+    def __repr__(self) -> str:
+        return f"{len(self.vertices):,} vertices, {len(self.faces):,} triangles"
 
     def __post_init__(self) -> None:
         for name, dtype in (("vertices", np.float64), ("faces", np.int32)):

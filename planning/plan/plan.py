@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.html import plan_html
@@ -60,6 +63,13 @@ class Plan:
     clearance_mm: Mapping[str, float]
     speeds: SpeedLimits = DEFAULT_SPEEDS
     warnings: tuple[str, ...] | None = None
+
+    @brief
+    def __repr__(self) -> str:
+        return (
+            f"case {self.case_name}, theta {np.degrees(self.theta):g} deg, beta {np.degrees(self.beta):g} deg, "
+            f"{self.model.name}, approach {self.approach.duration_s:.1f} s, insertion {self.insertion.duration_s:.1f} s"
+        )
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""

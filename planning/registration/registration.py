@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import Aim
@@ -49,6 +50,10 @@ class Registration:
     conditioning: Conditioning
     uncertainty: FitUncertainty | None = None
     aim: Aim | None = None
+
+    @brief
+    def __repr__(self) -> str:
+        return f"{self.method}, {len(self.markers.names)} markers, FRE {self.fre_mm:.3f} mm, FLE {self.fle_mm:.3f} mm"
 
     @property
     def fle_mm(self) -> float:

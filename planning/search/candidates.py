@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32, Texts
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.angle_grid import AngleGrid
 from puncture_twin.planning.search.html import candidates_html
@@ -208,6 +209,14 @@ class Candidates(Columns):
 
     def __len__(self) -> int:
         return len(self.theta)
+
+    @brief
+    def __repr__(self) -> str:
+        best = "" if not len(self.ranked) else "; best " + self._direction(int(self.ranked[0]))
+        return f"{len(self):,} directions, {int(self.safe.sum()):,} {self.safe_text}{best}; arm {self.arm_note}"
+
+    def _direction(self, row: int) -> str:
+        return f"theta {np.degrees(self.theta[row]):g} deg, beta {np.degrees(self.beta[row]):g} deg"
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""

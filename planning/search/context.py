@@ -14,6 +14,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
@@ -72,6 +73,10 @@ class CaseContext:
     chance: ChanceModel | None
     watcher: Watcher
     stages: Stages
+
+    @brief
+    def __repr__(self) -> str:
+        return f"case {self.case.name}, {len(self.anatomy.structures)} structures; arm {self.arm}"
 
     @property
     def arm(self) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure, surface_distance
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
@@ -57,6 +58,10 @@ class Explanation:
     facts: EntryFacts
     doubt: Doubt | None = None
     read: tuple[Input, ...] = ()
+
+    @brief
+    def __repr__(self) -> str:
+        return f"case {self.case.name}, {' '.join(line.strip() for line in self.head())}; .text() says all"
 
     @property
     def safe(self) -> bool:

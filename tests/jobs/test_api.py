@@ -8,6 +8,7 @@ import pytest
 
 import puncture_twin as pt
 from puncture_twin.meshes import folder
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import prepare
 
 HEAVY = ("numba", "pybullet", "matplotlib", "trimesh", "scipy", "ompl", "fcl", "pyarrow", "SimpleITK", "plotly")
@@ -46,6 +47,33 @@ def test_check_takes_degrees(context):
     for row in (0, len(candidates) // 2):
         explained = pt.check(context, np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row]))
         assert explained.safe == candidates.safe[row]
+
+
+def test_what_it_returns_prints_as_one_line(context):
+    """A prompt is not flooded with arrays: the name of the type, and what is in it."""
+    candidates, marker = pt.search(context), folder() / "carton" / "markers_ct.csv"
+    rejected = int(np.flatnonzero(~candidates.safe)[0])
+    checked = pt.check(context, *np.degrees((candidates.theta[rejected], candidates.beta[rejected])))
+    values = {
+        "<CaseContext: case carton-m, ": context,
+        "<Case: carton-m, ": context.case,
+        f"<Candidates: {len(candidates):,} directions, ": candidates,
+        "<Explanation: case carton-m, theta ": checked,
+        "<Certificate: case carton-m, ": pt.certify(context, size_deg=10.0),
+        "<NamedPoints: 3 points, ": pt.read_points(marker),
+        "<TriangleMesh: ": context.anatomy.skin.mesh,
+    }
+    for begins, value in values.items():
+        assert repr(value) == str(value) and len(repr(value).splitlines()) == 1
+        assert repr(value).startswith(begins) and repr(value).endswith(">") and len(repr(value)) < 400, repr(value)
+        assert "array(" not in repr(value)
+    assert ": rejected because " in repr(checked)
+
+
+def test_a_value_that_is_half_made_still_prints():
+    """A debugger must not fail over it."""
+    half = object.__new__(TriangleMesh)
+    assert "TriangleMesh object at" in repr(half)
 
 
 def test_rerank_orders_the_safe_ones_alone(context):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.twin.plant.felt import NOT_FELT, Felt
 from puncture_twin.twin.rehearsal.standing import Standing
 
@@ -94,6 +95,11 @@ class Rehearsal:
     off_path_mm: float
     felt: Felt | None
     standing: Standing | None = None
+
+    @brief
+    def __repr__(self) -> str:
+        touched = ", ".join(sorted({one.body for one in self.contacts})) or "nothing"
+        return f"seed {self.seed}, the tip ended {self.tip_error_mm:.2f} mm from the target, touched {touched}"
 
     @property
     def followed_text(self) -> str:

@@ -17,6 +17,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.guard import guard_points
@@ -32,6 +33,10 @@ MAX_FILE_BYTES = 10_000_000
 _READERS: Mapping[str, Callable[[bytes, str], RawPoints]] = MappingProxyType(
     {".csv": read_csv_points, ".mrk.json": read_markups_points, ".fcsv": read_fcsv_points}
 )
+
+
+MOST_NAMED = 8
+"""Points that a line about a list names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +56,11 @@ class NamedPoints:
     space: Space | None
     kinds: tuple[str, ...] | None = None
     joints: NDArray[np.float64] | None = None
+
+    @brief
+    def __repr__(self) -> str:
+        named = ", ".join(self.names[:MOST_NAMED]) + (", ..." if len(self.names) > MOST_NAMED else "")
+        return f"{len(self.names)} points, {self.space or 'no space stated'}: {named}"
 
     def __post_init__(self) -> None:
         for name in ("points", "joints"):

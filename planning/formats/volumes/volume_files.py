@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import is_plain_file
 from puncture_twin.planning.base.input_file import absence, read_input
@@ -48,6 +49,10 @@ class Volume:
     T_ct_index: NDArray[np.float64]
     path: Path
     fields: dict[str, str] = field(default_factory=dict)
+
+    @brief
+    def __repr__(self) -> str:
+        return f"{' x '.join(map(str, self.values.shape))} voxels of {self.values.dtype}, {self.path}"
 
     def __post_init__(self) -> None:
         for name in ("values", "T_ct_index"):

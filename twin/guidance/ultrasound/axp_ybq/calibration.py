@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, tangent_basis
@@ -79,6 +80,10 @@ class Calibration:
     arm_errors: Floats
     joint_covariance: Floats
     small_sample: SmallSample | None
+
+    @brief
+    def __repr__(self) -> str:
+        return f"{len(self.weights)} poses, {len(self.outliers)} set aside, residuals {self.rms_mm:.3f} mm (rms)"
 
     @property
     def chi_squared_ratio(self) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 
@@ -81,6 +82,10 @@ class Recording:
     turn_probe: Floats | None = None
     turn_needle: Floats | None = None
     shaft_mm: Floats | None = None
+
+    @brief
+    def __repr__(self) -> str:
+        return f"{len(self.P)} poses, the tip in {'pixels' if self.pixels else 'mm'}"
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.A))
