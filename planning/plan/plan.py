@@ -26,8 +26,8 @@ class Plan:
         seed: Of the approach's planner.
         model: The arm.
         T_base_ct: Shape (4, 4), the belief of where the patient is.
-        expected_target_error_mm: Expected tip error (rms), as the arm stands for the insertion; without ``[errors]``
-            the registration's TRE alone; NaN for a stated mount or transform.
+        expected_target_error_mm: Expected tip error (rms), in the insertion's configuration of the arm; without
+            ``[errors]`` the registration's TRE alone; NaN for a stated mount or transform.
         theta: Puncture angle.
         beta: Azimuth.
         entry_ct: Shape (3,), skin entry.

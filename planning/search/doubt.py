@@ -136,7 +136,7 @@ class Doubt:
         fractions = ", ".join(f"{SOURCES[source].text} {100 * fraction:.0f} %" for source, fraction in self.sources())
         return [
             self.sentence(),
-            f"  expected tip error {budget.rms_mm:.2f} mm (rms), as the arm stands for it: "
+            f"  expected tip error {budget.rms_mm:.2f} mm (rms), in this configuration of the arm: "
             f"{budget.lateral_mm:.2f} across the needle, {budget.depth_mm:.2f} along it; "
             f"half axes of the 95 % ellipsoid {axes} mm",
             f"  of its variance: {fractions}",

@@ -84,7 +84,7 @@ def test_an_expected_error_says_of_what_it_is(carton, rehearsed, capfd):
     )
     assert abs(tre - tip) > 0.1  # else they may be mixed up here
     assert f"expected TRE at the target (rms), markers alone</th><td><b>{tre:.2f} mm" in page
-    assert f"expected tip error (rms), as the arm stands in the plan</th><td>{tip:.2f} mm" in page
+    assert f"expected tip error (rms), in the plan&#39;s configuration of the arm</th><td>{tip:.2f} mm" in page
     assert main(["register", str(carton)]) == OK
     said = capfd.readouterr().out
     assert f"expected TRE at the target {tre:.3f} mm (rms), markers alone" in said

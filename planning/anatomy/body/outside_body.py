@@ -207,10 +207,10 @@ def _outward_faces(vertices: Floats, n: int) -> Ints32:
     )
     corners = np.concatenate([*ends, *(between + first for first in range(0, last, 2 * n))])
     faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]).astype(np.int32)
-    return _turned_outward(vertices, faces)
+    return _facing_outward(vertices, faces)
 
 
-def _turned_outward(vertices: Floats, faces: Ints32) -> Ints32:
+def _facing_outward(vertices: Floats, faces: Ints32) -> Ints32:
     """Triangles that are wound alike, seen counter-clockwise from outside.
 
     Surfaces that overlap are joined: where one looked inward, or was wound against itself, what lies in both would
@@ -307,4 +307,4 @@ def _prism(section: Floats, axis: int, end: int, image: OutsideImage) -> Triangl
     sides = np.concatenate([np.stack([i, i + n, j], axis=1), np.stack([j, i + n, j + n], axis=1)])
     faces = np.concatenate([fan, fan[:, ::-1] + n, sides]).astype(np.int32)
     vertices = apply(image.T_ct_index, index)
-    return TriangleMesh(vertices, _turned_outward(vertices, faces))
+    return TriangleMesh(vertices, _facing_outward(vertices, faces))

@@ -91,7 +91,7 @@ def _expected(run: Run, error_mm: float | None) -> str:
     if run.context.chance is None:
         return f"expected TRE at the target: {error_mm:.2f} mm (rms), markers alone: no [errors] declare the arm's"
     straight = "" if run.context.case.bending is None else ", of a needle that does not bend"
-    return f"expected tip error: {error_mm:.2f} mm (rms), as the arm stands in the plan{straight}"
+    return f"expected tip error: {error_mm:.2f} mm (rms), in the plan's configuration of the arm{straight}"
 
 
 def _otherwise(found: Candidates, plan: Plan) -> list[str]:
@@ -102,9 +102,7 @@ def _otherwise(found: Candidates, plan: Plan) -> list[str]:
     other = float(np.hypot(found.chances.lateral_mm[row[0]], found.chances.depth_mm[row[0]]))
     if not abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
         return []
-    return [
-        f"    as the arm stands in the table and in check {other:.2f} mm: an approach may end in another configuration"
-    ]
+    return [f"    in the configuration of the table and of check {other:.2f} mm: an approach may end in another one"]
 
 
 def _other_aim(run: Run) -> list[str]:

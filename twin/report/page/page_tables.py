@@ -136,7 +136,7 @@ def counts_table(candidates: Candidates) -> Markup:
 
 
 TRE_TEXT = "expected TRE at the target (rms), markers alone"
-TIP_ERROR_TEXT = "expected tip error (rms), as the arm stands in the plan"
+TIP_ERROR_TEXT = "expected tip error (rms), in the plan's configuration of the arm"
 """Of the registration, and of the whole insertion with the arm's declared errors."""
 
 
