@@ -36,7 +36,7 @@ def _touches(found):
         Row.at_most("speed when felt, largest, mm/s", max(one.speed_mm_s for one in touches), 2.0),
         Row.at_most("force on the needle, largest, N", max(one.force_n for one in touches), 2.0),
         Row("seconds a touch, home to home", f"{seconds:.1f}", "", True),
-        Row("expected error at the target, best poses, mm", f"{found[0].plan.expected_mm:.3f}", "", True),
+        Row("expected tip error, best poses, mm", f"{found[0].plan.expected_mm:.3f}", "", True),
         Row("the same, worst poses, mm", f"{found[0].plan.worst_mm:.3f}", "", True),
     ]
 

@@ -69,7 +69,7 @@ class Squareness:
         first, second = self.axes
         return (
             f"the CT's frame looks {np.degrees(self.angle):.1f} degrees out of square, {first} against {second} "
-            f"(F test, p {self.probability:.2g}); without it the expected error at the target would be about "
+            f"(F test, p {self.probability:.2g}); without it the expected TRE at the target would be about "
             f"{self.rms_square_mm:.1f} mm instead of {self.rms_mm:.1f}; the registration does not use this"
         )
 

@@ -60,7 +60,7 @@ def _calibration(facts: Facts) -> list[str]:
         "calibration: residuals {residual_rms_mm:.3f} mm rms, {iterations} iterations, "
         "condition {condition:.1e}".format(**facts),
         f"  {noise}",
-        f"  expected error at the tip (rms, {counted(facts)}) {facts['predicted_tre_mm']:.3f} mm",
+        f"  expected tip error (rms, {counted(facts)}) {facts['predicted_tre_mm']:.3f} mm",
         f"  tip in the flange's frame ({', '.join(f'{x:.2f}' for x in facts['tip_end2_mm'])}) mm",
     ]
     if facts["arms"] is not None:
