@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import fcl
-
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies.body import Body
 from puncture_twin.planning.collision.bodies.shapes import touch
+from puncture_twin.planning.collision.bodies.solid import Solid
 from puncture_twin.planning.collision.patient import FclPatient
 from puncture_twin.planning.collision.state_checker import Contact
 
@@ -18,9 +17,9 @@ class Check(NamedTuple):
 
     contact: Contact
     """What it means if they do."""
-    first: fcl.CollisionObject | FclPatient
+    first: Solid | FclPatient
     """The patient, a box, or a piece of a body."""
-    second: fcl.CollisionObject
+    second: Solid
     first_body: Body | None
     """The body that ``first`` moves with; None for skin and boxes."""
     second_body: Body
@@ -29,15 +28,15 @@ class Check(NamedTuple):
 
     def contact_at(self, frames: Floats) -> Contact | None:
         """The contact, if the two shapes touch where ``link_poses`` (7, 4, 4) has them; see `contact_found`."""
-        self.second.setTransform(self.second_body.pose(frames))
+        self.second.place(self.second_body.pose(frames))
         if self.first_body is not None:
             assert not isinstance(self.first, FclPatient)  # it belongs to no body
-            self.first.setTransform(self.first_body.pose(frames))
+            self.first.place(self.first_body.pose(frames))
         return self.contact_found()
 
     def contact_found(self) -> Contact | None:
         """The contact, if the two shapes touch where they are: ``outside_body`` where that is all of the patient."""
         if not isinstance(self.first, FclPatient):
-            return self.contact if touch(self.first, self.second) else None
+            return self.contact if touch(self.first.made, self.second.made) else None
         part = self.first.touched_part(self.second_body)
         return None if part is None else self.contact._replace(other=part)

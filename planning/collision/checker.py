@@ -10,7 +10,7 @@ surface counts (``patient_closed``). What is loose (a block of the table) could 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence, Set
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations, product
 
 import fcl
@@ -27,6 +27,7 @@ from puncture_twin.planning.collision.base_place import refuse_base_in
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.body import BODY_NAMES, NEVER_TESTED, NEVER_TOUCHING, Body
 from puncture_twin.planning.collision.bodies.shapes import surface
+from puncture_twin.planning.collision.bodies.solid import Solid
 from puncture_twin.planning.collision.check import Check
 from puncture_twin.planning.collision.hanging import check_hanging
 from puncture_twin.planning.collision.neighbours import joined_pieces
@@ -216,10 +217,10 @@ class CellChecker:
         return {body.name: bounds[:, body.frame - 1] for body in self._bodies[1:]}
 
     @cached_property
-    def _whole(self) -> fcl.CollisionObject:
+    def _whole(self) -> Solid:
         """The patient in one tree, for distances."""
         assert self._surface is not None
-        return fcl.CollisionObject(surface(self._surface))
+        return Solid(partial(surface, self._surface))
 
     def _workcell_checks(self) -> Iterator[Check]:
         """Every moving body against the patient, then the boxes."""
@@ -250,13 +251,11 @@ class CellChecker:
             body.place(poses)
 
 
-def _nearest(
-    bodies: Sequence[Body], others: Mapping[str, fcl.CollisionObject], bounds: Mapping[str, Floats]
-) -> Nearest:
+def _nearest(bodies: Sequence[Body], others: Mapping[str, Solid], bounds: Mapping[str, Floats]) -> Nearest:
     """The closest pair; pairs whose spheres cannot beat the best so far are passed over."""
     pairs = []
     for body in bodies:
-        centre = np.asarray(body.bare.surface.getTranslation())
+        centre = np.asarray(body.bare.surface.pose.getTranslation())
         for name, other in others.items():
             low, high = bounds[name]
             gap = float(np.linalg.norm(np.maximum(0.0, np.maximum(low - centre, centre - high))))
@@ -266,18 +265,16 @@ def _nearest(
         if at_least >= best.mm:
             break
         shapes = (body.bare.surface,) if name == PATIENT else body.bare.solids
-        mm = min(fcl.distance(other, shape, fcl.DistanceRequest(), fcl.DistanceResult()) for shape in shapes)
+        mm = min(fcl.distance(other.made, shape.made, fcl.DistanceRequest(), fcl.DistanceResult()) for shape in shapes)
         best = min(best, Nearest(max(0.0, float(mm)), body.name, name))  # FCL says -1 for contact
     return best
 
 
-def _boxes(boxes: Sequence[Box], taken: Set[str]) -> dict[str, fcl.CollisionObject]:
+def _boxes(boxes: Sequence[Box], taken: Set[str]) -> dict[str, Solid]:
     names = [box.name for box in boxes]
     if len(set(names)) < len(names) or set(names) & taken:
         raise InputError(f"box names {names}", where="cell", allowed="each once, and none a body's or the patient's")
     return {
-        box.name: fcl.CollisionObject(
-            fcl.Box(*box.size_mm), fcl.Transform(box.T_base_box[:3, :3], box.T_base_box[:3, 3])
-        )
+        box.name: Solid(partial(fcl.Box, *box.size_mm), fcl.Transform(box.T_base_box[:3, :3], box.T_base_box[:3, 3]))
         for box in boxes
     }

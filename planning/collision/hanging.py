@@ -33,8 +33,8 @@ def check_hanging(tool: ToolBody, bodies: Sequence[Body]) -> None:
     hanging: list[fcl.CollisionObject] = []
     for body in carriers:
         for solid in body.bare.solids:
-            solid.setTransform(fcl.Transform(body.T_frame_body[:3, :3], body.T_frame_body[:3, 3]))
-            hanging.append(solid)
+            solid.place(fcl.Transform(body.T_frame_body[:3, :3], body.T_frame_body[:3, 3]))
+            hanging.append(solid.made)
     while hanging and free:
         one = hanging.pop()
         hanging += [piece for piece in free if touch(one, piece)]

@@ -13,6 +13,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.body import Body
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.collision.bodies.solid import Solid
 from puncture_twin.planning.collision.loose_parts import LooseParts, within
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.kd_order import kd_order
@@ -47,16 +48,16 @@ class FclSkin:
             raise InputError(what, where=name, allowed="a checked mesh")
         self._mesh = mesh
 
-    def touches(self, solid: fcl.CollisionObject, box: Floats) -> bool:
+    def touches(self, solid: Solid, box: Floats) -> bool:
         """Whether a body touches the surface where it stands.
 
         Args:
             solid: The body.
             box: Shape (2, 3), mm: lowest and highest corner of a box about it, in its own frame.
         """
-        low, high = _bounds_at(solid, box)
+        low, high = _bounds_at(solid.pose, box)
         near = np.all((self._bounds[:, 1] >= low) & (self._bounds[:, 0] <= high), axis=1)
-        return any(touch(self._tree(part), solid) for part in np.flatnonzero(near).tolist())
+        return any(touch(self._tree(part), solid.made) for part in np.flatnonzero(near).tolist())
 
     def collides_with(self, body: Body) -> bool:
         """Whether a body touches the surface where it stands, or has a part of it within."""
@@ -73,8 +74,8 @@ class FclSkin:
         if not body.hollow:
             return False
         small = self._loose.no_larger_than(float(np.linalg.norm(body.box[1] - body.box[0])))
-        solid = body.full.surface
-        points = (small.corners - solid.getTranslation()) @ solid.getRotation()
+        pose = body.full.surface.pose
+        points = (small.corners - pose.getTranslation()) @ pose.getRotation()
         near = np.all((points >= body.box[0]) & (points <= body.box[1]), axis=1)
         return bool(near.any()) and bool(within(points[near], body.half_spaces).any())
 
@@ -119,9 +120,9 @@ class FclPatient(NamedTuple):
         return OUTSIDE_BODY if self.outside is not None and self.outside.collides_with(body) else None
 
 
-def _bounds_at(solid: fcl.CollisionObject, box: Floats) -> tuple[Floats, Floats]:
+def _bounds_at(pose: fcl.Transform, box: Floats) -> tuple[Floats, Floats]:
     """Lowest and highest corner (3,) of a box about a body's own box where the body stands."""
-    R = solid.getRotation()
-    centre = R @ (0.5 * (box[0] + box[1])) + solid.getTranslation()
+    R = pose.getRotation()
+    centre = R @ (0.5 * (box[0] + box[1])) + pose.getTranslation()
     reach = np.abs(R) @ (0.5 * (box[1] - box[0])) + ROUNDING_MM
     return centre - reach, centre + reach

@@ -335,8 +335,8 @@ def test_the_bound_on_the_distance_to_the_skin_is_below_it() -> None:
             gap = skin_gap(packed.skin, packed.spheres, rows[body.name][2], T, 12.0, 200.0, 1e-3, *stacks)
             T_body, mm = T @ body.T_frame_body, np.inf
             for solid in body.full.solids:
-                solid.setTransform(fcl.Transform(T_body[:3, :3], T_body[:3, 3]))
-                mm = min(mm, fcl.distance(skin, solid, fcl.DistanceRequest(), fcl.DistanceResult()))
+                solid.place(fcl.Transform(T_body[:3, :3], T_body[:3, 3]))
+                mm = min(mm, fcl.distance(skin, solid.made, fcl.DistanceRequest(), fcl.DistanceResult()))
             assert gap <= max(mm, 1e-3) + 1e-6
             by_field += 12.0 < gap < 0.9 * mm - 5.0
             near += 1e-3 < gap < 12.0
@@ -530,8 +530,8 @@ def test_pieces_that_are_never_asked_about_never_touch() -> None:
             assert check.first_body is not None
             assert check.second_body.frame - check.first_body.frame == 2
             for item, body in ((check.first, check.first_body), (check.second, check.second_body)):
-                item.setTransform(body.pose(poses))
-            assert fcl.distance(check.first, check.second, fcl.DistanceRequest(), fcl.DistanceResult()) > 0.0
+                item.place(body.pose(poses))
+            assert fcl.distance(check.first.made, check.second.made, fcl.DistanceRequest(), fcl.DistanceResult()) > 0.0
     assert len(slow._checks) == len(fast._checks)
 
 

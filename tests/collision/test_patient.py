@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import fcl
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.collision.bodies.solid import Solid
 from puncture_twin.planning.collision.checker import BODY_NAMES, CellChecker, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.loose_parts import LooseParts
@@ -30,15 +33,15 @@ def ball(subdivisions: int) -> TriangleMesh:
     return TriangleMesh(np.asarray(sphere.vertices), np.asarray(sphere.faces))
 
 
-def bodies() -> list[tuple[fcl.CollisionObject, np.ndarray]]:
+def bodies() -> list[tuple[Solid, np.ndarray]]:
     """A cylinder, a box and a surface, each with a box about it."""
     box = trimesh.creation.box((30.0, 20.0, 60.0))
     mesh = TriangleMesh(np.asarray(box.vertices), np.asarray(box.faces))
     about = np.array([[-15.0, -10.0, -30.0], [15.0, 10.0, 30.0]])
     return [
-        (fcl.CollisionObject(fcl.Cylinder(5.0, 80.0)), np.array([[-5.0, -5.0, -40.0], [5.0, 5.0, 40.0]])),
-        (fcl.CollisionObject(fcl.Box(30.0, 20.0, 60.0)), about),
-        (fcl.CollisionObject(surface(mesh)), about),
+        (Solid(partial(fcl.Cylinder, 5.0, 80.0)), np.array([[-5.0, -5.0, -40.0], [5.0, 5.0, 40.0]])),
+        (Solid(partial(fcl.Box, 30.0, 20.0, 60.0)), about),
+        (Solid(partial(surface, mesh)), about),
     ]
 
 
@@ -51,8 +54,8 @@ def test_the_parts_touch_what_the_whole_touches(rng) -> None:
         for _ in range(300):
             at = rng.normal(size=3)
             turn, along = exp_rotation(rng.normal(size=3)), at / np.linalg.norm(at) * rng.uniform(50.0, 150.0)
-            solid.setTransform(fcl.Transform(turn, along))
-            told.append((parts.touches(solid, box), touch(whole, solid)))
+            solid.place(fcl.Transform(turn, along))
+            told.append((parts.touches(solid, box), touch(whole, solid.made)))
     mine, oracle = np.array(told).T
     assert (mine == oracle).all()
     assert 100 < oracle.sum() < 800
@@ -63,19 +66,19 @@ def test_a_body_just_at_the_edge_of_a_part_is_asked_about() -> None:
     wall = TriangleMesh(
         np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, 50.0, 0.0]]), np.array([[0, 1, 2]], np.int32)
     )
-    solid, half = fcl.CollisionObject(fcl.Box(10.0, 10.0, 10.0)), np.full(3, 5.0)
+    solid, half = Solid(partial(fcl.Box, 10.0, 10.0, 10.0)), np.full(3, 5.0)
     for gap, expected in ((0.0, True), (-1e-9, True), (1e-3, False)):
-        solid.setTransform(fcl.Transform(np.eye(3), np.array([10.0, 10.0, 5.0 + gap])))
+        solid.place(fcl.Transform(np.eye(3), np.array([10.0, 10.0, 5.0 + gap])))
         assert FclSkin(wall, "wall").touches(solid, np.array([-half, half])) is expected
 
 
 def test_only_parts_that_a_body_comes_near_are_built() -> None:
-    """Far away none; at the surface one or a few."""
+    """Far away none, nor the body; at the surface one or a few."""
     parts = FclSkin(ball(6), "ball")
     solid, box = bodies()[0]
-    solid.setTransform(fcl.Transform(np.eye(3), np.array([0.0, 0.0, 400.0])))
-    assert not parts.touches(solid, box) and not parts._trees
-    solid.setTransform(fcl.Transform(np.eye(3), np.array([0.0, 0.0, 100.0])))
+    solid.place(fcl.Transform(np.eye(3), np.array([0.0, 0.0, 400.0])))
+    assert not parts.touches(solid, box) and not parts._trees and "made" not in vars(solid)
+    solid.place(fcl.Transform(np.eye(3), np.array([0.0, 0.0, 100.0])))
     assert parts.touches(solid, box) and 0 < len(parts._trees) < len(parts._parts)
 
 

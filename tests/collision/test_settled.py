@@ -95,8 +95,8 @@ def test_a_round_body_is_settled_as_fcl_settles_it() -> None:
         axis, end = frames[body.frame, :3, 2], (body.T_frame_body[:3, 3] @ [0.0, 0.0, 1.0])
         off = rng.choice([body.radius_mm, body.radius_mm + 6.0, 20.0])
         frames[body.frame, :3, 3] = at - axis * (end + off) + rng.normal(size=3) * rng.choice([0.3, 3.0, 40.0])
-        body.full.surface.setTransform(body.pose(frames))
-        on_it, beside = (touch(tree, body.full.surface) for tree in trees)
+        body.full.surface.place(body.pose(frames))
+        on_it, beside = (touch(tree, body.full.surface.made) for tree in trees)
         answer = on_skin(scene.skin, scene.hulls, hull, frames[body.frame], room)
         met[answer] += 1
         expected = TOUCHES if on_it else TOUCHES_OUTSIDE if beside else CLEAR

@@ -13,6 +13,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.links import LINK_NAMES
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.collision.bodies.solid import Solid
 from puncture_twin.planning.collision.loose_parts import half_spaces
 from puncture_twin.planning.geometry.mesh import box_of
 
@@ -52,8 +53,8 @@ NEVER_TOUCHING: Mapping[tuple[str, str], str] = MappingProxyType(
 class Shape(NamedTuple):
     """A body for FCL: solid convex pieces, and one surface for the test against the skin."""
 
-    solids: tuple[fcl.CollisionObject, ...]
-    surface: fcl.CollisionObject
+    solids: tuple[Solid, ...]
+    surface: Solid
     hulls: tuple[Floats, ...]
     """For each solid, corners (n, 3), mm, of a convex hull that contains it, in the frame of the shapes."""
 
@@ -103,4 +104,4 @@ class Body:
         transform = self.pose(poses)
         for shape in (self.bare,) if self.full is self.bare else (self.bare, self.full):
             for item in (*shape.solids, shape.surface):
-                item.setTransform(transform)
+                item.place(transform)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import fcl
+from functools import partial
+
 import numpy as np
 
 from puncture_twin.planning.arm.links import Link, joined
 from puncture_twin.planning.collision.bodies.body import Body, Shape
 from puncture_twin.planning.collision.bodies.shapes import convex, surface
+from puncture_twin.planning.collision.bodies.solid import Solid
 
 
 def link_body(link: Link, grown: Link) -> Body:
@@ -19,7 +21,6 @@ def link_body(link: Link, grown: Link) -> Body:
 
 
 def _link_shape(link: Link) -> Shape:
-    whole = surface(joined(link.pieces))
-    solids = tuple(fcl.CollisionObject(convex(piece)) for piece in link.pieces)
+    solids = tuple(Solid(partial(convex, piece)) for piece in link.pieces)
     hulls = tuple(np.asarray(piece.vertices) for piece in link.pieces)
-    return Shape(solids, fcl.CollisionObject(whole), hulls)
+    return Shape(solids, Solid(lambda: surface(joined(link.pieces))), hulls)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import fcl
 import numpy as np
 
 from puncture_twin.planning.collision.bodies.body import FLANGE_FRAME, Body, Shape
 from puncture_twin.planning.collision.bodies.prisms import prism
+from puncture_twin.planning.collision.bodies.solid import Solid
 from puncture_twin.planning.geometry.rigid import pose
 
 
@@ -21,5 +24,5 @@ def round_body(name: str, diameter_mm: float, span_mm: tuple[float, float], padd
 
 
 def _cylinder(radius_mm: float, length_mm: float) -> Shape:
-    solid = fcl.CollisionObject(fcl.Cylinder(radius_mm, length_mm))
+    solid = Solid(partial(fcl.Cylinder, radius_mm, length_mm))
     return Shape((solid,), solid, (prism(radius_mm, length_mm),))

@@ -102,7 +102,7 @@ def test_clearance_is_kept(case, room, candidates):
     for q_probe, q_needle in zip(candidates.q_probe[:6], candidates.q_needle[:6], strict=True):
         assert between.apart(q_probe, q_needle)
         pieces = [
-            [piece for body in bodies for piece in body.bare.solids]
+            [piece.made for body in bodies for piece in body.bare.solids]
             for bodies in (between.probe_bodies, between.needle_bodies)
         ]
         least = min(fcl.distance(a, b) for a, b in product(*pieces))

@@ -8,7 +8,7 @@ Everything stands where the *drawing* has it; the clearance covers what the trut
 from __future__ import annotations
 
 from enum import StrEnum
-from functools import cache
+from functools import cache, partial
 from itertools import product
 
 import fcl
@@ -22,6 +22,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.body import Body, Shape
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.collision.bodies.solid import Solid
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -110,7 +111,7 @@ class TwoArms:
             return False
         self._between.place_probe(q)
         *links, head = self._between.probe_bodies
-        if touch(head.bare.surface, self._phantom) or touch(head.full.surface, self._table):
+        if touch(head.bare.surface.made, self._phantom) or touch(head.full.surface.made, self._table):
             return False
         return not any(_meet(head, link) for link in links[:FAR_LINKS])
 
@@ -133,11 +134,11 @@ class TwoArms:
 
 def _meet(first: Body, second: Body) -> bool:
     """Whether ``first``, with its clearance, touches ``second``; balls first."""
-    apart = np.linalg.norm(first.full.surface.getTranslation() - second.bare.surface.getTranslation())
+    apart = np.linalg.norm(first.full.surface.pose.getTranslation() - second.bare.surface.pose.getTranslation())
     reach = max(float(np.linalg.norm(hull, axis=1).max()) for hull in first.full.hulls)
     if apart > reach + second.radius_mm:
         return False
-    return any(touch(a, b) for a, b in product(first.full.solids, second.bare.solids))
+    return any(touch(a.made, b.made) for a, b in product(first.full.solids, second.bare.solids))
 
 
 def probe_tool(case: SelfcalCase) -> Tool:
@@ -168,7 +169,7 @@ def _head_body(case: SelfcalCase, T_end1_image: Floats, clearance_mm: float) -> 
 
 
 def _cuboid(size: Floats) -> Shape:
-    solid = fcl.CollisionObject(fcl.Box(*size))
+    solid = Solid(partial(fcl.Box, *size))
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * size
     return Shape((solid,), solid, (corners,))
 
