@@ -90,8 +90,10 @@ class TriangleMesh:
     @cached_property
     def digest(self) -> str:
         """Hexadecimal SHA-256 of its vertices and faces: two meshes of one digest are the same to the bit."""
-        shape = f"{self.vertices.shape} {self.faces.shape} ".encode()
-        return hashlib.sha256(shape + self.vertices.tobytes() + self.faces.tobytes()).hexdigest()
+        digest = hashlib.sha256(f"{self.vertices.shape} {self.faces.shape} ".encode())
+        digest.update(self.vertices.data)
+        digest.update(self.faces.data)
+        return digest.hexdigest()
 
     @property
     def nbytes(self) -> int:

@@ -106,7 +106,7 @@ SPOILS = {
     "digest": lambda content: flipped(content, 30),
     "header": lambda content: flipped(content, 60),
     "last bit": lambda content: flipped(content, -1),
-    "a later layout": lambda content: content.replace(b"arrays 2", b"arrays 3"),
+    "a later layout": lambda content: content.replace(b"arrays 3", b"arrays 4"),
 }
 
 
