@@ -55,9 +55,7 @@ class FclSkin:
             solid: The body.
             box: Shape (2, 3), mm: lowest and highest corner of a box about it, in its own frame.
         """
-        low, high = _bounds_at(solid.pose, box)
-        near = np.all((self._bounds[:, 1] >= low) & (self._bounds[:, 0] <= high), axis=1)
-        return any(touch(self._tree(part), solid.made) for part in np.flatnonzero(near).tolist())
+        return any(touch(self._tree(part), solid.made) for part in self._near(solid.pose, box))
 
     def collides_with(self, body: Body) -> bool:
         """Whether a body touches the surface where it stands, or has a part of it within."""
@@ -71,13 +69,20 @@ class FclSkin:
         Args:
             body: One that :meth:`touches` has found to touch nothing.
         """
-        if not body.hollow:
+        pose = body.full.surface.pose
+        if not body.hollow or not self._near(pose, body.box):
             return False
         small = self._loose.no_larger_than(float(np.linalg.norm(body.box[1] - body.box[0])))
-        pose = body.full.surface.pose
         points = (small.corners - pose.getTranslation()) @ pose.getRotation()
         near = np.all((points >= body.box[0]) & (points <= body.box[1]), axis=1)
         return bool(near.any()) and bool(within(points[near], body.half_spaces).any())
+
+    def _near(self, pose: fcl.Transform, box: Floats) -> list[int]:
+        """The parts that a box about a body, in the body's frame, may meet where the body stands."""
+        low, high = _bounds_at(pose, box)
+        near = np.all((self._bounds[:, 1] >= low) & (self._bounds[:, 0] <= high), axis=1)
+        found: list[int] = np.flatnonzero(near).tolist()
+        return found
 
     @cached_property
     def _loose(self) -> LooseParts:
