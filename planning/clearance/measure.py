@@ -55,8 +55,8 @@ def measure(
     """
     lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), len(structures))
     axes = engine.measure(target_ct, outward_ct, lengths) if axes is None else axes
-    distance, depth = axes.distance.copy(), axes.depth.copy()
-    violated = np.zeros(distance.shape, bool)
+    distance, depth = axes.distance.copy(order="K"), axes.depth.copy(order="K")  # a structure's row by row, as a rule
+    violated = np.zeros_like(distance, bool)
     for column, structure in enumerate(structures):
         if holds(structure.mesh, target_ct):
             distance[:, column] = depth[:, column] = 0.0
