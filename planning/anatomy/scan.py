@@ -172,7 +172,8 @@ class Scan:
         T = np.linalg.inv(self._ct.T_ct_index)
         at = np.einsum("ij,nj->ni", T[:3, :3], points_ct) + T[:3, 3]  # on one core: several wait for a busy one
         index = np.round(at).astype(np.int64)
-        inside = np.all((index >= 0) & (index < self._hu.shape), axis=1)
+        within = [(column >= 0) & (column < size) for column, size in zip(index.T, self._hu.shape, strict=True)]
+        inside = within[0] & within[1] & within[2]  # one by one: numpy is slow with axis=1
         found = np.full(len(points_ct), np.nan)
         found[inside] = self._hu[tuple(index[inside].T)]
         return found

@@ -117,8 +117,8 @@ class TriangleMesh:
 
 
 def box_of(points: Floats) -> NDArray[np.float64]:
-    """Lowest and highest corner of the axis-aligned box about points (n, 3), shape (2, 3)."""
-    columns = [points[:, axis] for axis in range(3)]  # one by one: numpy is five times slower with axis=0
+    """Lowest and highest corner of the axis-aligned box about points (n, d), shape (2, d)."""
+    columns = points.T  # one by one: numpy is five times slower with axis=0
     return np.array([[column.min() for column in columns], [column.max() for column in columns]])
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.frames import frame_along
+from puncture_twin.planning.geometry.mesh import box_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,13 +86,13 @@ def camera_around(points_ct: Floats, toward: Floats, up: Floats, *, fov: float, 
     """
     points = np.asarray(points_ct, dtype=float)
     toward = np.asarray(toward, dtype=float) / np.linalg.norm(toward)
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    centre = box_of(points).sum(axis=0) / 2
     axes = ViewCamera(centre - toward, centre, up, fov, width, height).axes
     for _ in range(3):  # centring shifts the perspective a little; three rounds leave less than a pixel
         local = (points - centre) @ axes.T
         slope = np.tan(fov / 2) / SPARE * np.array([width / height, 1.0])
         distance = float(np.max(np.abs(local[:, :2]) / slope - local[:, 2:]))
         seen = local[:, :2] / (local[:, 2:] + distance)
-        middle = (seen.min(axis=0) + seen.max(axis=0)) / 2 * distance
+        middle = box_of(seen).sum(axis=0) / 2 * distance
         centre = centre + middle @ axes[:2]
     return ViewCamera(centre - distance * toward, centre, np.asarray(up, dtype=float), fov, width, height)
