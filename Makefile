@@ -12,7 +12,7 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test quick durations fuzz kill kill-batch lint mutants install reinstall docs pictures meshes clean
+.PHONY: demo test quick durations fuzz kill kill-batch lint mutants install reinstall wheel docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -63,6 +63,10 @@ reinstall:
 	@command -v chromium chromium-browser google-chrome >/dev/null || $(BIN)/playwright install chromium || \
 	  echo "no browser: the page's tests in one will skip"
 	cat pyproject.toml constraints.txt > $(VENV)/installed
+
+# In out/wheels, some minutes: one for every machine, and one for this Python on Linux x86-64 that brings machine code.
+wheel: install
+	$(BIN)/python -m wheels.build --out out/wheels
 
 # The pages and the API reference, as a site in out/site.
 docs: install

@@ -2,40 +2,11 @@
 
 import os
 import pickle
-import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-
-import puncture_twin
-
-BASE = "planning/base"
-COPIED = (
-    *("__init__.py", "planning/__init__.py", f"{BASE}/__init__.py", f"{BASE}/errors.py", f"{BASE}/numba_kernels.py"),
-    *(f"{BASE}/cache/{name}.py" for name in ("__init__", "kernel_cache", "kernel_files", "source_stamp", "entry_file")),
-)
-"""What a project needs to keep its kernels as ours does."""
-
-CALLEE = (
-    "from puncture_twin.planning.base.numba_kernels import nb\nfrom puncture_twin.planning.size import SIZE\n\n"
-    "@nb.njit(cache=True, forceinline=True)\ndef rule(x):\n    return x + {} * SIZE\n"
-)
-CALLER = (
-    "from puncture_twin.planning.base.numba_kernels import nb\nfrom puncture_twin.planning.callee import rule\n\n"
-    "@nb.njit(cache=True)\ndef add(x):\n    return rule(x)\n"
-)
-
-
-def copy_package(project):
-    """The package with what it needs to keep its kernels, and nothing else."""
-    for name in COPIED:
-        copy = project / "puncture_twin" / name
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(Path(puncture_twin.__file__).parent / name, copy)
-        if name.endswith("__init__.py"):
-            copy.write_text("")  # what a room hands on is not there
+from kernel_world import CALLEE, CALLER, copy_package, write_kernels
 
 
 def _run(project, own=True):
@@ -65,10 +36,7 @@ def _answer(project, own=True):
 def project(tmp_path):
     """A project with a kernel that takes in another."""
     copy_package(tmp_path)
-    folder = tmp_path / "puncture_twin" / "planning"
-    (folder / "caller.py").write_text(CALLER)
-    (folder / "size.py").write_text("SIZE = 1\n")
-    (folder / "callee.py").write_text(CALLEE.format(1))
+    write_kernels(tmp_path)
     return tmp_path
 
 

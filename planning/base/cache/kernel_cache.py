@@ -5,7 +5,7 @@ kernel would be reused after an edit of that file alone, and a search would go o
 this project are stamped with the sources of all of them instead.
 
 The classes are numba's own places, tried in numba's own order; `CACHE_LOCATOR_CLASSES` is its setting for others'.
-Files outside the project are left to numba.
+Files outside the project are left to numba. What the package brings is looked up behind them.
 """
 
 # mypy: disable-error-code="no-untyped-call, misc"
@@ -19,7 +19,9 @@ from typing import Any
 
 from numba.core import config as numba_config
 from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
+from numba.core.codegen import get_host_cpu_features
 
+from puncture_twin.planning.base.cache.brought_kernels import BROUGHT, brought_class, brought_folder
 from puncture_twin.planning.base.cache.kernel_files import CheckedFiles, ProjectStamp, use_checked_files
 from puncture_twin.planning.base.cache.source_stamp import PACKAGE, PARTS, library_versions, sources_with, stamp_of
 
@@ -40,12 +42,12 @@ NUMBAS = (
 
 
 @cache
-def kernels_stamp() -> ProjectStamp:
+def kernels_stamp() -> str:
     """A hash of every source file of the project that speaks of numba, and of all that they import from the project.
 
     What they import counts too: numba freezes a constant into the kernel that names it. So do the compilers' versions.
     """
-    return ProjectStamp(f"{stamp_of(sources_with(b'numba'))} {library_versions(COMPILERS)}")
+    return f"{stamp_of(sources_with(b'numba'))} {library_versions(COMPILERS)}"
 
 
 @cache
@@ -56,12 +58,15 @@ def _ours(py_file: str) -> bool:
 class _OfTheProject:
     """Of two bases, the one that comes first: takes the project's files only, and stamps them with all kernels."""
 
+    _py_file: str
+
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
         return super().from_function(py_func, py_file) if _ours(py_file) else None
 
     def get_source_stamp(self) -> ProjectStamp:
-        return kernels_stamp()
+        brought = None if class_in_use() is None else brought_folder(Path(self._py_file))
+        return ProjectStamp(kernels_stamp(), brought)
 
 
 class SetFolder(_OfTheProject, UserProvidedCacheLocator):
@@ -82,6 +87,27 @@ def use_kernel_cache() -> None:
     theirs = config.CACHE_LOCATOR_CLASSES.split(",") if config.CACHE_LOCATOR_CLASSES else list(NUMBAS)
     use_checked_files()
     config.CACHE_LOCATOR_CLASSES = ",".join([*ours, *(place for place in theirs if place not in ours)])
+    name = class_in_use()
+    if name is not None:
+        config.CPU_NAME, config.CPU_FEATURES = name, ""  # no feature beyond those of the class
+
+
+@cache
+def class_in_use() -> str | None:
+    """The class of processors for which code is brought, and for which this process compiles; None: for its own.
+
+    What a user has told numba of the processor stays in force. Numba knows one processor for all that a process
+    compiles: kernels of others are made for that class too.
+    """
+    if not BROUGHT.is_dir() or config.CPU_NAME is not None or config.CPU_FEATURES is not None:
+        return None
+    return brought_class(kernels_stamp(), host_features())
+
+
+def host_features() -> frozenset[str]:
+    """What this processor can do, in LLVM's words, without what numba is told to leave out."""
+    words = get_host_cpu_features().split(",")
+    return frozenset(word.removeprefix("+") for word in words if word.startswith("+"))
 
 
 def is_compiled(kernel: Any) -> bool:

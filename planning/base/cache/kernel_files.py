@@ -17,7 +17,7 @@ import re
 import shutil
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba.core import caching
 
@@ -36,24 +36,38 @@ FUNCTION = re.compile(r"(?P<name>.*)-\d+\.py\w+\.checked")
 """A file's name without its ending: the function, its line, the Python version."""
 
 
-class ProjectStamp(str):
-    """Of the sources of all kernels of this project; numba's own stamps are of one file's age and size."""
+class ProjectStamp(NamedTuple):
+    """Of the sources of all kernels of this project; numba's own stamps are of one file's age and size.
 
-    __slots__ = ()
+    Attributes:
+        text: The stamp.
+        brought: Where the package may bring compiled code of the same function, under the same names of files.
+    """
+
+    text: str
+    brought: Path | None = None
 
 
 class CheckedFiles(NumbasFiles):
-    """The index and the data files of one function, each behind a digest."""
+    """The index and the data files of one function, each behind a digest.
+
+    They are written into the one place that numba has chosen, and read there and then in what the package brings.
+    """
 
     def __init__(self, cache_path: str, filename_base: str, source_stamp: ProjectStamp) -> None:
         super().__init__(cache_path=cache_path, filename_base=filename_base + OWN, source_stamp=source_stamp)
         self._folder = Path(cache_path)
+        self._folders = [self._folder, *([source_stamp.brought] if source_stamp.brought else [])]
         self._base = filename_base + OWN
 
     def load(self, key: Any) -> Any:
         """What was saved under a key, or None."""
-        name = self._load_index().get(key)
-        content = None if name is None else self._content(name)
+        found = (self._load_from(folder, key) for folder in self._folders)
+        return next((data for data in found if data is not None), None)
+
+    def _load_from(self, folder: Path, key: Any) -> Any:
+        name = self._load_index(folder).get(key)
+        content = None if name is None else self._content(folder / name)
         if content is None:
             return None
         stated, data = pickle.loads(content)
@@ -61,11 +75,11 @@ class CheckedFiles(NumbasFiles):
 
     def any_kept(self) -> bool:
         """Whether the function has been compiled for anything under today's sources."""
-        return bool(self._load_index(report=False))
+        return any(self._load_index(folder, report=False) for folder in self._folders)
 
     def save(self, key: Any, data: Any) -> None:
         """Save under a key; a folder that cannot be written to costs time, not the result."""
-        overloads = self._load_index(report=False)
+        overloads = self._load_index(self._folder, report=False)
         taken = set(overloads.values())
         free = (self._data_name(number) for number in itertools.count(1))
         name = overloads.get(key) or next(name for name in free if name not in taken)
@@ -76,31 +90,31 @@ class CheckedFiles(NumbasFiles):
         except OSError:
             return
 
-    def _load_index(self, *, report: bool = True) -> dict[Any, str]:
-        content = self._content(self._index_name, report=report)
+    def _load_index(self, folder: Path, *, report: bool = True) -> dict[Any, str]:
+        content = self._content(folder / self._index_name, report=report)
         return {} if content is None else pickle.loads(content)
 
     def _save_index(self, overloads: dict[Any, str]) -> None:
         self._write(self._index_name, self._dump(overloads))
 
-    def _content(self, name: str, *, report: bool = True) -> bytes | None:
+    def _content(self, file: Path, *, report: bool = True) -> bytes | None:
         """The content of a file, or None where it is not there, of other sources or, which is said, not whole."""
         try:
-            stored = read_plain_file(self._folder / name)
+            stored = read_plain_file(file)
         except FileNotFoundError:
             return None
         except DamagedError as error:
             _report(str(error), report)
             return None
         stamp, digest, content = _split(stored)
-        if digest != _digest(name, stamp, content):
+        if digest != _digest(file.name, stamp, content):
             _report("is cut, damaged, or another's", report)
             return None
         return content if stamp == self._stamp else None
 
     @property
     def _stamp(self) -> bytes:
-        return hashlib.sha256(str(self._source_stamp).encode()).digest()
+        return hashlib.sha256(self._source_stamp.text.encode()).digest()
 
     def _write(self, name: str, content: bytes) -> None:
         path = self._folder / name

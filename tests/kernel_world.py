@@ -1,0 +1,41 @@
+"""A small project that keeps its kernels as ours does: what is needed for that, and a kernel that takes in another."""
+
+import shutil
+from pathlib import Path
+
+import puncture_twin
+
+BASE = "planning/base"
+COPIED = (
+    *("__init__.py", "planning/__init__.py", f"{BASE}/__init__.py", f"{BASE}/errors.py", f"{BASE}/numba_kernels.py"),
+    *(f"{BASE}/cache/{name}.py" for name in ("__init__", "kernel_cache", "kernel_files", "brought_kernels")),
+    *(f"{BASE}/cache/{name}.py" for name in ("source_stamp", "entry_file")),
+)
+"""What a project needs to keep its kernels as ours does."""
+
+CALLEE = (
+    "from puncture_twin.planning.base.numba_kernels import nb\nfrom puncture_twin.planning.size import SIZE\n\n"
+    "@nb.njit(cache=True, forceinline=True)\ndef rule(x):\n    return x + {} * SIZE\n"
+)
+CALLER = (
+    "from puncture_twin.planning.base.numba_kernels import nb\nfrom puncture_twin.planning.callee import rule\n\n"
+    "@nb.njit(cache=True)\ndef add(x):\n    return rule(x)\n"
+)
+
+
+def copy_package(project):
+    """The package with what it needs to keep its kernels, and nothing else."""
+    for name in COPIED:
+        copy = project / "puncture_twin" / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(Path(puncture_twin.__file__).parent / name, copy)
+        if name.endswith("__init__.py"):
+            copy.write_text("")  # what a room hands on is not there
+
+
+def write_kernels(project):
+    """A kernel that takes in another, which names a constant of a third file."""
+    folder = project / "puncture_twin" / "planning"
+    (folder / "caller.py").write_text(CALLER)
+    (folder / "size.py").write_text("SIZE = 1\n")
+    (folder / "callee.py").write_text(CALLEE.format(1))
