@@ -190,6 +190,18 @@ def test_a_place_that_cannot_be_written_is_no_hindrance(project, tmp_path):
     assert list((tmp_path / "user").rglob("caller.*.nbc"))
 
 
+def test_no_place_that_can_be_written_is_no_hindrance_either(project, tmp_path):
+    """A read-only system and a user without a home: what is not brought is compiled each time."""
+    for path in (project / "puncture_twin" / "planning" / "__pycache__", tmp_path / "user"):
+        path.write_text("in its way")
+    settings = {"XDG_CACHE_HOME": str(tmp_path / "user")}
+    assert answer(project, **settings) == ("2", "1", PLAINEST)
+    brought(project, ".nbc").unlink()
+    for _ in range(2):
+        assert answer(project, **settings) == ("2", "0", PLAINEST)
+    assert kept(project) == []
+
+
 def test_two_processes_at_once(project):
     """Both load what is brought; what is missing both compile, or one finds what the other has just kept."""
     both = [begin(project, ANSWER) for _ in range(2)]

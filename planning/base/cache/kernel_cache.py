@@ -81,9 +81,19 @@ class UserFolder(_OfTheProject, UserWideCacheLocator):
     """In the user's cache folder, where the source's folder cannot be written."""
 
 
+class Nowhere(_OfTheProject, InTreeCacheLocator):
+    """Where no folder can be written: what is brought is found, and what is compiled is not kept.
+
+    Numba alone would end in an error, as for a user without a home on a file system that is read-only.
+    """
+
+    def ensure_cache_path(self) -> None:
+        """Whatever cannot be written is not."""
+
+
 def use_kernel_cache() -> None:
     """Let numba try these places first; a user's own setting stays in force behind them."""
-    ours = [f"{__name__}.{place.__name__}" for place in (SetFolder, BesideSource, UserFolder)]
+    ours = [f"{__name__}.{place.__name__}" for place in (SetFolder, BesideSource, UserFolder, Nowhere)]
     theirs = config.CACHE_LOCATOR_CLASSES.split(",") if config.CACHE_LOCATOR_CLASSES else list(NUMBAS)
     use_checked_files()
     config.CACHE_LOCATOR_CLASSES = ",".join([*ours, *(place for place in theirs if place not in ours)])
