@@ -66,7 +66,7 @@ reinstall:
 
 # In out/wheels, some minutes: one for every machine, and one for this Python on Linux x86-64 that brings machine code.
 wheel: install
-	$(BIN)/python -m wheels.build --out out/wheels
+	$(BIN)/python -m benchmarks.build_wheels --out out/wheels
 
 # The pages and the API reference, as a site in out/site.
 docs: install

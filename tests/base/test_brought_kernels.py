@@ -9,6 +9,7 @@ import pytest
 from base.test_kernel_cache import SPOILS
 from kernel_world import CALLEE, CALLER, copy_package, write_kernels
 
+from benchmarks.build_wheels import FIXED, STAMP, lay
 from puncture_twin.planning.base.cache.brought_kernels import (
     BROUGHT,
     CLASSES,
@@ -18,7 +19,6 @@ from puncture_twin.planning.base.cache.brought_kernels import (
     classes_of,
 )
 from puncture_twin.planning.base.cache.kernel_cache import COMPILERS, class_in_use, host_features
-from wheels.build import FIXED, STAMP, lay
 
 PLAINEST = list(CLASSES)[-1]
 OWN = "None"

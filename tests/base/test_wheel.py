@@ -10,9 +10,9 @@ import zipfile
 import pytest
 from base.test_brought_kernels import OWN, PLAINEST, begin, end, kept
 
+from benchmarks.build_wheels import build
 from puncture_twin.planning.base.cache.brought_kernels import BROUGHT, classes_of
 from puncture_twin.planning.base.cache.kernel_cache import host_features
-from wheels.build import build
 
 DRAW = """
 import numba, numpy as np

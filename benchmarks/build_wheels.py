@@ -1,4 +1,4 @@
-"""Build the wheel, and beside it one that brings machine code: ``python -m wheels.build --out DIR`` (``make wheel``).
+"""Build the wheel, and beside it one that brings machine code: ``make wheel``, or this with ``--out DIR``.
 
 The first is what ``pip wheel .`` builds, for every machine. The second is the same files, and what numba keeps of the
 kernels when commands run from it: once for each class of processors that this machine is of
@@ -21,6 +21,9 @@ from puncture_twin.planning.base.cache.brought_kernels import MADE_FOR, classes_
 from puncture_twin.planning.base.cache.kernel_cache import host_features
 
 ROOT = Path(__file__).resolve().parents[1]
+SOURCES = ("LICENSE", "README.md", "pyproject.toml", "run_twin.py", "meshes", "planning", "puncture_twin", "twin")
+"""What is installed, and what says how."""
+
 TAGS = f"--python-tag=cp{sys.version_info.major}{sys.version_info.minor}", "--platform-tag=linux_x86_64"
 FIXED = {"NUMBA_CPU_FEATURES": "", "NUMBA_DISABLE_INTEL_SVML": "1"}
 """For numba: nothing beyond what the class can do, and no library that another machine may lack."""
@@ -50,17 +53,24 @@ def build(out: Path, commands: Sequence[Words], classes: Sequence[str]) -> list[
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
-        wheels = [pure_wheel(work / "plain")]
+        wheels = [pure_wheel(work)]
         if classes:
             wheels.append(with_code(wheels[0], classes, commands, work))
         return [Path(shutil.copy(wheel, out)) for wheel in wheels]
 
 
-def pure_wheel(folder: Path) -> Path:
-    """What pip builds of this checkout, without what an earlier build has left."""
-    shutil.rmtree(ROOT / "build", ignore_errors=True)
-    run("-m", "pip", "wheel", str(ROOT), "--quiet", "--no-deps", "--wheel-dir", str(folder))
-    (wheel,) = folder.glob("*.whl")
+def pure_wheel(work: Path) -> Path:
+    """What pip builds of this checkout: of a copy, beside which other work may go on."""
+    sources = work / "sources"
+    sources.mkdir()
+    for name in SOURCES:
+        if (ROOT / name).is_dir():
+            unkept = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(ROOT / name, sources / name, symlinks=True, ignore=unkept)
+        else:
+            shutil.copy(ROOT / name, sources)
+    run("-m", "pip", "wheel", str(sources), "--quiet", "--no-deps", "--wheel-dir", str(work / "plain"))
+    (wheel,) = (work / "plain").glob("*.whl")
     return wheel
 
 
