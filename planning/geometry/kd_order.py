@@ -86,7 +86,7 @@ def _select(records, rows, sample, low, high, middle, axis):  # type: ignore[no-
         border = _part(records, rows, low, high, axis, pivot, False)
         if border == low:  # none lies below: those that equal the pivot come first
             border = _part(records, rows, low, high, axis, pivot, True)
-            if middle <= border:
+            if middle <= border or border == low:  # not a number equals nothing, and has no order
                 return
         if middle < border:
             high = border

@@ -46,3 +46,11 @@ def test_runs_are_compact(rng):
     points = rng.uniform(0, 1, (5000, 3))
     runs = points[kd_order(points, 16)][:4992].reshape(-1, 16, 3)
     assert np.median(np.ptp(runs, axis=1)) < 0.2
+
+
+def test_what_is_no_number_ends_too(rng):
+    """Callers refuse it; who did not would get some order, and not wait for ever."""
+    points = rng.uniform(0, 1, (3000, 3))
+    points[rng.uniform(0, 1, points.shape) < 0.3] = np.nan
+    for cloud in (points, np.full((100, 3), np.nan), np.full((100, 3), np.inf)):
+        np.testing.assert_array_equal(np.sort(kd_order(cloud, 16)), np.arange(len(cloud)))
