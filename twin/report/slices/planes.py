@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -42,7 +43,7 @@ class Plane:
     centre: Floats
     half_mm: float
 
-    @property
+    @cached_property
     def normal(self) -> Floats:
         """Toward the viewer, unit, shape (3,)."""
         return np.cross(self.right, self.up)
