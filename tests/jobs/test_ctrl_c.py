@@ -10,6 +10,7 @@ from kill_world import SELFCAL, coarse_cases
 from places import ROOT
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.base.output.manifest import MANIFEST_NAME, problems
 from puncture_twin.run_twin import app
 from puncture_twin.twin.jobs.exit_codes import INTERRUPTED
 
@@ -92,8 +93,13 @@ def typed(tmp_path_factory):
     }
 
 
+def is_whole(out):
+    """Whether a folder is there with all that its manifest lists."""
+    return (out / MANIFEST_NAME).exists() and not problems(out)
+
+
 def interrupted(seconds, arguments, out):
-    """A command that is interrupted after some seconds; after fewer, where it had ended by then."""
+    """A command that is interrupted after some seconds; after fewer where it, or its folder, was complete by then."""
     while True:
         done = subprocess.run(
             [sys.executable, "-c", PROGRAM % ENDED_BEFORE, str(seconds), *arguments],
@@ -102,7 +108,7 @@ def interrupted(seconds, arguments, out):
             cwd=ROOT,
             check=False,
         )
-        if done.returncode != ENDED_BEFORE:
+        if done.returncode != ENDED_BEFORE and not is_whole(out):
             return done
         shutil.rmtree(out, ignore_errors=True)
         seconds /= 2

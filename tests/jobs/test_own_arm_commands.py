@@ -157,7 +157,11 @@ BAD = [
         ["place"],
         "does not hang on wrist, holder",
     ),
-    (in_text("case.toml", "position_mm = [0, 0, 0]", "position_mm = [0, 0, nan]"), ["plan"], r"tool\.position_mm\.2"),
+    (
+        in_text("case.toml", "position_mm = [0, 0, 0]", "position_mm = [0, 0, nan]"),
+        ["plan"],
+        r"tool\.position_mm number 3",
+    ),
     (with_bytes("j.csv", (JOINTS + "1,2,3,4,5,6\n" * 4).encode()), ["pivot", "j.csv"], "pivot|j.csv"),
     (with_bytes("j.csv", (JOINTS + "0,-90,90,0,90,0\n10,-90,90,0,90,0,7\n").encode()), ["pivot", "j.csv"], "j.csv"),
     (with_bytes("j.csv", (JOINTS + "400,-9,9,0,9,0\n0,-9,9,0,9,0\n").encode()), ["pivot", "j.csv"], "j.csv"),
