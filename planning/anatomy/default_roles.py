@@ -436,9 +436,17 @@ def plain_name(name: str) -> str:
     return re.sub(r"[\W_]+", "_", spaced).strip("_").lower()
 
 
+def _matches(plain: str, pattern: str) -> bool:
+    """Whether a name is as a pattern of the table has it, in which ``*`` and ``?`` stand for something else.
+
+    Python compiles each pattern before it matches: hundreds, of which a name holds the words of a few.
+    """
+    return all(part in plain for part in pattern.replace("?", "*").split("*")) and fnmatchcase(plain, pattern)
+
+
 def _matching(plain: str, lines: tuple[DefaultRole, ...]) -> Iterator[tuple[float, DefaultRole]]:
     """How closely each line names a name, for those that do."""
     for line in lines:
-        close = [specificity(pattern, plain) for pattern in line.patterns if fnmatchcase(plain, pattern)]
+        close = [specificity(pattern, plain) for pattern in line.patterns if _matches(plain, pattern)]
         if close:
             yield max(close), line

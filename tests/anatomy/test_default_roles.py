@@ -7,6 +7,7 @@ from puncture_twin.planning.anatomy.default_roles import (
     BODY,
     BY_REGION,
     GENERAL,
+    LESION,
     UNKNOWN_NAME,
     default_role,
     never_crossed,
@@ -125,3 +126,14 @@ def test_the_page_shows_the_table():
         margin = f"{line.margin_mm:g}" if line.kind == "avoid" else ""
         assert f"| {line.kind} | {margin} | {line.reason} |" in page, line.group
         assert all(f"`{pattern}`" in page for pattern in line.patterns), line.group
+
+
+def test_each_pattern_of_the_table_finds_a_name_of_its_own():
+    """Names are looked through for the words between stars and question marks before Python compiles a pattern."""
+    missed = []
+    for region, lines in {"other": (*GENERAL, LESION), **BY_REGION}.items():
+        patterns = {pattern for line in lines for pattern in line.patterns}
+        assert not {sign for pattern in patterns for sign in pattern} & set("[]!")
+        names = {pattern: pattern.replace("*", "a").replace("?", "a") for pattern in patterns}
+        missed += [pattern for pattern, name in names.items() if default_role(name, region) is None]
+    assert missed == []
