@@ -139,6 +139,19 @@ def test_a_module_is_imported_to_its_end(tmp_path, monkeypatch):
     assert sys.modules.pop("half_imported").whole
 
 
+def test_a_program_that_is_itself_imported_can_be_interrupted(tmp_path, monkeypatch):
+    """What it was started from is not what it has entered."""
+    (tmp_path / "started_by_import.py").write_text(
+        "import signal, time\nfrom puncture_twin.twin.jobs.exit_codes import exit_code_of\n"
+        "def command():\n    signal.raise_signal(signal.SIGINT)\n    time.sleep(20)\n"
+        "began = time.monotonic()\ncode = exit_code_of(command, print)\nseconds = time.monotonic() - began\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    started = __import__("started_by_import")
+    assert started.code == INTERRUPTED and started.seconds < 10
+    del sys.modules["started_by_import"]
+
+
 def test_llvms_memory_is_freed_once(capfd):
     """Wherever Ctrl-C comes while a module is made and closed; broken there, the process ended with a signal."""
     places = []

@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -37,7 +38,7 @@ def insistent_ctrl_c() -> Iterator[None]:
         yield
         return
     alarm, unraisable = signal.getsignal(signal.SIGALRM), sys.unraisablehook
-    signal.signal(signal.SIGINT, _first)
+    signal.signal(signal.SIGINT, partial(_first, _unbreakable(sys._getframe())))
     try:
         yield
         raise_dropped()
@@ -72,22 +73,25 @@ def _is_on_its_way() -> bool:
     return signal.getitimer(signal.ITIMER_REAL)[1] > 0.0
 
 
-def _first(_: int, frame: FrameType | None) -> None:
-    """The signal: from now on what is dropped is a consequence of it, and not worth a traceback."""
+def _first(outside: int, _: int, frame: FrameType | None) -> None:
+    """The signal: from now on what is dropped is a consequence of it, and not worth a traceback.
+
+    It is put off within frames of `UNBREAKABLE` that the block has entered, beyond those that it was entered from.
+    """
     sys.unraisablehook = _silent
     signal.signal(signal.SIGALRM, _again)
     signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
-    if not _is_unbreakable(frame):
+    if _unbreakable(frame) <= outside:
         raise KeyboardInterrupt
 
 
-def _is_unbreakable(frame: FrameType | None) -> bool:
-    """Whether a frame, or one that led to it, is of `UNBREAKABLE`."""
+def _unbreakable(frame: FrameType | None) -> int:
+    """How many of a frame, and of those that led to it, are of `UNBREAKABLE`."""
+    count = 0
     while frame is not None:
-        if str(frame.f_globals.get("__name__")).partition(".")[0] in UNBREAKABLE:
-            return True
+        count += str(frame.f_globals.get("__name__")).partition(".")[0] in UNBREAKABLE
         frame = frame.f_back
-    return False
+    return count
 
 
 def _again(*_: object) -> None:
