@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -329,13 +330,23 @@ def reason_text(candidates: Candidates, row: int) -> str:
     return said
 
 
+def deep_text(clearance_mm: float) -> str:
+    """How deep a needle of a negative clearance is in what it crosses: at least, so rounded down, to 0.01 mm.
+
+    >>> deep_text(-0.5951), deep_text(-0.6), deep_text(-1e-9)
+    (', at least 0.59 mm deep', ', at least 0.6 mm deep', '')
+    """
+    deep_mm = math.floor(-100.0 * clearance_mm + 1e-9) / 100.0
+    return f", at least {deep_mm:g} mm deep" if deep_mm > 0.0 else ""
+
+
 def _amount_text(candidates: Candidates, row: int) -> str:
     """The number that fell short; a clearance ends at minus the radius, how much deeper an axis is nobody measures."""
     reason, amount = str(candidates.verdict.reason[row]), float(candidates.verdict.amount[row])
     margin = _margin(candidates, row) if reason == Reason.TOO_CLOSE.value else np.nan
     if reason not in UNITS and amount < 0:
         wanted = f"; {margin:g} mm clearance is demanded" if np.isfinite(margin) else ""
-        return f": the needle crosses it, at least {-amount:.2g} mm deep{wanted}"
+        return f": the needle crosses it{deep_text(amount)}{wanted}"
     wanted = f" where {margin:g} mm is demanded" if np.isfinite(margin) else ""
     return f" with {amount:.2f} {UNITS.get(reason, 'mm clearance')}{wanted}"
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from puncture_twin.planning.base.cache.entry_file import DamagedError, read_plain_file
 from puncture_twin.planning.base.cache.source_stamp import PACKAGE
 
 BROUGHT = PACKAGE / "machine_code"
@@ -42,8 +43,8 @@ def brought_class(stamp: str, features: frozenset[str], brought: Path = BROUGHT)
         brought: The folder of what the package brings.
     """
     try:
-        made_from, *made_for = (brought / MADE_FOR).read_text(encoding="utf-8").splitlines()
-    except (OSError, ValueError):
+        made_from, *made_for = read_plain_file(brought / MADE_FOR).decode("utf-8").splitlines()
+    except (FileNotFoundError, DamagedError, ValueError):
         return None
     return next((name for name in classes_of(features) if made_from == stamp and name in made_for), None)
 

@@ -10,7 +10,7 @@ import numpy as np
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import closest_miss
-from puncture_twin.planning.search.explain import needle_warnings, reason_text
+from puncture_twin.planning.search.explain import deep_text, needle_warnings, reason_text
 from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
 from puncture_twin.twin.jobs.patient.budget import budget_lines
 from puncture_twin.twin.jobs.patient.correction import correction_lines
@@ -134,7 +134,7 @@ def _rehearsal(run: Run) -> list[str]:
 
 def _true_needle(name: str, clearance_mm: float) -> str:
     if clearance_mm < 0:
-        return f"the true needle crosses what it must avoid: {name}, at least {-clearance_mm:.2g} mm deep"
+        return f"the true needle crosses what it must avoid: {name}{deep_text(clearance_mm)}"
     return f"least clearance of the true needle to what it must avoid: {clearance_mm:.2f} mm, {name}"
 
 
