@@ -90,6 +90,11 @@ def number(value: float, digits: int = 1, unit: str = "") -> str:
     return f"{text} {unit}" if unit else text
 
 
+def clearance_text(clearance_mm: float, unit: str = "") -> str:
+    """A clearance, or that the needle crosses the structure, of which a clearance below zero says too little."""
+    return "crossed" if clearance_mm < 0 else number(clearance_mm, 1, unit)
+
+
 def expected_text(error_mm: float) -> str:
     """An expected error (rms), or why there is none."""
     return number(error_mm, 2, "mm") if math.isfinite(error_mm) else "unknown (no markers)"

@@ -183,7 +183,7 @@ def _clearance(side: Side, name: str) -> str:
         return NOTHING
     digits = next(decimals(one) for one in side.explained.anatomy.checked if one.name == name)
     clearance = side.explained.clearances()[name]
-    return f"{clearance:.{digits}f}" if clearance >= 0 else "crossed"
+    return "crossed" if clearance < 0 else f"{clearance:.{digits}f}"
 
 
 def _shown(value: float, form: str) -> str:

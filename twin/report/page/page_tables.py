@@ -17,7 +17,15 @@ from puncture_twin.planning.base.reasons import Reason, css
 from puncture_twin.planning.plan.html import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
-from puncture_twin.twin.report.numbers import arm_text, expected_text, nearest_structure, number, percent, reason_counts
+from puncture_twin.twin.report.numbers import (
+    arm_text,
+    clearance_text,
+    expected_text,
+    nearest_structure,
+    number,
+    percent,
+    reason_counts,
+)
 
 PROJECT = "puncture-twin"
 
@@ -248,7 +256,7 @@ def rehearsal_section(rehearsal: Any | None, keep_away: frozenset[str], film: st
     )
     nearest = table(
         ("structure", "least clearance mm"),
-        [(n.replace("_", " "), "crossed" if v < 0 else number(v, 1)) for n, v in least[:12]],
+        [(n.replace("_", " "), clearance_text(v)) for n, v in least[:12]],
         kind="numbers",
     )
     more = faint(f"The 12 nearest of {len(least)} structures to keep away from.") if len(least) > 12 else ""

@@ -12,7 +12,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.search.selection.choice import Pick
-from puncture_twin.twin.report.numbers import number
+from puncture_twin.twin.report.numbers import clearance_text, number
 from puncture_twin.twin.report.palette import OUTSIDE, organ_colours
 
 NEAR_MM = 30.0
@@ -33,8 +33,7 @@ class Near(NamedTuple):
     def text(self) -> str:
         """For a legend."""
         margin = f", margin {number(self.margin_mm, 0)}" if np.isfinite(self.margin_mm) else ""
-        clearance = "crossed" if self.clearance_mm < 0 else number(self.clearance_mm, 1, "mm")
-        return f"{self.name.replace('_', ' ')}: {clearance}{margin}"
+        return f"{self.name.replace('_', ' ')}: {clearance_text(self.clearance_mm, 'mm')}{margin}"
 
 
 @dataclass(frozen=True, eq=False)
