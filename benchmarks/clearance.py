@@ -44,14 +44,14 @@ def rounds(scene: Scene, directions: np.ndarray, sample: int) -> dict[str, float
     its calls prepares the depths of crossings for whole surfaces.
     """
     chosen = np.random.default_rng(1).choice(len(directions), min(sample, len(directions)), replace=False)
-    engine, judge, objects = FastEngine(scene.meshes), FclEngine(scene.meshes), peers.trees(scene)
+    engine, judge, objects = FastEngine(scene.meshes, threads=1), FclEngine(scene.meshes), peers.trees(scene)
     ask = (scene.target, directions, scene.length)
     engine.measure(*ask)
     sums: dict[str, float] = {}
     for part in np.array_split(directions[chosen], ROUNDS):
         scale = len(directions) / len(part)
         times = {
-            "build": took(lambda: FastEngine(scene.meshes)),
+            "build": took(lambda: FastEngine(scene.meshes, threads=1)),
             "exact": took(lambda: engine.measure(*ask)),
             "FCL build": took(lambda: FclEngine(scene.meshes)),
             "FCL capsule": peers.fcl_capsule_distance(scene, part, objects) * scale,
@@ -89,7 +89,7 @@ def compile_times() -> None:
         "from puncture_twin.planning.geometry.mesh import TriangleMesh;"
         "from puncture_twin.planning.clearance.fast_engine import FastEngine;"
         "m=TriangleMesh(np.eye(3)*9,[[0,1,2]]);a=time.perf_counter();"
-        "FastEngine([m]).measure(np.zeros(3),np.eye(3),99.);print(f'{a-t:.2f} {time.perf_counter()-a:.2f}')"
+        "FastEngine([m], threads=1).measure(np.zeros(3),np.eye(3),99.);print(f'{a-t:.2f} {time.perf_counter()-a:.2f}')"
     )
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"NUMBA_CACHE_DIR": cache, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
@@ -104,7 +104,7 @@ def compile_times() -> None:
 def large(step_deg: float) -> None:
     """Print time and peak memory of a fine grid on the phantom."""
     scene = next(scenes())
-    directions, engine = scene.hemisphere(step_deg), FastEngine(scene.meshes)
+    directions, engine = scene.hemisphere(step_deg), FastEngine(scene.meshes, threads=1)
     start = time.perf_counter()
     engine.measure(scene.target, directions, scene.length)
     seconds = time.perf_counter() - start

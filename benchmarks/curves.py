@@ -68,7 +68,7 @@ def point(rows: int, count: int) -> dict[str, float]:
     build, search = [], []
     for _ in range(REPEATS if count < 300_000 else 1):
         start = time.thread_time()
-        engine = FastEngine(scene.meshes)
+        engine = FastEngine(scene.meshes, threads=1)
         built = time.thread_time()
         engine.measure(scene.target, rays, scene.length)
         build.append(built - start)

@@ -268,7 +268,7 @@ def optional(scene: Scene, directions: np.ndarray) -> None:
 def compare(scene: Scene, step_deg: float) -> None:
     """Print a scene's table: ratios to ours first, then microseconds per direction."""
     directions = np.random.default_rng(SEED).permutation(scene.hemisphere(step_deg))
-    engine = FastEngine(scene.meshes)
+    engine = FastEngine(scene.meshes, threads=1)
     engine.measure(scene.target, directions[:50], scene.length)
     exact = least_seconds(lambda: engine.measure(scene.target, directions, scene.length), 3) / len(directions)
     ours = engine.measure(scene.target, directions, scene.length).distance

@@ -63,7 +63,7 @@ def unit_costs() -> tuple[float, float, float]:
 
 def profile(scene: Scene, step_deg: float) -> None:
     """Print what the search of one scene counts per answer, and how its time divides."""
-    directions, engine = scene.hemisphere(step_deg), FastEngine(scene.meshes)
+    directions, engine = scene.hemisphere(step_deg), FastEngine(scene.meshes, threads=1)
     took = min(_search(engine, scene, directions) for _ in range(3))
     counts = dict(zip(COUNTED, engine.counts / 3, strict=True))
     answers = len(directions) * len(scene.meshes)
