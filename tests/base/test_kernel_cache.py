@@ -12,8 +12,9 @@ from kernel_world import CALLEE, CALLER, copy_package, write_kernels
 def _run(project, own=True):
     """Let a process of its own ask the kernel, and say how often it came from the cache."""
     lines = [
-        "import puncture_twin.planning.base.numba_kernels, numba",
-        "" if own else "numba.core.config.CACHE_LOCATOR_CLASSES = ''",
+        "import puncture_twin.planning.base.numba_kernels",
+        "from numba.core import caching, dispatcher",
+        "" if own else "dispatcher.FunctionCache = caching.FunctionCache",
     ]
     lines += ["from puncture_twin.planning.caller import add", "print(add(1), sum(add.stats.cache_hits.values()))"]
     return _python(project, "\n".join(lines))
@@ -159,3 +160,28 @@ def test_it_is_known_whether_a_kernel_is_compiled(project):
     assert compiled() == ["True"]
     (project / "puncture_twin" / "planning" / "size.py").write_text("SIZE = 2\n")
     assert compiled() == ["False"]
+
+
+def test_what_is_kept_is_loaded_without_what_only_compiling_needs(project):
+    """Numba's implementations of NumPy stay out until something is compiled, which then takes in what was loaded."""
+    (project / "puncture_twin" / "planning" / "caller.py").write_text(
+        CALLER.replace("rule(x)", "rule(x) + np.zeros(2).max()").replace("from", "import numpy as np\nfrom", 1)
+    )
+    loads = (
+        "import sys\nfrom puncture_twin.planning.caller import add\nprint(add(1), 'numba.np.arraymath' in sys.modules)"
+    )
+    assert _python(project, loads).stdout.split() == ["2.0", "True"]
+    compiles = "\nimport numba\nprint(numba.njit(lambda x: add(x) + 1)(1), 'numba.np.arraymath' in sys.modules)"
+    assert _python(project, loads + compiles).stdout.split() == ["2.0", "False", "3.0", "True"]
+
+
+def test_a_users_place_for_compiled_code_stays_in_force(project):
+    """Numba's setting of locators decides where kernels lie, not what they are stamped with."""
+    place = "from numba.core import config\nconfig.CACHE_LOCATOR_CLASSES = 'InTreeCacheLocator'\n"
+    asked = place + "from puncture_twin.planning.caller import add\nprint(add(1), sum(add.stats.cache_hits.values()))"
+    assert _python(project, asked).stdout.split() == ["2", "0"]
+    assert not (project / "cache").exists()
+    assert list((project / "puncture_twin" / "planning" / "__pycache__").glob("caller.add*.nbc"))
+    assert _python(project, asked).stdout.split() == ["2", "1"]
+    (project / "puncture_twin" / "planning" / "size.py").write_text("SIZE = 2\n")
+    assert _python(project, asked).stdout.split() == ["3", "0"]

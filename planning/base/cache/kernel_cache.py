@@ -1,11 +1,11 @@
-"""Where numba keeps compiled kernels, and when it must not trust them: when any kernel's source has changed.
+"""Where numba keeps compiled kernels, and when it must not trust them: when a source of theirs has changed.
 
 Numba stamps what it has compiled with the source of the function's own file. A kernel that takes in another file's
 kernel would be reused after an edit of that file alone, and a search would go on judging by the old rule. Kernels of
-this project are stamped with the sources of all of them instead.
+this project are stamped with their file and all that it imports from the project instead.
 
-The classes are numba's own places, tried in numba's own order; `CACHE_LOCATOR_CLASSES` is its setting for others'.
-Files outside the project are left to numba. What the package brings is looked up behind them.
+The places are numba's own, in numba's own order, and a user's setting of them stays in force. Functions of files
+outside the project are left to numba. What the package brings is looked up behind them.
 """
 
 # mypy: disable-error-code="no-untyped-call, misc"
@@ -13,32 +13,30 @@ Files outside the project are left to numba. What the package brings is looked u
 
 from __future__ import annotations
 
-from functools import cache
+import inspect
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from numba.core import config as numba_config
-from numba.core.caching import InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
+from numba.core import caching, config as numba_config, dispatcher as numba_dispatcher
 from numba.core.codegen import get_host_cpu_features
+from numba.core.runtime.nrt import rtsys
 
 from puncture_twin.planning.base.cache.brought_kernels import BROUGHT, brought_class, brought_folder
-from puncture_twin.planning.base.cache.kernel_files import CheckedFiles, ProjectStamp, use_checked_files
+from puncture_twin.planning.base.cache.kernel_files import CheckedFiles
 from puncture_twin.planning.base.cache.source_stamp import PACKAGE, PARTS, library_versions, sources_with, stamp_of
 
 config: Any = numba_config
 """It makes its attributes when it is loaded."""
 
+NumbasCache: Any = caching.FunctionCache
+"""Numba's own, of one function's compiled code."""
+
+NumbasPlaces: Any = caching.CompileResultCacheImpl
+"""Where it is, and what of it is kept."""
+
 COMPILERS = ("numba", "llvmlite", "numpy")
 """Whose versions decide what is compiled."""
-
-NUMBAS = (
-    "UserProvidedCacheLocator",
-    "InTreeCacheLocator",
-    "UserWideCacheLocator",
-    "IPythonCacheLocator",
-    "ZipCacheLocator",
-)
-"""What numba tries where nothing is set."""
 
 
 @cache
@@ -47,41 +45,24 @@ def kernels_stamp() -> str:
 
     What they import counts too: numba freezes a constant into the kernel that names it. So do the compilers' versions.
     """
-    return f"{stamp_of(sources_with(b'numba'))} {library_versions(COMPILERS)}"
+    return _stamp(*sources_with(b"numba"))
 
 
 @cache
-def _ours(py_file: str) -> bool:
-    return any(Path(py_file).resolve().is_relative_to((PACKAGE / part).resolve()) for part in PARTS)
+def _stamp(*files: str) -> str:
+    return f"{stamp_of(files)} {library_versions(COMPILERS)}"
 
 
-class _OfTheProject:
-    """Of two bases, the one that comes first: takes the project's files only, and stamps them with all kernels."""
-
-    _py_file: str
-
-    @classmethod
-    def from_function(cls, py_func: Any, py_file: str) -> Any:
-        return super().from_function(py_func, py_file) if _ours(py_file) else None
-
-    def get_source_stamp(self) -> ProjectStamp:
-        brought = None if class_in_use() is None else brought_folder(Path(self._py_file))
-        return ProjectStamp(kernels_stamp(), brought)
+@cache
+def _own_file(py_file: str) -> str | None:
+    """The file as one of the package, whose parts may be links; None for others' files."""
+    file = Path(py_file).resolve()
+    folders = (PACKAGE / part for part in PARTS)
+    found = (folder / file.relative_to(folder.resolve()) for folder in folders if file.is_relative_to(folder.resolve()))
+    return next(map(str, found), None)
 
 
-class SetFolder(_OfTheProject, UserProvidedCacheLocator):
-    """In the folder that NUMBA_CACHE_DIR names."""
-
-
-class BesideSource(_OfTheProject, InTreeCacheLocator):
-    """In ``__pycache__``."""
-
-
-class UserFolder(_OfTheProject, UserWideCacheLocator):
-    """In the user's cache folder, where the source's folder cannot be written."""
-
-
-class Nowhere(_OfTheProject, InTreeCacheLocator):
+class Nowhere(caching.InTreeCacheLocator):
     """Where no folder can be written: what is brought is found, and what is compiled is not kept.
 
     Numba alone would end in an error, as for a user without a home on a file system that is read-only.
@@ -91,15 +72,56 @@ class Nowhere(_OfTheProject, InTreeCacheLocator):
         """Whatever cannot be written is not."""
 
 
+class Places(NumbasPlaces):
+    """Numba's own places for what it compiles, and behind them none."""
+
+    _locator_classes = (*NumbasPlaces._locator_classes, Nowhere)
+
+
+class KernelCache(NumbasCache):
+    """The cache of one kernel: set up when it is first asked, for most kernels are only taken in by others.
+
+    What is kept is loaded without numba's registries, of which only compiling knows anything, and which take a tenth of
+    a second: compiled code needs numba's runtime alone.
+    """
+
+    def __init__(self, py_func: Any) -> None:
+        self._name, self._py_func = repr(py_func), py_func
+        self.enable()
+
+    @cached_property
+    def _impl(self) -> Any:
+        return Places(self._py_func)
+
+    @cached_property
+    def _cache_path(self) -> Any:
+        return self._impl.locator.get_cache_path()
+
+    @cached_property
+    def _cache_file(self) -> CheckedFiles:
+        file = _own_file(inspect.getfile(self._py_func))
+        assert file is not None  # others' functions have numba's cache
+        brought = None if class_in_use() is None else brought_folder(Path(file))
+        return CheckedFiles(self._cache_path, self._impl.filename_base, _stamp(file), brought)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """What was compiled for these types, or None."""
+        rtsys.initialize(target_context)
+        return self._load_overload(sig, target_context)
+
+
 def use_kernel_cache() -> None:
-    """Let numba try these places first; a user's own setting stays in force behind them."""
-    ours = [f"{__name__}.{place.__name__}" for place in (SetFolder, BesideSource, UserFolder, Nowhere)]
-    theirs = config.CACHE_LOCATOR_CLASSES.split(",") if config.CACHE_LOCATOR_CLASSES else list(NUMBAS)
-    use_checked_files()
-    config.CACHE_LOCATOR_CLASSES = ",".join([*ours, *(place for place in theirs if place not in ours)])
+    """Let numba keep this project's kernels so, and all others as ever."""
+    numbas: Any = numba_dispatcher  # its attribute is a class; what stands in for it makes an object of one of two
+    numbas.FunctionCache = _cache_of
     name = class_in_use()
     if name is not None:
         config.CPU_NAME, config.CPU_FEATURES = name, ""  # no feature beyond those of the class
+
+
+def _cache_of(py_func: Any) -> Any:
+    ours = _own_file(inspect.getfile(py_func)) is not None
+    return KernelCache(py_func) if ours else NumbasCache(py_func)
 
 
 @cache

@@ -11,15 +11,18 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import io
 import itertools
 import pickle
 import re
 import shutil
+import sys
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from numba.core import caching
+from numba.core.environment import Environment, _rebuild_env, lookup_environment
 
 from puncture_twin.planning.base.cache.entry_file import DamagedError, read_plain_file
 from puncture_twin.planning.base.errors import CacheWarning
@@ -36,28 +39,22 @@ FUNCTION = re.compile(r"(?P<name>.*)-\d+\.py\w+\.checked")
 """A file's name without its ending: the function, its line, the Python version."""
 
 
-class ProjectStamp(NamedTuple):
-    """Of the sources of all kernels of this project; numba's own stamps are of one file's age and size.
-
-    Attributes:
-        text: The stamp.
-        brought: Where the package may bring compiled code of the same function, under the same names of files.
-    """
-
-    text: str
-    brought: Path | None = None
-
-
 class CheckedFiles(NumbasFiles):
     """The index and the data files of one function, each behind a digest.
 
     They are written into the one place that numba has chosen, and read there and then in what the package brings.
+
+    Args:
+        cache_path: That place.
+        filename_base: The beginning of the files' names.
+        stamp: Of the sources that the function is made of.
+        brought: Where the package may bring compiled code of the same function, under the same names of files.
     """
 
-    def __init__(self, cache_path: str, filename_base: str, source_stamp: ProjectStamp) -> None:
-        super().__init__(cache_path=cache_path, filename_base=filename_base + OWN, source_stamp=source_stamp)
+    def __init__(self, cache_path: str, filename_base: str, stamp: str, brought: Path | None) -> None:
+        super().__init__(cache_path=cache_path, filename_base=filename_base + OWN, source_stamp=stamp)
         self._folder = Path(cache_path)
-        self._folders = [self._folder, *([source_stamp.brought] if source_stamp.brought else [])]
+        self._folders = [self._folder, *([brought] if brought else [])]
         self._base = filename_base + OWN
 
     def load(self, key: Any) -> Any:
@@ -70,7 +67,7 @@ class CheckedFiles(NumbasFiles):
         content = None if name is None else self._content(folder / name)
         if content is None:
             return None
-        stated, data = pickle.loads(content)
+        stated, data = _Unpickler(io.BytesIO(content)).load()
         return data if stated == key else None
 
     def any_kept(self) -> bool:
@@ -114,7 +111,7 @@ class CheckedFiles(NumbasFiles):
 
     @property
     def _stamp(self) -> bytes:
-        return hashlib.sha256(self._source_stamp.text.encode()).digest()
+        return hashlib.sha256(self._source_stamp.encode()).digest()
 
     def _write(self, name: str, content: bytes) -> None:
         path = self._folder / name
@@ -140,6 +137,29 @@ class CheckedFiles(NumbasFiles):
             return False
 
 
+class _Unpickler(pickle.Unpickler):
+    """Loads what numba has pickled, without the modules of numba that only compiling needs."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """What stands for a name in the file."""
+        rebuild = (module, name) == (_rebuild_env.__module__, _rebuild_env.__name__)
+        return _environment if rebuild else super().find_class(module, name)
+
+
+def _environment(module: str, consts: list[Any], name: str) -> Any:
+    """What a compiled function knows of its module; of numba's own that is nothing but the name.
+
+    Only code in object mode looks names up there, and kernels have none. Numba would import the module.
+    """
+    known = lookup_environment(name)
+    if known is not None or not module.startswith("numba.") or module in sys.modules or consts:
+        return known or _rebuild_env(module, consts, name)
+    environment = Environment({"__name__": module})
+    environment.env_name = name
+    Environment._memo[name] = environment
+    return environment
+
+
 def _split(stored: bytes) -> tuple[bytes, bytes, bytes]:
     """Stamp, digest and content of a file; no digest where it is none of these files."""
     if not stored.startswith(MAGIC):
@@ -157,14 +177,3 @@ def _digest(name: str, stamp: bytes, content: bytes) -> bytes:
 def _report(why: str, report: bool) -> None:
     if report:
         warnings.warn(f"cache: a compiled kernel {why}; it is compiled anew and replaced", CacheWarning, stacklevel=1)
-
-
-def use_checked_files() -> None:
-    """Let numba keep this project's kernels in such files, and all others in its own."""
-    numbas: Any = caching  # its attribute is a class; what stands in for it makes an object of one of two
-    numbas.IndexDataCacheFile = _files
-
-
-def _files(cache_path: str, filename_base: str, source_stamp: Any) -> Any:
-    kind = CheckedFiles if isinstance(source_stamp, ProjectStamp) else NumbasFiles
-    return kind(cache_path=cache_path, filename_base=filename_base, source_stamp=source_stamp)
