@@ -62,9 +62,9 @@ def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) 
     """Unit normals at points of triangles: the corners' normals (area weighted), blended; shape (n, 3)."""
     a, b, c = np.moveaxis(mesh.triangles, 1, 0)
     areas = np.cross(b - a, c - a)
-    at_vertex = np.zeros_like(mesh.vertices)
-    for corner in mesh.faces.T:
-        np.add.at(at_vertex, corner, areas)
+    corners, at_vertex = mesh.faces.T.reshape(-1), np.empty_like(mesh.vertices)
+    for axis, part in enumerate(areas.T):
+        at_vertex[:, axis] = np.bincount(corners, weights=np.tile(part, 3), minlength=len(at_vertex))
     weights = _corner_weights(mesh.triangles[face], points)
     return _unit(np.einsum("ij,ijk->ik", weights, _unit(at_vertex)[mesh.faces[face]]))
 

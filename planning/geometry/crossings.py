@@ -7,16 +7,20 @@ compute its edge function from the same numbers with the opposite sign, so a ray
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
-POLAR_BINS = 120
-"""Bins over the polar angle (1.5 degrees each); twice as many over the azimuth."""
+MOST_POLAR_BINS = 120
+"""Bins over the polar angle (1.5 degrees each) for many rays; twice as many over the azimuth."""
+
+LEAST_POLAR_BINS = 2
+"""For few rays: of fewer bins a cone's window would hold some twice."""
 
 SAME_CROSSING_MM = 1e-6
 """Crossings of one ray closer than this are one: the ray runs through an edge or a corner."""
@@ -59,14 +63,14 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
         directions: Shape (n, 3), unit vectors.
         length: Crossings beyond are left out, mm.
     """
-    corners = mesh.triangles - origin
-    order, starts = _binned(directions)
-    directions = np.array(directions, order="C")
+    order, starts, bins = _binned(directions)
+    rays = np.take(directions, order, axis=0)
+    origin = np.array(origin, dtype=np.float64)
     room, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
     while total > room:
         room = total
         ray, depth, face = np.empty(room, np.int64), np.empty(room), np.empty(room, np.int64)
-        total = _visit(corners, directions, order, starts, length, ray, depth, face)
+        total = _visit(mesh.vertices, mesh.faces, origin, rays, order, starts, bins, length, ray, depth, face)
     ray, depth, face = ray[:total], depth[:total], face[:total]
     rows = np.lexsort((depth, ray))
     ray, depth, face = ray[rows], depth[rows], face[rows]
@@ -86,41 +90,48 @@ def first_crossing(mesh: TriangleMesh, origin: Floats, directions: Floats, lengt
     return depth
 
 
-def _binned(directions: Floats) -> tuple[Ints, Ints]:
-    """Ray numbers sorted by direction bin, and where each bin starts, shape (bins + 1,)."""
+def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
+    """Ray numbers sorted by direction bin, where each bin starts, and how many there are over the polar angle.
+
+    Shapes (n,) and (bins + 1,). There is about a ray a bin, as long as that gives no more than the most.
+    """
+    count = min(MOST_POLAR_BINS, max(LEAST_POLAR_BINS, math.isqrt(len(directions) // 2)))
     polar = np.arccos(np.clip(directions[:, 2], -1, 1))
     azimuth = np.arctan2(directions[:, 1], directions[:, 0]) + np.pi
-    row = np.minimum((polar * (POLAR_BINS / np.pi)).astype(np.int64), POLAR_BINS - 1)
-    column = np.minimum((azimuth * (POLAR_BINS / np.pi)).astype(np.int64), 2 * POLAR_BINS - 1)
-    bins = row * 2 * POLAR_BINS + column
-    order = np.argsort(bins, kind="stable")
-    starts = np.searchsorted(bins[order], np.arange(2 * POLAR_BINS**2 + 1))
-    return order, starts
+    row = np.minimum((polar * (count / np.pi)).astype(np.int64), count - 1)
+    column = np.minimum((azimuth * (count / np.pi)).astype(np.int64), 2 * count - 1)
+    bins = (row * 2 * count + column).astype(np.uint16)  # numpy sorts small numbers ten times as fast
+    starts = np.zeros(2 * count**2 + 1, np.int64)
+    np.cumsum(np.bincount(bins, minlength=2 * count**2), out=starts[1:])
+    return np.argsort(bins, kind="stable"), starts, count
 
 
-@nb.njit(cache=True)
-def _visit(corners, directions, order, starts, length, ray, depth, face):  # type: ignore[no-untyped-def]  # numba infers
+@allocation_free()
+def _visit(vertices, faces, origin, rays, order, starts, bins, length, ray, depth, face):  # type: ignore[no-untyped-def]  # numba infers
     """Count the crossings; write them too where the output arrays have room."""
-    found = 0
-    for f in range(len(corners)):
-        a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+    found, per_radian = 0, bins / np.pi
+    for f in range(len(faces)):
+        a, b, c = (
+            _seen(vertices, faces[f, 0], origin),
+            _seen(vertices, faces[f, 1], origin),
+            _seen(vertices, faces[f, 2], origin),
+        )
         if _beyond(a, b, c, length):
             continue
         center, radius = _cone(a, b, c)
-        first_row, last_row = 0, POLAR_BINS - 1
         polar = np.arccos(min(1.0, max(-1.0, center[2])))
-        if radius < 1.5:
-            first_row = max(0, int((polar - radius) * (POLAR_BINS / np.pi)))
-            last_row = min(POLAR_BINS - 1, int((polar + radius) * (POLAR_BINS / np.pi)))
-        low, high = _azimuths(center, polar, radius)
+        first_row = max(0, int((polar - radius) * per_radian))
+        last_row = min(bins - 1, int((polar + radius) * per_radian))
+        low, high = _azimuths(center, polar, radius, bins)
         if radius >= 1.5:  # all bins, each once: in one piece, since most of them hold no ray
             first_row, last_row, low, high = 0, 0, 0, 0
+        normals = _normal(b, c), _normal(c, a), _normal(a, b)
         for row in range(first_row, last_row + 1):
             for column in range(low, high + 1):
-                cell = row * 2 * POLAR_BINS + column % (2 * POLAR_BINS)
+                cell = row * 2 * bins + column % (2 * bins)
                 begin, end = (0, len(order)) if radius >= 1.5 else (starts[cell], starts[cell + 1])
                 for k in range(begin, end):
-                    t = _cross(a, b, c, directions[order[k]])
+                    t = _cross(a, b, c, normals, rays[k])
                     if 0.0 <= t <= length:
                         if found < len(ray):
                             ray[found], depth[found], face[found] = order[k], t, f
@@ -128,7 +139,13 @@ def _visit(corners, directions, order, starts, length, ray, depth, face):  # typ
     return found
 
 
-@nb.njit(cache=True)
+@allocation_free()
+def _seen(vertices, row, origin):  # type: ignore[no-untyped-def]  # numba infers
+    """A vertex, seen from where the rays start."""
+    return vertices[row, 0] - origin[0], vertices[row, 1] - origin[1], vertices[row, 2] - origin[2]
+
+
+@allocation_free()
 def _beyond(a, b, c, length):  # type: ignore[no-untyped-def]  # numba infers
     """Whether no ray from the origin crosses a triangle at a length or less, told by its corners' distances.
 
@@ -140,7 +157,7 @@ def _beyond(a, b, c, length):  # type: ignore[no-untyped-def]  # numba infers
     return _length(a[0], a[1], a[2]) - 3.0 * max(to_b, to_c) > length + SAME_CROSSING_MM
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
     """Axis and half-angle of a cone about the origin that holds a triangle; half-angle pi where none is narrow."""
     na, nb_, nc = _length(a[0], a[1], a[2]), _length(b[0], b[1], b[2]), _length(c[0], c[1], c[2])
@@ -160,40 +177,46 @@ def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
     return (x, y, z), np.arccos(min(1.0, cosine)) + CONE_SLACK + 1e-7
 
 
-@nb.njit(cache=True)
+@allocation_free()
 def _length(x, y, z):  # type: ignore[no-untyped-def]  # numba infers
     """Of a vector."""
     return np.sqrt(x * x + y * y + z * z)
 
 
-@nb.njit(cache=True)
-def _azimuths(center, polar, radius):  # type: ignore[no-untyped-def]  # numba infers
+@allocation_free()
+def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # numba infers
     """First and last azimuth bin that a cone touches (the last may run past the full circle)."""
     if radius >= 1.5 or polar - radius <= 0.0 or polar + radius >= np.pi:
-        return 0, 2 * POLAR_BINS - 1
+        return 0, 2 * bins - 1
     half = np.arcsin(min(1.0, np.sin(radius) / np.sin(polar)))
     azimuth = np.arctan2(center[1], center[0]) + np.pi
-    low = int(np.floor((azimuth - half) * (POLAR_BINS / np.pi) - 1e-9))
-    high = int(np.floor((azimuth + half) * (POLAR_BINS / np.pi) + 1e-9))
+    low = int(np.floor((azimuth - half) * (bins / np.pi) - 1e-9))
+    high = int(np.floor((azimuth + half) * (bins / np.pi) + 1e-9))
     return low, high  # half is a right angle at most: no bin twice
 
 
-@nb.njit(cache=True)
-def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
+@allocation_free()
+def _cross(a, b, c, normals, u):  # type: ignore[no-untyped-def]  # numba infers
     """Depth at which the ray from the origin along u crosses the triangle; -1 where it does not."""
-    wa, wb, wc = _edge(b, c, u), _edge(c, a, u), _edge(a, b, u)
+    wa, wb, wc = _along(normals[0], u), _along(normals[1], u), _along(normals[2], u)
     if not ((wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)):
         return -1.0
     total = wa + wb + wc
     if total == 0.0:
         return -1.0
-    return (wa * (a @ u) + wb * (b @ u) + wc * (c @ u)) / total
+    return (wa * _along(a, u) + wb * _along(b, u) + wc * _along(c, u)) / total
 
 
-@nb.njit(cache=True)
-def _edge(p, q, u):  # type: ignore[no-untyped-def]  # numba infers
-    """Triple product u . (p x q): on which side of the edge p-q the ray passes; swapping p and q negates it exactly."""
-    return u[0] * (p[1] * q[2] - p[2] * q[1]) + u[1] * (p[2] * q[0] - p[0] * q[2]) + u[2] * (p[0] * q[1] - p[1] * q[0])
+@allocation_free()
+def _normal(p, q):  # type: ignore[no-untyped-def]  # numba infers
+    """Of the plane through the origin and the edge p-q: p x q; swapping p and q negates it exactly."""
+    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+
+
+@allocation_free()
+def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
+    """How far a point lies along a ray; of an edge's normal, on which side of the edge the ray passes."""
+    return p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
 
 
 def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:

@@ -38,6 +38,23 @@ def test_crossings_equal_brute_force(rng, spread, size):
         np.testing.assert_allclose(depths, ray_crossings(origin, direction, mesh), atol=1e-8)
 
 
+@pytest.mark.parametrize(("spread", "size"), [(60, 10), (60, 100), (3, 3)])
+def test_a_ray_crosses_the_same_among_few_and_among_many(rng, spread, size):
+    """The bins are as coarse as the rays are few: alone, with some or with tens of thousands, to the bit."""
+    mesh = soup(rng, 60, spread, size)
+    directions = rng.normal(size=(40_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    every = crossings(mesh, np.zeros(3), directions)
+    assert len(every.ray) > 1000
+    hit = int(every.ray[0])
+    for rows in (slice(hit, hit + 1), slice(0, 9), slice(0, 150), slice(0, 5000)):
+        found, begin = crossings(mesh, np.zeros(3), directions[rows]), rows.start
+        kept = (every.ray >= begin) & (every.ray < rows.stop)
+        np.testing.assert_array_equal(found.ray + begin, every.ray[kept])
+        for name in ("depth", "face"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(every, name)[kept])
+
+
 def test_no_ray_has_no_crossings(ball):
     """An empty answer, not an error."""
     found = crossings(ball(10.0), np.zeros(3), np.zeros((0, 3)))
