@@ -54,8 +54,11 @@ def measure(
         axes: What the engine has measured of them already; None measures them.
     """
     lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), len(structures))
-    axes = engine.measure(target_ct, outward_ct, lengths) if axes is None else axes
-    distance, depth = axes.distance.copy(order="K"), axes.depth.copy(order="K")  # a structure's row by row, as a rule
+    if axes is None:
+        axes = engine.measure(target_ct, outward_ct, lengths)
+        distance, depth = axes.distance, axes.depth
+    else:  # the caller's, who needs them as they are
+        distance, depth = axes.distance.copy(order="K"), axes.depth.copy(order="K")  # a structure's row by row
     violated = np.zeros_like(distance, bool)
     for column, structure in enumerate(structures):
         if holds(structure.mesh, target_ct):
