@@ -73,8 +73,7 @@ def _cut(outward, starts):  # type: ignore[no-untyped-def]  # numba infers
     count, first = 0, 0
     starts[0] = 0
     for i in range(1, len(outward)):
-        d = outward[i] - outward[first]
-        if i % TILE == 0 or d @ d > WIDEST * WIDEST:
+        if i % TILE == 0 or _square_between(outward, i, first) > WIDEST * WIDEST:
             count += 1
             first = i
             starts[count] = i
@@ -87,15 +86,22 @@ def _cut(outward, starts):  # type: ignore[no-untyped-def]  # numba infers
 def _axes(outward, starts, middle, chord):  # type: ignore[no-untyped-def]  # numba infers
     """The member nearest to the mean of each bundle, and the widest chord from it."""
     for tile in range(len(middle)):
-        mean = np.zeros(3)
+        x, y, z = 0.0, 0.0, 0.0
         for i in range(starts[tile], starts[tile + 1]):
-            mean += outward[i]
-        middle[tile] = starts[tile]
+            x, y, z = x + outward[i, 0], y + outward[i, 1], z + outward[i, 2]
+        middle[tile], most = starts[tile], -np.inf
         for i in range(starts[tile], starts[tile + 1]):
-            if np.dot(outward[i], mean) > np.dot(outward[middle[tile]], mean):
-                middle[tile] = i
+            along = outward[i, 0] * x + outward[i, 1] * y + outward[i, 2] * z
+            if along > most:
+                middle[tile], most = i, along
         widest = 0.0
         for i in range(starts[tile], starts[tile + 1]):
-            d = outward[i] - outward[middle[tile]]
-            widest = max(widest, np.dot(d, d))
+            widest = max(widest, _square_between(outward, i, middle[tile]))
         chord[tile] = np.sqrt(widest) * (1 + CHORD_SLACK) + CHORD_SLACK
+
+
+@nb.njit(cache=True)
+def _square_between(outward, i, k):  # type: ignore[no-untyped-def]  # numba infers
+    """Square of the chord between two directions."""
+    x, y, z = outward[i, 0] - outward[k, 0], outward[i, 1] - outward[k, 1], outward[i, 2] - outward[k, 2]
+    return x * x + y * y + z * z
