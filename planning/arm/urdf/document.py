@@ -12,12 +12,12 @@ from typing import TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
-import scipy
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.text_names import check_name
 from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.rotations import about_fixed_axes
 
 Element = ElementTree.Element
 
@@ -262,7 +262,7 @@ def _origin(element: Element, here: str) -> Floats:
     xyz, rpy = (
         _numbers(origins[0], key, 3, here) if key in origins[0].attrib else np.zeros(3) for key in ("xyz", "rpy")
     )
-    return pose(scipy.spatial.transform.Rotation.from_euler("xyz", rpy).as_matrix(), MM_PER_M * xyz)
+    return pose(about_fixed_axes(rpy), MM_PER_M * xyz)
 
 
 def _weighs(element: Element, here: str) -> bool:

@@ -16,7 +16,7 @@ from puncture_twin.planning.arm.urdf.document import UrdfDocument
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.rotations import log_rotation
+from puncture_twin.planning.geometry.rotations import rotation_angle
 
 SQUARE_RAD = 1e-4
 """How far an axis may be from where a UR has it: 1.5708 for a right angle is off by 4e-6, 1.57 by 8e-4."""
@@ -117,7 +117,7 @@ def _base(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> Floats:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, np.round(-R @ stated[name][:3, 3], DIGITS_MM) + 0.0
     difference = T @ stated[name]
-    angle = float(np.linalg.norm(log_rotation(difference[:3, :3])))
+    angle = rotation_angle(difference[:3, :3])
     if angle > SQUARE_RAD:
         what = f"link '{name}' is turned by {np.degrees(angle):.4g} degrees against the controller's base of a UR"
         allowed = (
@@ -149,7 +149,7 @@ def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
             what = f"passes {np.linalg.norm(off):.4g} mm beside where a UR's does, by ({_mm(off)}) mm in the base"
             raise _other(chain, joint, what, document)
     off = [float(T[0, 3] - p[3, 0]), 0.0, float(T[2, 3] - p[5, 2])]
-    turned = float(np.linalg.norm(log_rotation(R_BASE_FLANGE.T @ T[:3, :3])))
+    turned = rotation_angle(R_BASE_FLANGE.T @ T[:3, :3])
     if np.linalg.norm(off) > OFF_MM or turned > SQUARE_RAD:
         what = (
             f"the flange '{chain.flange}' is {np.linalg.norm(off):.4g} mm beside axis 6 and turned by "
