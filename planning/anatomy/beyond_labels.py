@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from puncture_twin.planning.anatomy.body.outside_body import joined
 from puncture_twin.planning.anatomy.label_grids import LabelGrid, label_grids
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import Role, Structure
@@ -23,7 +22,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.volumes.orientation import canonical
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 

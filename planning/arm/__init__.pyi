@@ -17,7 +17,6 @@ from .links import (
     LINK_NAMES as LINK_NAMES,
     Link as Link,
     collision_links as collision_links,
-    joined as joined,
     visual_links as visual_links,
 )
 from .model_urdf import (

@@ -19,7 +19,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.mesh_list import packed_meshes, unpacked_meshes
 
 LINK_NAMES = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -109,13 +109,6 @@ def _convex_links(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
 def _packed(links: Sequence[Sequence[TriangleMesh]]) -> Arrays:
     """The links' pieces for the cache, and how many each link has."""
     return {**packed_meshes([piece for link in links for piece in link]), "pieces": np.array([*map(len, links)])}
-
-
-def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Several meshes of one frame as one."""
-    starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
-    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
 @cache

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from puncture_twin.planning.arm.links import collision_links, joined
+from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -20,7 +20,7 @@ class BaseInPatientError(InputError):
 
 
 def refuse_base_in(
-    model: UrModel, base: Body, placed: FclPatient, patient: TriangleMesh, outside: TriangleMesh | None
+    model: UrModel, base: Body, placed: FclPatient, patient: TriangleMesh, surface: TriangleMesh
 ) -> None:
     """Refuse a base that stands in the patient, or in what the CT shows outside of the body.
 
@@ -29,7 +29,7 @@ def refuse_base_in(
         base: Its first body.
         placed: Both surfaces for FCL.
         patient: The skin, base frame, mm.
-        outside: What the CT shows besides, likewise.
+        surface: The skin, and behind it what the CT shows besides, likewise; the same where that is nothing.
 
     Raises:
         BaseInPatientError: It does.
@@ -39,7 +39,7 @@ def refuse_base_in(
     if met or _encloses(patient, centre):
         what = "the robot's base stands in the patient"
         raise BaseInPatientError(what, where="workcell", allowed="a base outside the skin")
-    if outside is not None and _encloses(joined([patient, outside]), centre):
+    if surface is not patient and _encloses(surface, centre):
         what = "the robot's base stands in what the CT shows outside of the body (its table?)"
         raise BaseInPatientError(what, where="workcell", allowed="a base outside of it")
 

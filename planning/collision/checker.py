@@ -18,7 +18,6 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import joined
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -44,7 +43,7 @@ from puncture_twin.planning.collision.state_checker import (
     require_finite,
 )
 from puncture_twin.planning.collision.sweep import SweptBodies
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
 
 __all__ = [
@@ -114,7 +113,7 @@ class CellChecker:
         self._checks = (*self._workcell_checks(), *self._self_checks())
         if patient is not None and self._surface is not None and self._patient is not None:
             self._bounds[PATIENT] = self._surface.bounds
-            refuse_base_in(model, self._bodies[0], self._patient, patient, outside)
+            refuse_base_in(model, self._bodies[0], self._patient, patient, self._surface)
 
     @property
     def patient_closed(self) -> bool:

@@ -10,14 +10,14 @@ from dataclasses import replace
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
-from puncture_twin.planning.anatomy.body.outside_body import BOX_FACES, joined
+from puncture_twin.planning.anatomy.body.outside_body import BOX_FACES
 from puncture_twin.planning.arm.gantry import gantry_boxes
 from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Gantry, Obstacle
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
 
 GANTRY = "gantry"

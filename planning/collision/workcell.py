@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role
-from puncture_twin.planning.anatomy.body.outside_body import joined
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
@@ -15,7 +14,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.base_place import BaseInPatientError
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.surroundings import case_boxes, check_gantry
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 
 ARM_PADDING_MM = 5.0
 """The arm keeps this distance from all around it: more than the registration's error, and enough to prove the path

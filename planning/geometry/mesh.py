@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -42,9 +43,16 @@ class TriangleMesh:
 
     def __post_init__(self) -> None:
         for name, dtype in (("vertices", np.float64), ("faces", np.int32)):
-            array = np.array(getattr(self, name), dtype=dtype, order="C")
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            array = getattr(self, name)
+            if not _read_only(array, dtype):
+                array = np.array(array, dtype=dtype, order="C")
+                array.setflags(write=False)
+                object.__setattr__(self, name, array)
+
+    def known(self, *, closed: bool, wound_alike: bool) -> TriangleMesh:
+        """The same mesh, of which `closed` and `wound_alike` have been found before and need not be found again."""
+        vars(self).update(closed=closed, wound_alike=wound_alike)
+        return self
 
     @cached_property
     def triangles(self) -> NDArray[np.float64]:
@@ -114,6 +122,27 @@ class TriangleMesh:
             T_b_a: Shape (4, 4), maps coordinates of this mesh's frame a to frame b, mm.
         """
         return TriangleMesh(apply(T_b_a, self.vertices), self.faces)
+
+
+def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """Several surfaces of one frame as one; of one alone that itself."""
+    if len(meshes) == 1:
+        return meshes[0]
+    starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]], dtype=np.int32)
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
+    for array in (vertices, faces):
+        array.setflags(write=False)  # nobody else has it: it is taken as it is
+    return TriangleMesh(vertices, faces)
+
+
+def _read_only(array: Any, dtype: type) -> bool:
+    """Whether this is an array of a kind that nobody writes to, down to the memory that it looks at."""
+    if type(array) is not np.ndarray or array.dtype != dtype or not (array.flags.c_contiguous and array.flags.aligned):
+        return False
+    while type(array) is np.ndarray and not array.flags.writeable:
+        array = array.base
+    return array is None or type(array) is bytes
 
 
 def box_of(points: Floats) -> NDArray[np.float64]:

@@ -9,14 +9,13 @@ from functools import cached_property
 
 import numpy as np
 
-from puncture_twin.planning.arm.links import joined
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import Contact
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.place.directions import WantedDirections
 from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from puncture_twin.planning.anatomy.body.outside_body import joined
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual_links
 from puncture_twin.planning.arm.tool import HOLDER_ROOT_MM
@@ -20,7 +19,7 @@ from puncture_twin.planning.collision.bodies.shapes import convex, surface, touc
 from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.sweep import SweptBodies
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.winding import winding_number, winding_numbers
 
 UR3 = ur_model("ur3")

@@ -12,7 +12,6 @@ from kept_checkers import built
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import joined
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
@@ -22,7 +21,7 @@ from puncture_twin.planning.collision.checker import BODY_NAMES, CellChecker, To
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.loose_parts import LooseParts
 from puncture_twin.planning.collision.patient import PART_TRIANGLES, FclSkin
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation
 

@@ -10,7 +10,6 @@ from .outside_body import (
     beyond_drawn_sides as beyond_drawn_sides,
     beyond_face as beyond_face,
     beyond_flat_sides as beyond_flat_sides,
-    joined as joined,
     outside_mask as outside_mask,
     outside_surface as outside_surface,
 )

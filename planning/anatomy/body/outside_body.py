@@ -21,7 +21,7 @@ from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.formats.labels.label_surface import field_surface
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
 
 SMOOTH_MM = 3.0
@@ -219,13 +219,6 @@ def _facing_outward(vertices: Floats, faces: Ints32) -> Ints32:
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     inward = float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0
     return faces[:, ::-1] if inward else faces
-
-
-def joined(meshes: list[TriangleMesh]) -> TriangleMesh:
-    """Several surfaces as one."""
-    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    faces = [mesh.faces + start for mesh, start in zip(meshes, first, strict=True)]
-    return TriangleMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
 def _without_specks(mask: Bools, least_voxels: float) -> Bools:

@@ -6,10 +6,11 @@ from functools import partial
 
 import numpy as np
 
-from puncture_twin.planning.arm.links import Link, joined
+from puncture_twin.planning.arm.links import Link
 from puncture_twin.planning.collision.bodies.body import Body, Shape
 from puncture_twin.planning.collision.bodies.shapes import convex, surface
 from puncture_twin.planning.collision.bodies.solid import Solid
+from puncture_twin.planning.geometry.mesh import joined
 
 
 def link_body(link: Link, grown: Link) -> Body:
