@@ -144,9 +144,9 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     beyond = beyond_labels(case, skin, structures)
     structures.extend(beyond.structures)
     _check_names(case, [*structures, *outside])
-    _check_target(case, structures, skin)
     read = {one.name: one.mesh for one in structures if one.source != OWN_TARGET}  # the ball is ours
     of_meshes = kept_mesh_warnings(read, cache)
+    _check_target(case, structures, skin)
     warnings = (*loader.warnings, *beyond.warnings, *left_out, *skin.warnings, *of_meshes)
     return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch)
 

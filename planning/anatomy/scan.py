@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +22,6 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     beyond_drawn_sides,
     beyond_face,
     beyond_flat_sides,
-    joined,
     outside_mask,
     outside_surface,
 )
@@ -31,13 +29,13 @@ from puncture_twin.planning.anatomy.body.support import FACES, find_support
 from puncture_twin.planning.anatomy.body.unscanned import measured_hu, unscanned_voxels
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_mesh
+from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_mesh, mesh_arrays
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.cache.array_cache import Arrays
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.mesh_guard import fits
 from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 
 SKIN_TOLERANCE_MM = 3.0
@@ -139,7 +137,7 @@ class Scan:
             image = BodyImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm, slack_mm)
             return unnamed_surfaces(image, structures, dense_hu=dense_hu, where=self.source.path)
 
-        named = {"structures": [f"{one.name} {_digest(one.mesh)}" for one in structures]}
+        named = {"structures": [f"{one.name} {one.mesh.digest}" for one in structures]}
         return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
 
     def air_in_skin(self) -> float:
@@ -154,8 +152,8 @@ class Scan:
                 )
             }
 
-        made_from = {"what": "room in skin", "skin": _digest(self.skin.mesh)}
-        return float(self.source.kept(made_from, make, by=__name__, check=_fraction)["fraction"])
+        made_from = {"what": "room in skin", "skin": self.skin.mesh.digest}
+        return self.source.kept(made_from, make, _fraction, by=__name__)
 
     def contains(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
@@ -210,9 +208,9 @@ class Scan:
         self, made_from: dict[str, Any], make: Callable[[], list[TriangleMesh | None]]
     ) -> list[TriangleMesh | None]:
         """Meshes from the cache, made where they are not there; None is kept too."""
-        skin = None if self.skin is None else _digest(self.skin.mesh)
+        skin = None if self.skin is None else self.skin.mesh.digest
         made_from = {"skin": skin, **made_from}
-        return _to_meshes(self.source.kept(made_from, lambda: _of_meshes(make()), by=__name__, check=_to_meshes))
+        return self.source.kept(made_from, lambda: _of_meshes(make()), _to_meshes, by=__name__)
 
 
 def _joined(meshes: Sequence[TriangleMesh | None]) -> TriangleMesh | None:
@@ -221,20 +219,18 @@ def _joined(meshes: Sequence[TriangleMesh | None]) -> TriangleMesh | None:
     return joined(found) if found else None
 
 
-def _digest(mesh: TriangleMesh) -> str:
-    return hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes()).hexdigest()
-
-
-def _fraction(stored: Arrays) -> None:
-    if not 0.0 <= float(stored["fraction"]) <= 1.0:
+def _fraction(stored: Arrays) -> float:
+    fraction = float(stored["fraction"])
+    if not 0.0 <= fraction <= 1.0:
         raise ValueError("a fraction")
+    return fraction
 
 
 def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:
     arrays: Arrays = {"count": np.array(len(meshes))}
     for number, mesh in enumerate(meshes):
         if mesh is not None:
-            arrays |= {f"vertices{number}": mesh.vertices, f"faces{number}": mesh.faces}
+            arrays |= mesh_arrays(mesh, number)
     return arrays
 
 

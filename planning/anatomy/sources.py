@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from puncture_twin.planning.anatomy.scan import Scan
-from puncture_twin.planning.anatomy.skin import Skin, flat_ends, skin_from_mesh
+from puncture_twin.planning.anatomy.skin import Skin, flat_ends
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
+from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_skin
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names
@@ -139,9 +139,7 @@ class StructureSources:
                 allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
             )
         cut = section.cut or ()
-        return kept.get(
-            (skin_from_mesh.__name__, mesh.digest, cut), partial(skin_from_mesh, mesh, cut), lambda skin: skin.nbytes
-        )
+        return kept_skin(mesh, cut, self._cache)
 
     def scan(self, skin_section: StructureSection, skin: Skin) -> Scan | None:
         """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
-from puncture_twin.planning.anatomy.skin import Skin, skin_from_ct, skin_from_label
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_ct, skin_from_label, skin_from_mesh
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
@@ -22,7 +22,7 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
-LABELS_PRESENT = "labels present"
+Value = TypeVar("Value")
 
 READERS = "puncture_twin.planning.case.case_volumes"
 """The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
@@ -70,8 +70,11 @@ class VolumeSurfaces:
 
     def labels_present(self) -> tuple[int, ...]:
         """The labels that have a voxel, ascending."""
-        stored = self._arrays(LABELS_PRESENT, lambda: {"labels": np.array(self.labelmap.labels_present(), np.int64)})
-        return tuple(int(label) for label in stored["labels"])
+
+        def make() -> Arrays:
+            return {"labels": np.array(self.labelmap.labels_present(), np.int64)}
+
+        return self._kept("labels present", make, _to_labels)
 
     def mask_label(self) -> int | None:
         """Of a file that is one structure's mask, its voxels' value; None where it is empty."""
@@ -80,36 +83,36 @@ class VolumeSurfaces:
             label = mask_label(labelmap_of(self.volume, may_be_empty=True))
             return {"labels": np.array([] if label is None else [label], np.int64)}
 
-        stored = self.kept({"what": "mask label"}, make, by=__name__, check=_check_mask)["labels"]
-        return int(stored[0]) if len(stored) else None
+        return self._kept("mask label", make, _to_mask_label)
 
     def label(self, label: int) -> TriangleMesh:
         """The surface of one label, LPS mm."""
-        stored = self._arrays(f"label {label}", lambda: _of_mesh(label_mesh(self.labelmap, label, where=self.path)))
-        return kept_mesh(stored)
+        return self._kept(
+            f"label {label}", lambda: mesh_arrays(label_mesh(self.labelmap, label, where=self.path)), kept_mesh
+        )
 
     def skin_of_label(self, label: int) -> Skin:
         """The skin of a label that is the body."""
-        return _to_skin(self._arrays(f"skin {label}", lambda: _of_skin(skin_from_label(self.labelmap, label))))
+        return self._kept(f"skin {label}", lambda: _of_skin(skin_from_label(self.labelmap, label)), _to_skin)
 
     def skin_of_ct(self) -> Skin:
         """The skin of the body found in a CT."""
-        return _to_skin(self._arrays("skin", lambda: _of_skin(skin_from_ct(self.volume))))
+        return self._kept("skin", lambda: _of_skin(skin_from_ct(self.volume)), _to_skin)
 
     def kept(
-        self,
-        made_from: Mapping[str, Any],
-        make: Callable[[], Arrays],
-        *,
-        by: str,
-        check: Callable[[Arrays], object] | None = None,
-    ) -> Arrays:
-        """Arrays that are made from this file and from what ``made_from`` says; see `Cache.arrays`."""
-        return self.cache.arrays({"files": self.sha256, "readers": _readers(), **made_from}, make, by=by, check=check)
+        self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
+    ) -> Value:
+        """What is made from this file and from what ``made_from`` says; see `Cache.value`."""
+        return self.cache.value({"files": self.sha256, "readers": _readers(), **made_from}, make, read, by=by)
 
-    def _arrays(self, what: str, make: Callable[[], Arrays]) -> Arrays:
-        check = _to_skin if what.startswith("skin") else _check_labels if what == LABELS_PRESENT else kept_mesh
-        return self.kept({"what": what}, make, by=__name__, check=check)
+    def _kept(self, what: str, make: Callable[[], Arrays], read: Callable[[Arrays], Value]) -> Value:
+        return self.kept({"what": what}, make, read, by=__name__)
+
+
+def kept_skin(mesh: TriangleMesh, cut: Sequence[str], cache: Cache) -> Skin:
+    """`skin_from_mesh` of a mesh and the sides at which the body was cut, from the cache."""
+    made_from = {"what": "skin of a mesh", "mesh": mesh.digest, "cut": list(cut)}
+    return cache.value(made_from, lambda: _of_skin(skin_from_mesh(mesh, cut)), _to_skin, by=__name__)
 
 
 @cache
@@ -117,15 +120,17 @@ def _readers() -> str:
     return source_stamp(READERS)
 
 
-def _of_mesh(mesh: TriangleMesh) -> Arrays:
-    return {"vertices": mesh.vertices, "faces": mesh.faces}
+def mesh_arrays(mesh: TriangleMesh, number: int | str = "") -> Arrays:
+    """A surface for the cache, and what takes longest to find of it; see `kept_mesh`."""
+    facts = np.array([mesh.closed, mesh.wound_alike])
+    return {f"vertices{number}": mesh.vertices, f"faces{number}": mesh.faces, f"facts{number}": facts}
 
 
 def _of_skin(skin: Skin) -> Arrays:
     view = skin.field_of_view
     box = {} if view is None else {"T_ct_box": view.T_ct_box, "size_mm": view.size_mm, "cut": view.cut}
     warnings = np.array(skin.warnings, dtype=np.str_)
-    return {**_of_mesh(skin.mesh), **box, "cut_faces": skin.cut_faces, "warnings": warnings}
+    return {**mesh_arrays(skin.mesh), **box, "cut_faces": skin.cut_faces, "warnings": warnings}
 
 
 def _to_skin(stored: Arrays) -> Skin:
@@ -140,25 +145,34 @@ def kept_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
     """A surface, which went through the guard before it was stored, and does again: kept files may be anything.
 
     Args:
-        stored: With ``vertices`` and ``faces``.
-        number: Behind these two names, where there are several.
+        stored: With ``vertices``, ``faces`` and ``facts``: whether it is closed and wound alike.
+        number: Behind these names, where there are several.
 
     Raises:
         KeyError, TypeError, InputError: It is none.
     """
-    vertices, faces = stored[f"vertices{number}"], stored[f"faces{number}"]
-    if vertices.dtype != np.float64 or faces.dtype != np.int32:
+    vertices, faces, facts = (stored[f"{name}{number}"] for name in ("vertices", "faces", "facts"))
+    if vertices.dtype != np.float64 or faces.dtype != np.int32 or facts.dtype != np.bool_ or facts.shape != (2,):
         raise TypeError("a mesh of other types than ours")
-    return guard_mesh(vertices, faces, where="cache")
+    return guard_mesh(vertices, faces, where="cache").known(closed=bool(facts[0]), wound_alike=bool(facts[1]))
 
 
-def _check_mask(stored: Arrays) -> None:
-    labels = stored["labels"]
-    if labels.ndim != 1 or labels.dtype != np.int64 or len(labels) > 1:
+def _to_mask_label(stored: Arrays) -> int | None:
+    labels = _listed(stored)
+    if len(labels) > 1:
         raise ValueError("at most one label")
+    return labels[0] if labels else None
 
 
-def _check_labels(stored: Arrays) -> None:
+def _to_labels(stored: Arrays) -> tuple[int, ...]:
+    labels = _listed(stored)
+    if not labels:
+        raise ValueError("no label")
+    return labels
+
+
+def _listed(stored: Arrays) -> tuple[int, ...]:
     labels = stored["labels"]
-    if labels.ndim != 1 or labels.dtype != np.int64 or not len(labels):
-        raise ValueError("a list of labels")
+    if labels.ndim != 1 or labels.dtype != np.int64:
+        raise ValueError("no list of labels")
+    return tuple(labels.tolist())

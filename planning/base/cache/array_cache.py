@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from puncture_twin.planning.base.cache.cache_folder import StoredFile, store, touch
 from puncture_twin.planning.base.cache.entry_file import Arrays, DamagedError, packed, read_plain_file, unpacked
@@ -40,6 +40,16 @@ LIBRARIES = (
     *("pydantic", "pydicom", "python-gdcm", "h5py"),
 )
 """Whose versions decide what is made."""
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class _Read(Generic[Value]):
+    """Arrays, and what was read from them."""
+
+    arrays: Arrays
+    value: Value
 
 
 @dataclass(frozen=True)
@@ -72,20 +82,42 @@ class Cache:
             by: The module whose code makes them, such as ``puncture_twin.planning.anatomy.surfaces``.
             check: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
         """
+
+        def checked(arrays: Arrays) -> Arrays:
+            if check is not None:
+                check(arrays)
+            return arrays
+
+        return self.value(made_from, make, checked, by=by)
+
+    def value(
+        self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
+    ) -> Value:
+        """What ``read`` makes of `arrays`. To read them is their check too: a mesh is guarded once.
+
+        Args:
+            made_from: See `arrays`.
+            make: Makes the arrays.
+            read: Raises ValueError, KeyError,
+                TypeError or InputError for arrays that cannot be what ``make`` gives.
+            by: See `arrays`.
+        """
         if self.memory is NO_MEMORY:
-            return _frozen(make()) if self.folder is None else self._from_folder(_entry(made_from, by), make, check)
+            if self.folder is None:
+                return read(_frozen(make()))
+            return self._from_folder(_entry(made_from, by), make, read).value
         entry = _entry(made_from, by)
-        return self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, check), _size)
+        return read(self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, read).arrays, _size))
 
     def _from_folder(
-        self, entry: StoredFile, make: Callable[[], Arrays], check: Callable[[Arrays], object] | None
-    ) -> Arrays:
-        if self.folder is None:
-            return _frozen(make())
-        found = _kept(self.folder / entry.file, entry.key, check)
+        self, entry: StoredFile, make: Callable[[], Arrays], read: Callable[[Arrays], Value]
+    ) -> _Read[Value]:
+        found = None if self.folder is None else _kept(self.folder / entry.file, entry.key, read)
         if found is None:
-            found = _frozen(make())
-            self._store(entry, found)
+            made = _frozen(make())
+            found = _Read(made, read(made))
+            if self.folder is not None:
+                self._store(entry, made)
         return found
 
     def _store(self, entry: StoredFile, arrays: Arrays) -> None:
@@ -153,12 +185,11 @@ def _generation(by: str) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
-def _kept(path: Path, key: str, check: Callable[[Arrays], object] | None) -> Arrays | None:
-    """The arrays of an entry, or None where it is not there or, which is said, not to be trusted."""
+def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value] | None:
+    """What an entry holds, or None where it is not there or, which is said, not to be trusted."""
     try:
         arrays = unpacked(read_plain_file(path), key)
-        if check is not None:
-            check(arrays)
+        found = _Read(arrays, read(arrays))
     except FileNotFoundError:
         return None
     except (DamagedError, ValueError, KeyError, TypeError, InputError) as error:
@@ -166,4 +197,4 @@ def _kept(path: Path, key: str, check: Callable[[Arrays], object] | None) -> Arr
         warnings.warn(f"cache: a kept result {why}; it is made anew and replaced", CacheWarning, stacklevel=1)
         return None
     touch(path)
-    return arrays
+    return found

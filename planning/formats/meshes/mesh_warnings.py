@@ -35,20 +35,26 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
 
 
 def kept_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tuple[str, ...]:
-    """As `mesh_warnings` of each mesh, by name; what was found of the same meshes before is not found again."""
+    """As `mesh_warnings` of each mesh, by name; what was found of the same meshes before is not found again.
+
+    The meshes know then whether they are closed and wound alike, see `TriangleMesh.known`.
+    """
     made_from = {"what": "mesh warnings", "meshes": [(name, mesh.digest) for name, mesh in meshes.items()]}
 
     def found() -> Arrays:
-        return {
-            "lines": np.array([line for name, mesh in meshes.items() for line in mesh_warnings(mesh, name)], np.str_)
-        }
+        lines = [line for name, mesh in meshes.items() for line in mesh_warnings(mesh, name)]
+        facts = [(mesh.closed, mesh.wound_alike) for mesh in meshes.values()]
+        return {"lines": np.array(lines, np.str_), "facts": np.array(facts, np.bool_).reshape(-1, 2)}
 
-    return tuple(cache.arrays(made_from, found, by=__name__, check=_check_lines)["lines"].tolist())
+    def check(kept: Arrays) -> None:
+        lines, facts = kept["lines"], kept["facts"]
+        if lines.dtype.kind != "U" or lines.ndim != 1 or facts.dtype != np.bool_ or facts.shape != (len(meshes), 2):
+            raise ValueError("no lines, or not of these meshes")
 
-
-def _check_lines(kept: Arrays) -> None:
-    if kept["lines"].dtype.kind != "U" or kept["lines"].ndim != 1:
-        raise ValueError("no lines")
+    kept = cache.arrays(made_from, found, by=__name__, check=check)
+    for mesh, (closed, wound_alike) in zip(meshes.values(), kept["facts"].tolist(), strict=True):
+        mesh.known(closed=closed, wound_alike=wound_alike)
+    return tuple(kept["lines"].tolist())
 
 
 def _signed_volume(mesh: TriangleMesh) -> float:
