@@ -82,8 +82,7 @@ class PackedHulls:
         axes = by_axes(corners)
         inner = np.concatenate([inscribed_prism(piece) if about else piece for piece, about in pieces])
         count = len(self._boxes)
-        boxes, bodies = enclosed(self._corners[:count]), self._corners[count:]
-        arm = cache.arrays(made_from("hulls", bodies), lambda: enclosed(bodies), by=__name__)
+        boxes, arm = (kept_enclosed(some, cache) for some in (self._corners[:count], self._corners[count:]))
         centres, radii, slack, sizes, few, degrees = (
             np.concatenate([boxes[key], arm[key]]) for key in ("centres", "radii", "slack", "sizes", "few", "degrees")
         )
@@ -113,6 +112,11 @@ def by_axes(points: Floats) -> Axes:
     """The coordinates of points (n, 3), an array each."""
     x, y, z = (np.ascontiguousarray(axis) for axis in points.T)
     return x, y, z
+
+
+def kept_enclosed(hulls: Sequence[Floats], cache: Cache) -> Arrays:
+    """`enclosed` from the cache: boxes apart from the arm, which is the same for every patient."""
+    return cache.arrays(made_from("hulls", hulls), lambda: enclosed(hulls), by=__name__)
 
 
 def enclosed(hulls: Sequence[Floats]) -> Arrays:
