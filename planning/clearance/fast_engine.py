@@ -9,10 +9,12 @@ from functools import partial
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.processes import on_threads
 from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.clearance.block_orders import block_orders
 from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
@@ -50,7 +52,7 @@ class FastEngine:
     Args:
         meshes: The k surfaces, in the CT frame, mm.
         progress: Called with (structures done in all directions, structures).
-        memory: Where packed surfaces are kept.
+        cache: Where what is found of the surfaces is kept; its memory keeps them packed.
         threads: At most so many pieces of the work are done side by side, and one a core; each is done by itself, so
             the answer is the same to the bit.
 
@@ -62,10 +64,11 @@ class FastEngine:
         self,
         meshes: Sequence[TriangleMesh],
         progress: Count | None = None,
-        memory: Memory = NO_MEMORY,
+        cache: Cache = NO_CACHE,
         threads: int = MOST_THREADS,
     ) -> None:
-        self._blocks = _packed(meshes, threads) if memory is NO_MEMORY else _remembered(meshes, memory)
+        memory = cache.memory
+        self._blocks = _packed(meshes, threads, cache) if memory is NO_MEMORY else _remembered(meshes, memory)
         self._seen: tuple[Floats, tuple[PlacedSurface, ...]] | None = None
         self._threads = threads
         self._progress = progress
@@ -147,16 +150,18 @@ def _refuse_unsound(target: Floats, outward: Floats, lengths: Floats) -> None:
         raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
 
 
-def _packed(meshes: Sequence[TriangleMesh], threads: int) -> tuple[Blocks, ...]:
+def _packed(meshes: Sequence[TriangleMesh], threads: int, cache: Cache) -> tuple[Blocks, ...]:
     """Surfaces as blocks of triangles, packed side by side, the largest first; they are the same for every target."""
     found: dict[int, Blocks] = {}
     order = sorted(range(len(meshes)), key=lambda row: -len(meshes[row].faces))
+    threads = threads if sum(len(mesh.faces) for mesh in meshes) >= WORTH_THREADS else 1
+    known = block_orders(meshes, cache, threads) if cache.folder is not None and len(meshes) else None
 
     def work(k: int) -> None:
-        found[order[k]] = pack(meshes[order[k]])
+        row = order[k]
+        found[row] = pack(meshes[row], None if known is None else known[row])
 
-    many = sum(len(mesh.faces) for mesh in meshes) >= WORTH_THREADS
-    for _ in on_threads(work, len(meshes), threads if many else 1):
+    for _ in on_threads(work, len(meshes), threads):
         pass
     return tuple(found[row] for row in range(len(meshes)))
 

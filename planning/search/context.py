@@ -225,7 +225,7 @@ def prepare(
         case.files.release()
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
-        kept = {"memory": memory} if engine == "fast" else {}
+        kept = {"cache": cache} if engine == "fast" else {}
         measurer = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **kept)
         reach = None
         if arm is not False and placement is not None:

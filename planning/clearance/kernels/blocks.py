@@ -47,9 +47,19 @@ class Blocks:
         return sum(array.nbytes for array in (self.triangles, self.local, self.center, self.disc, self.base))
 
 
-def pack(mesh: TriangleMesh) -> Blocks:
-    """Pack a surface."""
-    order = kd_order(_middles(mesh.vertices, mesh.faces), LANES)
+def block_order(mesh: TriangleMesh) -> NDArray[np.int32]:
+    """The order in which a surface's triangles fill its blocks, shape (m,): what takes longest to find of them."""
+    return kd_order(_middles(mesh.vertices, mesh.faces), LANES).astype(np.int32)
+
+
+def pack(mesh: TriangleMesh, known: NDArray[np.int32] | None = None) -> Blocks:
+    """Pack a surface.
+
+    Args:
+        mesh: The surface.
+        known: Its `block_order`, where that has been found before.
+    """
+    order = np.array(block_order(mesh) if known is None else known, np.int64)
     blocks = -(-len(order) // LANES)
     counts = [blocks]
     while counts[-1] > LANES:
