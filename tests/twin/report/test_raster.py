@@ -15,9 +15,10 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
 from puncture_twin.twin.report.map_view import MapCells, map_view
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
+from puncture_twin.twin.report.raster.compositing import SAMPLES, compose
 from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.moving import MovingPicture
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, picture, shells_of
+from puncture_twin.twin.report.raster.render import Layer, Surface, View, opaque_shot, picture, posed, shells_of
 from puncture_twin.twin.report.raster.shading import corner_normals
 
 SIZE = 90, 120
@@ -132,6 +133,19 @@ def test_the_arms_that_ship_look_the_same_without_what_faces_away(model):
         seen = np.isfinite(whole.depth)
         assert seen.mean() > 0.05
         assert (whole.depth[seen] != front.depth[seen]).mean() < 1e-3
+
+
+def test_a_picture_is_what_its_samples_blend_to(rng, ball):
+    """Made at once, to the byte what shots and shells kept sample by sample, as for films, are blended to."""
+    camera = camera_at((0, -400, 30))
+    shapes = [Surface(soup(rng, 40), (200, 100, 50)), Surface(ball(30.0), (90, 160, 40))]
+    see_through = [Surface(ball(radius), (200, 0, 250), 0.3) for radius in (40.0, 50.0, 60.0)]
+    opaque, glass, fine = Layer(shapes), Layer(see_through), camera.finer(SAMPLES)
+    shot, before = opaque_shot(opaque, fine), View(glass, fine, posed(glass, fine))
+    wanted = compose(shot, before.shells(shot.depth, (0, 0), before.spans))
+    found = picture(opaque, glass, camera)
+    np.testing.assert_array_equal(found, wanted)
+    assert len(np.unique(found.reshape(-1, 3), axis=0)) > 1000
 
 
 def test_an_empty_layer_is_background():

@@ -136,10 +136,10 @@ def _blend(pixels, colour, depth, shell_colour, shell_alpha, shell_depth, before
                             y += alpha * (shell_colour[k, r, c, 1] - y)
                             z += alpha * (shell_colour[k, r, c, 2] - z)
                     red, green, blue = red + x, green + y, blue + z
-            pixels[i, j, 0], pixels[i, j, 1], pixels[i, j, 2] = _byte(red), _byte(green), _byte(blue)
+            pixels[i, j, 0], pixels[i, j, 1], pixels[i, j, 2] = byte(red), byte(green), byte(blue)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _byte(total):  # type: ignore[no-untyped-def]  # numba infers
+def byte(total):  # type: ignore[no-untyped-def]  # numba infers
     """The mean of a pixel's samples as a byte."""
     return np.uint8(min(max(np.round(total / SAMPLES**2), 0.0), 255.0))

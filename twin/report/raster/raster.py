@@ -124,7 +124,7 @@ def _cut_outline(points, face, seen, grid):
     return left, right, top, bottom
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@allocation_free(nogil=True, error_model="numpy")
 def draw(points, faces, bodies, spans, grid, corner, before, inverse, triangle):
     """Keep in every sample the nearest surface, or the nearest few in order, of those that nothing opaque hides.
 
@@ -153,7 +153,7 @@ def draw(points, faces, bodies, spans, grid, corner, before, inverse, triangle):
             _draw_one(bodies, f, planes, span, grid, corner, before, inverse, triangle)
 
 
-@allocation_free(nogil=True, error_model="numpy")
+@allocation_free(nogil=True, error_model="numpy", forceinline=True)
 def _draw_one(bodies, f, planes, span, grid, corner, before, inverse, triangle):
     """Keep triangle f in the samples of its span that it covers: its edges' planes, and what makes them 1/z."""
     p, q, r, per_facing = planes
@@ -168,10 +168,14 @@ def _draw_one(bodies, f, planes, span, grid, corner, before, inverse, triangle):
         lo, hi = begin, end
         if end - begin > WIDE:
             lo, hi = _inside(pu, pe, qu, qe, ru, re, begin, end)
+        within = False
         for column in range(lo, hi + 1):
             wa, wb, wc = pu * column + pe, qu * column + qe, ru * column + re
             if wa < 0.0 or wb < 0.0 or wc < 0.0:
+                if within:  # what a row has inside a triangle is in one piece
+                    break
                 continue
+            within = True
             value = (wa + wb + wc) * per_facing
             i, j = row - row0, column - column0
             slack = TIE * value * value

@@ -24,8 +24,8 @@ from puncture_twin.twin.report.raster.compositing import (
     SAMPLES,
     RasterShot,
     Shells,
-    compose,
 )
+from puncture_twin.twin.report.raster.finish import finish
 from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.raster import depth_before, draw, outlines, sorted_by_band
 from puncture_twin.twin.report.raster.shading import corner_normals, flat_normals, rotated, shade_nearest, shade_shells
@@ -46,7 +46,7 @@ BACKGROUND = np.array([246.0, 247.0, 249.0], dtype=np.float32)
 LIGHT = np.array([-0.45, 0.6, -1.0]) / np.linalg.norm([-0.45, 0.6, -1.0])
 """Over the viewer's left shoulder: right, up, forward."""
 
-BAND = 120_000
+BAND = 60_000
 """Samples that are worked on at once: their arrays stay in the cache, and the bands share the processors."""
 
 
@@ -141,11 +141,16 @@ class View:
     """
 
     def __init__(self, layer: Layer, camera: ViewCamera, seen: Posed) -> None:
-        self._grid = camera.scale, camera.height, camera.width
+        self.grid = camera.scale, camera.height, camera.width
         self._layer, self._camera = layer, camera
         self._mesh = seen.points, layer.faces, layer.bodies
         self._look = seen.normals, flat_normals(seen.points, layer.faces), layer.colours
-        self.spans = outlines(seen.points, layer.faces, layer.bodies, layer.solids, self._grid)
+        self.spans = outlines(seen.points, layer.faces, layer.bodies, layer.solids, self.grid)
+
+    @property
+    def look(self) -> Any:
+        """As `finish` takes it."""
+        return *self._mesh, *self._look, self._layer.alphas, self._layer.rims
 
     @cached_property
     def _by_band(self) -> tuple[NDArray[np.int64], Ints32]:
@@ -166,7 +171,7 @@ class View:
             spans: The triangles that it needs.
         """
         drawn = Drawn.empty(1, shot.depth.shape)
-        self.draw(depth_before(shot.depth, self._grid, corner), drawn, corner, spans)
+        self.draw(depth_before(shot.depth, self.grid, corner), drawn, corner, spans)
         self.shade(drawn, shot, corner)
 
     def draw(self, hidden: Floats32, drawn: Drawn, corner: tuple[int, int], spans: Ints32) -> None:
@@ -178,11 +183,11 @@ class View:
             corner: Row and column of the whole picture at which it begins.
             spans: The triangles that it needs.
         """
-        draw(*self._mesh, spans, self._grid, corner, hidden, *drawn)
+        draw(*self._mesh, spans, self.grid, corner, hidden, *drawn)
 
     def shade(self, drawn: Drawn, shot: RasterShot, corner: tuple[int, int]) -> None:
         """Colour and depth of the samples for which a triangle was found, in place; ``corner`` is even."""
-        place = tuple(LIGHT), self._grid, corner, drawn.inverse[0], drawn.triangle[0]
+        place = tuple(LIGHT), self.grid, corner, drawn.inverse[0], drawn.triangle[0]
         shade_nearest(*self._mesh, *self._look, *place, shot.colour, shot.depth)
 
     def shells(self, before: Floats32, corner: tuple[int, int], spans: Ints32) -> Shells:
@@ -194,9 +199,9 @@ class View:
             spans: The triangles that it needs.
         """
         drawn = Drawn.empty(MAX_SHELLS, before.shape)
-        self.draw(depth_before(before, self._grid, corner), drawn, corner, spans)
+        self.draw(depth_before(before, self.grid, corner), drawn, corner, spans)
         shells = Shells.empty(MAX_SHELLS, *before.shape)
-        look: Any = (*self._look, self._layer.alphas, self._layer.rims, tuple(LIGHT), self._grid, corner)
+        look: Any = (*self._look, self._layer.alphas, self._layer.rims, tuple(LIGHT), self.grid, corner)
         for shell in zip(*drawn, shells.colour, shells.alpha, shells.depth, strict=True):
             samples: Any = shell
             shade_shells(*self._mesh, *look, *samples)
@@ -239,13 +244,20 @@ def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> NDArray[n
     """
     fine = camera.finer(SAMPLES)
     solid, glass = (View(layer, fine, posed(layer, fine)) for layer in (opaque, translucents))
+    return np.concatenate(_in_bands(fine, lambda band, rows: _pixels(solid, glass, band, rows)))
 
-    def draw_band(band: int, rows: slice) -> NDArray[np.uint8]:
-        shot = _background(rows.stop - rows.start, fine.width)
-        solid.put_opaque(shot, (rows.start, 0), solid.of_band(band))
-        return compose(shot, glass.shells(shot.depth, (rows.start, 0), glass.of_band(band)))
 
-    return np.concatenate(_in_bands(fine, draw_band))
+def _pixels(solid: View, glass: View, band: int, rows: slice) -> NDArray[np.uint8]:
+    """A band of a picture of what is opaque and of what is see-through before it, shape (h, w, 3)."""
+    corner, size = (rows.start, 0), (rows.stop - rows.start, solid.grid[2])
+    behind, shells = Drawn.empty(1, size), Drawn.empty(MAX_SHELLS, size)
+    solid.draw(np.zeros(size, dtype=np.float32), behind, corner, solid.of_band(band))
+    glass.draw(behind.inverse[0], shells, corner, glass.of_band(band))
+    held = np.empty((1 + MAX_SHELLS, SAMPLES * SAMPLES, 4), dtype=np.float32)
+    pixels = np.empty((size[0] // SAMPLES, size[1] // SAMPLES, 3), dtype=np.uint8)
+    place: Any = tuple(LIGHT), solid.grid, corner
+    finish(solid.look, glass.look, *place, behind.triangle, shells.triangle, tuple(BACKGROUND), held, pixels)
+    return pixels
 
 
 def _background(height: int, width: int) -> RasterShot:

@@ -93,13 +93,13 @@ def shade_nearest(
         bottom = min(top + 2, triangle.shape[0])
         for left in range(0, triangle.shape[1], 2):
             right = min(left + 2, triangle.shape[1])
-            alike = _alike(triangle, top, bottom, left, right, bodies, flats)
+            alike = all_alike(triangle, top, bottom, left, right, bodies, flats)
             tone, shine = 0.0, 0.0
             if alike:
                 x = (corner[1] + 0.5 * (left + right) - width / 2) / scale
                 y = (height / 2 - corner[0] - 0.5 * (top + bottom)) / scale
                 f = triangle[top, left]
-                tone, shine, _ = _lit(points, normals, flats, faces, f, x, y, light)
+                tone, shine, _ = lit(points, normals, flats, faces, f, x, y, light)
             for i in range(top, bottom):
                 for j in range(left, right):
                     f = triangle[i, j]
@@ -112,7 +112,7 @@ def shade_nearest(
                         continue
                     depth[i, j] = far
                     if not alike:
-                        tone, shine, _ = _lit(points, normals, flats, faces, f, x, y, light)
+                        tone, shine, _ = lit(points, normals, flats, faces, f, x, y, light)
                     for k in range(3):
                         colour[i, j, k] = min(colours[bodies[f], k] * tone + shine, 255.0)
 
@@ -161,13 +161,13 @@ def shade_shells(
         bottom = min(top + 2, triangle.shape[0])
         for left in range(0, triangle.shape[1], 2):
             right = min(left + 2, triangle.shape[1])
-            alike = _alike(triangle, top, bottom, left, right, bodies, flats)
+            alike = all_alike(triangle, top, bottom, left, right, bodies, flats)
             tone, shine, facing = 0.0, 0.0, 0.0
             if alike:
                 x = (corner[1] + 0.5 * (left + right) - width / 2) / scale
                 y = (height / 2 - corner[0] - 0.5 * (top + bottom)) / scale
                 f = triangle[top, left]
-                tone, shine, facing = _lit(points, normals, flats, faces, f, x, y, light)
+                tone, shine, facing = lit(points, normals, flats, faces, f, x, y, light)
             for i in range(top, bottom):
                 for j in range(left, right):
                     f = triangle[i, j]
@@ -176,7 +176,7 @@ def shade_shells(
                     x = (corner[1] + j + 0.5 - width / 2) / scale
                     y = (height / 2 - (corner[0] + i) - 0.5) / scale
                     if not alike:
-                        tone, shine, facing = _lit(points, normals, flats, faces, f, x, y, light)
+                        tone, shine, facing = lit(points, normals, flats, faces, f, x, y, light)
                     body, edge_on = bodies[f], 1.0 - facing
                     # A shell seen edge-on is thicker along the ray: glass-like outlines help to read its shape.
                     alpha[i, j] = min(1.0, alphas[body] * (1.0 + rims[body] * edge_on * edge_on * edge_on))
@@ -186,7 +186,7 @@ def shade_shells(
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _alike(triangle, top, bottom, left, right, bodies, flats):
+def all_alike(triangle, top, bottom, left, right, bodies, flats):
     """Whether the samples of a pixel show one smooth surface, so that one shading serves them all."""
     f = triangle[top, left]
     if f < 0:
@@ -223,7 +223,7 @@ def _triple(x, y, b, c):
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _lit(points, normals, flats, faces, f, x, y, light):
+def lit(points, normals, flats, faces, f, x, y, light):
     """Factor on the body's colour, grey of the highlight, |cos| between normal and ray.
 
     Phong's lighting (Commun. ACM 18, 1975) by one lamp beside the camera, with half Lambert: what faces away from the
