@@ -16,7 +16,6 @@ from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
 from puncture_twin.twin.report.map_view import MapCells, map_view
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.compositing import SAMPLES, compose
-from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.moving import MovingPicture
 from puncture_twin.twin.report.raster.render import Layer, Surface, View, opaque_shot, picture, posed, shells_of
 from puncture_twin.twin.report.raster.shading import corner_normals
@@ -29,6 +28,11 @@ def soup(rng, count, size=30.0, spread=80.0):
     middle = rng.uniform(-spread, spread, (count, 1, 3))
     corners = (middle + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3)
     return TriangleMesh(corners, np.arange(3 * count, dtype=np.int32).reshape(-1, 3))
+
+
+def alone(triangles):
+    """A mesh of triangles that share no corner."""
+    return TriangleMesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
 
 
 def camera_at(eye, look_at=(0.0, 0.0, 0.0)):
@@ -194,7 +198,10 @@ def test_line_of_sight_is_what_all_triangles_say(rng, points):
     way = seen - eye
     far = np.linalg.norm(way, axis=1)
     wanted = all_hits(mesh, eye, way / far[:, None]).min(axis=1) < far - 2.0
-    assert np.array_equal(blocked(mesh.vertices, mesh.faces, eye, seen, 2.0), wanted)
+    half = len(mesh.faces) // 2  # two bodies, and one far from all sight lines
+    bodies = [mesh.triangles[:half], mesh.triangles[half:], mesh.triangles[:5] + 1000.0]
+    layer = Layer([Surface(alone(body), (1, 2, 3)) for body in bodies])
+    assert np.array_equal(~layer.sees(eye, seen), wanted)
     assert points == "one" or 0 < wanted.sum() < len(wanted)
 
 

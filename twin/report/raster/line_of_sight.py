@@ -14,15 +14,18 @@ ROUNDING = 1e-6
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def blocked(vertices, faces, eye, points, slack):
+def blocked(vertices, faces, starts, boxes, eye, points, slack):
     """Whether a triangle lies between the eye and each point.
 
     The sight lines lie in a thin slab about the plane through the eye and two of the points: hardly any
     triangle meets it when the points stand in a line, as along a needle. Those that do are tested one by one.
+    Nor is a body looked at whose box lies beside the slab, or beside the box about eye and points.
 
     Args:
         vertices: Shape (n, 3), mm.
         faces: Shape (m, 3).
+        starts: Shape (b + 1, 2), where each body's vertices and faces begin, and where the last one's end.
+        boxes: Shape (b, 2, 3), lowest and highest corner of the box about each body, mm.
         eye: Shape (3,).
         points: Shape (k, 3).
         slack: mm; a triangle this close before a point does not hide it.
@@ -31,6 +34,34 @@ def blocked(vertices, faces, eye, points, slack):
         Shape (k,), bool.
     """
     out = np.zeros(len(points), dtype=np.bool_)
+    across = _across(eye, points)
+    half = ROUNDING
+    for k in range(len(points)):
+        half = max(half, abs(((points[k] - eye) * across).sum()))
+    beside = np.empty(len(vertices))
+    for body in range(len(boxes)):
+        if not _meets(boxes[body], eye, points, across, half):
+            continue
+        for i in range(starts[body, 0], starts[body + 1, 0]):
+            beside[i] = _above(vertices, i, eye, across)
+        for f in range(starts[body, 1], starts[body + 1, 1]):
+            p, q, r = beside[faces[f, 0]], beside[faces[f, 1]], beside[faces[f, 2]]
+            if min(p, q, r) > half or max(p, q, r) < -half:
+                continue
+            a, b, c = (
+                _from(vertices, faces[f, 0], eye),
+                _from(vertices, faces[f, 1], eye),
+                _from(vertices, faces[f, 2], eye),
+            )
+            for k in range(len(points)):
+                if not out[k]:
+                    out[k] = _between(a, b, c, _from(points, k, eye), slack)
+    return out
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _across(eye, points):
+    """The unit normal of the plane through the eye and the two points that are farthest apart seen from it."""
     across, longest = np.zeros(3), 0.0
     for k in range(len(points)):
         normal = _cross(points[0] - eye, points[k] - eye)
@@ -43,25 +74,35 @@ def blocked(vertices, faces, eye, points, slack):
         normal = _cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
         length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
         across[0], across[1], across[2] = normal[0] / length, normal[1] / length, normal[2] / length
-    half = ROUNDING
-    for k in range(len(points)):
-        half = max(half, abs(((points[k] - eye) * across).sum()))
-    beside = np.empty(len(vertices))
-    for i in range(len(vertices)):
-        beside[i] = (
-            (vertices[i, 0] - eye[0]) * across[0]
-            + (vertices[i, 1] - eye[1]) * across[1]
-            + (vertices[i, 2] - eye[2]) * across[2]
-        )
-    for f in range(len(faces)):
-        p, q, r = beside[faces[f, 0]], beside[faces[f, 1]], beside[faces[f, 2]]
-        if min(p, q, r) > half or max(p, q, r) < -half:
-            continue
-        a, b, c = vertices[faces[f, 0]] - eye, vertices[faces[f, 1]] - eye, vertices[faces[f, 2]] - eye
+    return across
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _meets(box, eye, points, across, half):
+    """Whether a box may hold what lies between the eye and one of the points."""
+    above, reach = 0.0, half + ROUNDING
+    for i in range(3):
+        above += ((box[0, i] + box[1, i]) / 2 - eye[i]) * across[i]
+        reach += (box[1, i] - box[0, i]) / 2 * abs(across[i])
+        low, high = eye[i], eye[i]
         for k in range(len(points)):
-            if not out[k]:
-                out[k] = _between(a, b, c, points[k] - eye, slack)
-    return out
+            low, high = min(low, points[k, i]), max(high, points[k, i])
+        if box[0, i] > high + ROUNDING or box[1, i] < low - ROUNDING:
+            return False
+    return abs(above) <= reach
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _from(points, i, eye):
+    """From the eye to one of the points."""
+    return points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _above(vertices, i, eye, across):
+    """How far a vertex lies on one side of the plane through the eye, mm."""
+    x, y, z = _from(vertices, i, eye)
+    return x * across[0] + y * across[1] + z * across[2]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -97,7 +97,19 @@ class Layer:
     def sees(self, eye: Floats, points: Floats) -> NDArray[np.bool_]:
         """Whether nothing of this layer lies between an eye and each point (n, 3), in the layer's frame."""
         eye, points = np.array(eye, dtype=np.float64), np.array(points, dtype=np.float64, order="C")
-        return np.asarray(~blocked(self.vertices, self.faces, eye, points, LINE_OF_SIGHT_SLACK_MM))
+        mesh = self.vertices, self.faces, self._starts, self._boxes
+        return np.asarray(~blocked(*mesh, eye, points, LINE_OF_SIGHT_SLACK_MM))
+
+    @cached_property
+    def _boxes(self) -> Floats:
+        """About each surface, shape (b, 2, 3), mm."""
+        return np.array([s.mesh.bounds for s in self.surfaces]).reshape(-1, 2, 3)
+
+    @cached_property
+    def _starts(self) -> NDArray[np.int64]:
+        """Where the vertices and faces of each surface begin, and where the last ones end, shape (b + 1, 2)."""
+        counts = [(len(s.mesh.vertices), len(s.mesh.faces)) for s in self.surfaces]
+        return np.cumsum([(0, 0), *counts], axis=0)
 
 
 class Drawn(NamedTuple):
