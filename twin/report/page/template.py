@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
+from pydantic_core import to_json
 
 from puncture_twin.planning.base.files import atomic
 
@@ -25,6 +26,9 @@ PLOTLY = "plotly_js/plotly-gl3d.min.js"
 
 PACKED = 4
 """Of gzip's levels: at 6 it takes two and a half times as long for six parts in a hundred."""
+
+BEFORE_NUMBER = b"[,:-"
+"""What a number follows in JSON, or its sign."""
 
 
 class Card(NamedTuple):
@@ -73,13 +77,29 @@ def plotly_script() -> Markup:
 
 
 def script_json(data: Any) -> Markup:
-    """JSON, packed."""
-    return packed(json.dumps(data, allow_nan=False, separators=(",", ":")))
+    """JSON, packed.
+
+    Raises:
+        ValueError: A number is not finite.
+    """
+    text = to_json(data)  # in a quarter of the time that Python's own takes
+    if _may_follow(text, b"NaN") or _may_follow(text, b"Inf"):
+        return packed(json.dumps(data, allow_nan=False))  # which knows words in a string from numbers
+    return packed(text)
 
 
-def packed(text: str) -> Markup:
+def _may_follow(text: bytes, word: bytes) -> bool:
+    """Whether a word stands in JSON where a number may."""
+    at = text.find(word)
+    while at > 0 and text[at - 1] not in BEFORE_NUMBER:
+        at = text.find(word, at + 1)
+    return at >= 0
+
+
+def packed(text: str | bytes) -> Markup:
     """Text as gzip in base64, the same bytes every time; no tag can begin in it. ``unpack.js`` reads it."""
-    return Markup(base64.b64encode(gzip.compress(text.encode("utf-8"), PACKED, mtime=0)).decode("ascii"))
+    plain = text if isinstance(text, bytes) else text.encode("utf-8")
+    return Markup(base64.b64encode(gzip.compress(plain, PACKED, mtime=0)).decode("ascii"))
 
 
 def data_address(picture: Path) -> str:
