@@ -36,7 +36,17 @@ MOST_BYTES = 2_000_000_000
 """Where it says nothing: the surfaces of some twenty whole bodies."""
 
 LIBRARIES = (
-    *("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "python-fcl", "trimesh", "fast-simplification"),
+    *(
+        "puncture-twin",
+        "numpy",
+        "scipy",
+        "scikit-image",
+        "numba",
+        "llvmlite",
+        "python-fcl",
+        "trimesh",
+        "fast-simplification",
+    ),
     *("pydantic", "pydicom", "python-gdcm", "h5py"),
 )
 """Whose versions decide what is made."""
