@@ -43,6 +43,9 @@ RING_SLACK = 1e-7
 HALF_CELL_SLACK = 1e-6
 """Share by which rounding may widen half a cell."""
 
+CLEAR = 1e-9
+"""rad; a direction this far within a cell is in it whatever rounding did."""
+
 
 class RimLabel(NamedTuple):
     """A body direction at the rim: its text and its angle on the picture, counter-clockwise from the right."""
@@ -190,24 +193,65 @@ class MapCells:
 def _find_rows(rows, betas, starts, heights, half_theta, half_beta, theta, beta):  # type: ignore[no-untyped-def]  # numba infers
     found = np.empty(len(theta), dtype=np.int64)
     for i in range(len(theta)):
-        found[i] = _find_row(rows, betas, starts, heights, half_theta, half_beta, theta[i], beta[i])
+        cell = _find_cell(betas, starts, heights, half_theta, half_beta, theta[i], beta[i])
+        found[i] = rows[cell] if cell >= 0 else -1
     return found
 
 
 @nb.njit(cache=True)
 def _find_picture(rows, betas, starts, heights, half_theta, half_beta, turn, theta_max, size):  # type: ignore[no-untyped-def]  # numba infers
+    """Most pixels are well within the cell of the pixel before: only for the others is it searched for."""
+    insides = _insides(betas, starts, heights, half_theta, half_beta, turn)
     found = np.empty((size, size), dtype=np.int64)
     for line in range(size):
-        y = 1.0 - (line + 0.5) / size * 2
+        y, cell = 1.0 - (line + 0.5) / size * 2, -1
         for column in range(size):
             x = (column + 0.5) / size * 2 - 1
-            theta, beta = np.hypot(x, y) * theta_max, np.mod(np.arctan2(y, x) - turn, 2 * np.pi)
-            found[line, column] = _find_row(rows, betas, starts, heights, half_theta, half_beta, theta, beta)
+            if cell < 0 or not _well_within(insides, cell, x, y, theta_max):
+                theta = np.hypot(x, y) * theta_max
+                if theta > heights[-1] + half_theta + CLEAR:
+                    cell = -1
+                else:
+                    beta = np.mod(np.arctan2(y, x) - turn, 2 * np.pi)
+                    cell = _find_cell(betas, starts, heights, half_theta, half_beta, theta, beta)
+            found[line, column] = rows[cell] if cell >= 0 else -1
     return found
 
 
 @nb.njit(cache=True)
-def _find_row(rows, betas, starts, heights, half_theta, half_beta, theta, beta):  # type: ignore[no-untyped-def]  # numba infers
+def _insides(betas, starts, heights, half_theta, half_beta, turn):  # type: ignore[no-untyped-def]  # numba infers
+    """Where each cell lies, and how far from its middle a direction is in it for sure, shape (n, 5).
+
+    Its θ, half its height, cosine and sine of its azimuth on the picture, sine of half its width, less ``CLEAR``.
+    """
+    insides = np.empty((len(betas), 5))
+    for ring in range(len(heights)):
+        high = half_theta
+        if ring > 0:
+            high = min(high, (heights[ring] - heights[ring - 1]) / 2)
+        if ring + 1 < len(heights):
+            high = min(high, (heights[ring + 1] - heights[ring]) / 2)
+        begin, end = starts[ring], starts[ring + 1]
+        for i in range(begin, end):
+            before = betas[i - 1] if i > begin else betas[end - 1] - 2 * np.pi
+            after = betas[i + 1] if i + 1 < end else betas[begin] + 2 * np.pi
+            wide = min(half_beta[ring], (betas[i] - before) / 2, (after - betas[i]) / 2, np.pi / 2)
+            insides[i, 0], insides[i, 1], insides[i, 4] = heights[ring], high - CLEAR, np.sin(wide - CLEAR)
+            insides[i, 2], insides[i, 3] = np.cos(betas[i] + turn), np.sin(betas[i] + turn)
+    return insides
+
+
+@nb.njit(cache=True)
+def _well_within(insides, cell, x, y, theta_max):  # type: ignore[no-untyped-def]  # numba infers
+    """Whether a place (x right, y up) in the disc lies within a cell, and not so near its border that this may err."""
+    radius, cosine, sine = np.sqrt(x * x + y * y), insides[cell, 2], insides[cell, 3]
+    if abs(radius * theta_max - insides[cell, 0]) >= insides[cell, 1]:
+        return False
+    return cosine * x + sine * y > 0.0 and abs(cosine * y - sine * x) < radius * insides[cell, 4]
+
+
+@nb.njit(cache=True)
+def _find_cell(betas, starts, heights, half_theta, half_beta, theta, beta):  # type: ignore[no-untyped-def]  # numba infers
     """The cell of a direction: in the nearest ring that of the nearest azimuth; -1 where that is too far."""
     ring = _first_not_below(heights, np.int64(0), len(heights), theta)
     if ring == len(heights) or (ring > 0 and theta - heights[ring - 1] <= heights[ring] - theta):
@@ -221,7 +265,7 @@ def _find_row(rows, betas, starts, heights, half_theta, half_beta, theta, beta):
     ahead, behind = _turn(betas[after] - beta), _turn(betas[before] - beta)
     if min(ahead, behind) > half_beta[ring]:
         return -1
-    return rows[after] if ahead < behind else rows[before]
+    return after if ahead < behind else before
 
 
 @nb.njit(cache=True)
