@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.bodies.body import Body
+from puncture_twin.planning.collision.bodies.body import FLANGE_FRAME, Body
 from puncture_twin.planning.collision.bodies.shapes import touch
 from puncture_twin.planning.collision.bodies.solid import Solid
 from puncture_twin.planning.collision.patient import FclPatient
@@ -25,6 +25,11 @@ class Check(NamedTuple):
     second_body: Body
     hulls: tuple[Floats | None, Floats] | None
     """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
+
+    @property
+    def before_last_joint(self) -> bool:
+        """Whether it is of two bodies of the arm neither of which moves with the last joint."""
+        return self.first_body is not None and max(self.first_body.frame, self.second_body.frame) < FLANGE_FRAME
 
     def contact_at(self, frames: Floats) -> Contact | None:
         """The contact, if the two shapes touch where ``link_poses`` (7, 4, 4) has them; see `contact_found`."""

@@ -152,6 +152,19 @@ class CellChecker:
         """
         return [self.contact(state, needle_may_touch_patient=needle_may_touch_patient) for state in q]
 
+    def folded(self, q: Floats) -> Bools:
+        """At which of many states (n, 6), rad, two links touch that come before the last joint: so at any q6.
+
+        Raises:
+            InputError: If a state is not finite.
+        """
+        before = [check for check in self._checks if check.before_last_joint]
+        found = np.zeros(len(q), np.bool_)
+        for row, state in enumerate(q):
+            self._place(state)
+            found[row] = any(check.contact_found() is not None for check in before)
+        return found
+
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """The first state of a path with a contact, and the contact; None when all are clear.
 

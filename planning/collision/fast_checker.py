@@ -11,7 +11,7 @@ from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.collision.checker import NEEDLE_IN_PATIENT, CellChecker, Contact, FirstContact
 from puncture_twin.planning.collision.kernels.segment_parts import Room, segment_room
@@ -63,6 +63,7 @@ class FastChecker(CellChecker):
         self._still = (np.zeros((1, 7)), np.zeros((1, 6)))
         needle = np.array([check.contact == NEEDLE_IN_PATIENT for check in self._tested])
         self._round = np.array([check.first_body is None and check.contact.body in ROUND for check in self._tested])
+        self._before_last = np.array([check.before_last_joint for check in self._tested], np.bool_)
         self._masks = {False: np.ones_like(needle), True: ~needle}
         self._padding_mm = padding_mm
 
@@ -81,12 +82,26 @@ class FastChecker(CellChecker):
         tested, known = np.stack([mask, mask & ~self._round]), np.zeros(len(states), np.int64)
         if round_clear is not None:
             known[round_clear] = 1
-        found: list[Contact | None] = [None] * len(states)
-        begins = np.zeros(len(states), dtype=np.int64)
-        while (left := self._proofs.first_not_clear(frames, begins, tested, known)).checks.max(initial=-1) >= 0:
+        return self._first_found(frames, tested, known)
+
+    def folded(self, q: Floats) -> Bools:
+        """See :meth:`StateChecker.folded`."""
+        states = np.asarray(q, dtype=np.float64).reshape(-1, 6)
+        require_finite(states)
+        frames, all_alike = link_poses(self.model, states), np.zeros(len(states), np.int64)
+        found = self._first_found(frames, self._before_last[None], all_alike)
+        return np.array([contact is not None for contact in found], np.bool_)
+
+    def _first_found(self, frames: Floats, tested: Bools, of_state: Ints) -> list[Contact | None]:
+        """The first contact of each state, see :meth:`Proofs.first_not_clear`."""
+        found: list[Contact | None] = [None] * len(frames)
+        begins = np.zeros(len(frames), dtype=np.int64)
+        while (left := self._proofs.first_not_clear(frames, begins, tested, of_state)).checks.max(initial=-1) >= 0:
             begins = np.where(left.checks < 0, len(self._tested), left.checks + 1)
-            for row in np.flatnonzero(left.checks >= 0).tolist():
-                found[row] = self._contact_of(int(left.checks[row]), int(left.answers[row]), frames[row])
+            rows = np.flatnonzero(left.checks >= 0)
+            of_rows = left.checks[rows].tolist(), left.answers[rows].tolist()
+            for row, check, answer in zip(rows.tolist(), *of_rows, strict=True):
+                found[row] = self._contact_of(check, answer, frames[row])
                 if found[row] is not None:
                     begins[row] = len(self._tested)
         return found

@@ -88,6 +88,9 @@ class StateChecker(Protocol):
         Where ``round_clear`` (n,) says so, holder and needle are known to touch neither patient nor boxes.
         """
 
+    def folded(self, q: Floats) -> Bools:
+        """At which of many states (n, 6), rad, two links touch that come before the last joint: so at any q6."""
+
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """The first state of ``q_path`` (m, 6), rad, with a contact, and the contact; None when all are clear."""
 

@@ -77,6 +77,19 @@ class FirstClear:
         past = [contact is None or contact.other in BODY_NAMES for contact in contacts]  # the workcell is checked first
         self._round_clear[motions.rows] |= np.array(past, np.bool_)
 
+    def drop_folded(self, checker: StateChecker) -> None:
+        """Drop the branches on which the arm touches itself at the standoff whatever the roll.
+
+        To be called where a motion of each request was tried: those that go no farther than the standoff change neither
+        its answer nor what was deepest.
+        """
+        rows, at = np.nonzero(self._left)
+        left = np.zeros(self._starts.shape[:2], np.bool_)
+        left[rows, self._branches[rows, at]] = True
+        branches, rows = np.nonzero(left.T)  # neighbours in turn: what is proven of one is nearly proven of the next
+        left[rows, branches] = ~checker.folded(self._starts[rows, branches] + self._turns[rows, branches, 0])
+        self._left &= np.take_along_axis(left, self._branches, axis=1)
+
     def _tried(
         self, checker: StateChecker, motions: NextMotions, at: int, contact: Contact | None
     ) -> ReachAnswer | Blocked:

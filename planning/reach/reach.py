@@ -90,14 +90,23 @@ def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: i
     """Of each request; round by round the next motion of all that have no answer yet."""
     surveys = _surveyed(checker, requests, n_rolls)
     search = FirstClear(surveys)
-    while len((motions := search.next_motions()).rows):
-        clear = motions.round_clear
-        contacts = checker.contacts(motions.standoffs, needle_may_touch_patient=False, round_clear=clear)
-        search.take(checker, motions, contacts)
+    _try_next(checker, search)
+    search.drop_folded(checker)
+    while _try_next(checker, search):
+        pass
     return [
         refusal(checker.model, found, deepest) if answer is None else answer
         for found, answer, deepest in zip(surveys, search.answers, search.deepest, strict=True)
     ]
+
+
+def _try_next(checker: StateChecker, search: FirstClear) -> bool:
+    """Try the next motion of each request whose search goes on; whether there was one."""
+    motions = search.next_motions()
+    clear = motions.round_clear
+    contacts = checker.contacts(motions.standoffs, needle_may_touch_patient=False, round_clear=clear)
+    search.take(checker, motions, contacts)
+    return len(motions.rows) > 0
 
 
 def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[Surveyed]:

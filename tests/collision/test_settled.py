@@ -170,6 +170,20 @@ def test_holder_and_needle_that_are_known_to_be_clear_are_not_checked() -> None:
     assert all(c is None or c.body not in ("holder", "needle") or c.other in BODY_NAMES for c in left) and None in left
 
 
+def test_an_arm_is_folded_where_fcl_finds_links_before_the_last_joint_in_contact() -> None:
+    """Whatever q6 is, and whatever else touches: skin, box and table do not count, nor what is on the flange."""
+    slow, fast, rng = cell(CellChecker), cell(FastChecker), np.random.default_rng(9)
+    states = rng.uniform(-np.pi, np.pi, (600, 6))
+    folded = slow.folded(states)
+    assert 100 < folded.sum() < 500
+    states[:, 5] = rng.uniform(-np.pi, np.pi, 600)
+    np.testing.assert_array_equal(fast.folded(states), folded)
+    contacts = slow.contacts(states, needle_may_touch_patient=False)
+    assert all(contact is not None for contact, one in zip(contacts, folded, strict=True) if one)
+    assert any(contact is not None for contact, one in zip(contacts, folded, strict=True) if not one)
+    assert fast.folded(np.empty((0, 6))).shape == (0,)
+
+
 def test_only_an_origin_well_within_a_tetrahedron_is_deep() -> None:
     """Not outside, not next to a face, not in a flat one, and not where a corner is missing."""
     corners = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])

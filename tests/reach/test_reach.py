@@ -19,6 +19,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.reach.branch_paths import every_branch, fill_branch_path
@@ -271,6 +272,29 @@ def test_a_standoff_that_starts_inside_the_skin_is_a_collision() -> None:
     skin = TriangleMesh(np.asarray(ball.vertices) + TARGET, np.asarray(ball.faces))
     answer = assess_reach_all(CellChecker(UR3, TOOL, patient=skin), [asked])[0]
     assert answer.reason is Reason.ARM_COLLISION and "patient at standoff" in answer.detail
+
+
+class Unfolded(FastChecker):
+    """Never says that an arm is folded: of each motion its contacts are checked."""
+
+    def folded(self, q: np.ndarray) -> np.ndarray:
+        """Nowhere."""
+        return np.zeros(len(q), np.bool_)
+
+
+def test_branches_on_which_the_arm_is_folded_are_passed_over_and_change_no_answer() -> None:
+    """The same answers, to the bit, as where each of their motions is tried."""
+    ball = trimesh.creation.icosphere(radius=80.0)
+    skin = TriangleMesh(ball.vertices + TARGET - [0.0, 0.0, 90.0], np.asarray(ball.faces))
+    requests = [request(u, 60.0) for u in directions(150, 4)]
+    with_it, without = (kind(UR3, TOOL, patient=skin, padding_mm=2.0) for kind in (FastChecker, Unfolded))
+    answers = assess_reach_all(with_it, requests)
+    for answer, expected in zip(answers, assess_reach_all(without, requests), strict=True):
+        assert (answer.reason, answer.detail, answer.contact) == (expected.reason, expected.detail, expected.contact)
+        assert (answer.branch, answer.depth_mm) == (expected.branch, expected.depth_mm)
+        np.testing.assert_array_equal(answer.insertion_q, expected.insertion_q)
+    starts = [answer.insertion_q[0] for answer in answers if answer.reachable]
+    assert not with_it.folded(np.array(starts)).any() and 5 < len(starts) < 145
 
 
 @pytest.mark.parametrize("roll", np.linspace(0.0, 2 * np.pi, 5))
