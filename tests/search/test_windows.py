@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy.spatial import cKDTree
 
+from puncture_twin.planning.case.angle_grid import AngleGrid
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.search.selection.safe_cone import grid_cone, with_grid_cone
 from puncture_twin.planning.search.selection.windows import SQUARE_DEGREES, find_windows
@@ -49,6 +51,30 @@ def test_no_cone_enters_a_cap_that_is_as_wide_as_a_cell(theta, beta, radius_deg)
     safe = apart > np.radians(radius_deg)
     cone = grid_cone(found.grid, safe)
     assert (cone <= apart[safe] - np.radians(radius_deg) + 1e-9).all()
+
+
+@settings(max_examples=200)
+@given(
+    grid=st.sampled_from([(0, 90, 0, 360, 6.0), (0, 180, 0, 360, 12.0), (30, 80, 0, 357, 7.0), (0, 60, 20, 200, 5.0)]),
+    share=st.floats(0.02, 0.98),
+    seed=st.integers(0, 2**32 - 1),
+    smooth=st.booleans(),
+)
+def test_a_cone_ends_at_the_nearest_of_all_that_are_not_safe(grid, share, seed, smooth):
+    """Scattered and in patches, round the pole and round a gap between the azimuths: to the bit, found among all."""
+    low, high, first, last, step = grid
+    theta, beta = (np.radians(np.arange(a, b + 1e-9, step)) for a, b in ((low, high), (first, last)))
+    full = np.isclose(last - first, 360)
+    beta = beta[:-1] if full else beta
+    angles = AngleGrid(theta, beta, np.radians(step), bool(full))
+    vectors = outward(np.repeat(theta, len(beta)), np.tile(beta, len(theta)))
+    rng = np.random.default_rng(seed)
+    score = vectors @ rng.normal(size=3) if smooth else rng.random(len(vectors))
+    safe = score > np.quantile(score, share)
+    barred = np.concatenate([vectors[~safe], outward(*angles.beyond())])
+    chord = cKDTree(barred).query(vectors[safe])[0]
+    expected = np.maximum(2 * np.arcsin(np.clip(chord / 2, 0, 1)) - np.sqrt(2) * angles.step, 0)
+    assert grid_cone(angles, safe).tolist() == expected.tolist()
 
 
 def test_a_cone_never_reaches_over_the_ends_of_the_search():

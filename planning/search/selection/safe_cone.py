@@ -42,9 +42,25 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
         safe: Shape (n,), row by row.
     """
     theta, beta = np.repeat(grid.theta, len(grid.beta)), np.tile(grid.beta, len(grid.theta))
-    vectors = outward(theta, beta)
-    barred = np.concatenate([vectors[~safe], outward(*grid.beyond())])
+    border = _border(grid, safe)
+    barred = np.concatenate([outward(theta[border], beta[border]), outward(*grid.beyond())])
     if not len(barred):
         return np.full(int(safe.sum()), np.pi)
-    chord, _ = scipy.spatial.cKDTree(barred).query(vectors[safe])
+    chord, _ = scipy.spatial.cKDTree(barred).query(outward(theta[safe], beta[safe]))
     return np.maximum(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)) - DIAGONAL * grid.step, 0.0)
+
+
+def _border(grid: AngleGrid, safe: Bools) -> Bools:
+    """Directions among which, or beyond the grid, is one that is not safe and nearest to a safe one, whichever it is.
+
+    They are not safe themselves, and lie beside a safe one or at an end of the azimuths. From any other, the step
+    towards the safe one, first in azimuth the shorter way and then in θ, stays in the grid and ends nearer (at a pole
+    in the same direction) in one that is not safe either.
+    """
+    pairs = grid.neighbours()
+    ends = pairs[safe[pairs[:, 0]] != safe[pairs[:, 1]]].ravel()
+    border = np.zeros((len(grid.theta), len(grid.beta)), bool)
+    border.ravel()[ends] = True
+    if not grid.full_circle:
+        border[:, [0, -1]] = True
+    return np.asarray(border.ravel() & ~safe)
