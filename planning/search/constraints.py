@@ -86,13 +86,19 @@ def first_broken(
 
 
 def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:
-    """Column of the structure that lacks most of its margin, shape (n,); equal lacks go to the one met first."""
-    if not structures:
-        return np.zeros(len(clearances.clearance), np.int64)
-    margins = np.array([s.margin_mm for s in structures])
-    lack = np.where(clearances.violated, margins - clearances.clearance, -np.inf)
-    most = lack.max(axis=1, keepdims=True)
-    return np.argmin(np.where(lack == most, clearances.depth, np.inf), axis=1)
+    """Column of the structure that lacks most of its margin, shape (n,); equal lacks go to the one met first.
+
+    0 where none lacks any.
+    """
+    count = len(clearances.clearance)
+    worst, most, met = np.zeros(count, np.int64), np.full(count, -np.inf), np.full(count, np.inf)
+    for column, structure in enumerate(structures):
+        rows = np.flatnonzero(clearances.violated[:, column])
+        lack, depth = structure.margin_mm - clearances.clearance[rows, column], clearances.depth[rows, column]
+        more = (lack > most[rows]) | ((lack == most[rows]) & (depth < met[rows]))
+        rows = rows[more]
+        worst[rows], most[rows], met[rows] = column, lack[more], depth[more]
+    return worst
 
 
 def closest_miss(found: Candidates) -> int | None:
