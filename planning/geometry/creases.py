@@ -60,9 +60,12 @@ def _normals(mesh: TriangleMesh) -> NDArray[np.float64]:
 
 def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Floats:
     """Unit normals at points of triangles: the corners' normals (area weighted), blended; shape (n, 3)."""
-    a, b, c = np.moveaxis(mesh.triangles, 1, 0)
+    asked = np.zeros(len(mesh.vertices), bool)
+    asked[mesh.faces[face]] = True
+    around = np.flatnonzero(asked[mesh.faces].any(axis=1))
+    a, b, c = np.moveaxis(mesh.triangles[around], 1, 0)
     areas = np.cross(b - a, c - a)
-    corners, at_vertex = mesh.faces.T.reshape(-1), np.empty_like(mesh.vertices)
+    corners, at_vertex = mesh.faces[around].T.reshape(-1), np.empty_like(mesh.vertices)
     for axis, part in enumerate(areas.T):
         at_vertex[:, axis] = np.bincount(corners, weights=np.tile(part, 3), minlength=len(at_vertex))
     weights = _corner_weights(mesh.triangles[face], points)
