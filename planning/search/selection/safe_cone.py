@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy
 
 from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.case.angle_grid import AngleGrid
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.search.candidates import CONE_OF_GRID, Candidates
@@ -46,7 +46,8 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
     barred = np.concatenate([outward(theta[border], beta[border]), outward(*grid.beyond())])
     if not len(barred):
         return np.full(int(safe.sum()), np.pi)
-    chord, _ = scipy.spatial.cKDTree(barred).query(outward(theta[safe], beta[safe]))
+    chord = np.empty(int(safe.sum()))
+    _least_chords(outward(theta[safe], beta[safe]), barred, chord)
     return np.maximum(2 * np.arcsin(np.clip(chord / 2, 0.0, 1.0)) - DIAGONAL * grid.step, 0.0)
 
 
@@ -64,3 +65,14 @@ def _border(grid: AngleGrid, safe: Bools) -> Bools:
     if not grid.full_circle:
         border[:, [0, -1]] = True
     return np.asarray(border.ravel() & ~safe)
+
+
+@allocation_free()
+def _least_chords(points, others, chords):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``chords`` (n,) with the distance of each point (n, 3) from the nearest of the others (m, 3)."""
+    for i in range(len(points)):
+        least = np.inf
+        for k in range(len(others)):
+            x, y, z = points[i, 0] - others[k, 0], points[i, 1] - others[k, 1], points[i, 2] - others[k, 2]
+            least = min(least, x * x + y * y + z * z)
+        chords[i] = np.sqrt(least)

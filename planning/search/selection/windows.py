@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.case.angle_grid import AngleGrid
@@ -80,13 +79,22 @@ def nearest_row(found: Candidates, outward_ct: Floats) -> int | None:
 
 
 def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
-    """A label for each row; safe neighbours share theirs."""
+    """A label for each row; safe neighbours share theirs, the least of their rows.
+
+    A label is a row of the same set. Where neighbours differ, the row that one names takes the other's label if that is
+    less, and all rows take the label of the row that they name (Shiloach and Vishkin, J. Algorithms 3, 1982).
+    """
     if grid is None:
         return np.arange(len(safe))
     pairs = grid.neighbours()
-    pairs = pairs[safe[pairs].all(axis=1)]
-    links = scipy.sparse.coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(len(safe), len(safe)))
-    return np.asarray(scipy.sparse.csgraph.connected_components(links, directed=False)[1], np.int64)
+    one, other = pairs[safe[pairs].all(axis=1)].T
+    label: Ints = np.arange(len(safe))
+    while not np.array_equal(label[one], label[other]):
+        least, ends = np.minimum(label[one], label[other]), (label[one], label[other])
+        for end in ends:
+            np.minimum.at(label, end, least)
+        label = label[label]
+    return label
 
 
 def _entry_area(found: Candidates, cell: Floats) -> Floats:
