@@ -8,8 +8,8 @@ import puncture_twin
 BASE = "planning/base"
 COPIED = (
     *("__init__.py", "planning/__init__.py", f"{BASE}/__init__.py", f"{BASE}/errors.py", f"{BASE}/numba_kernels.py"),
-    *(f"{BASE}/cache/{name}.py" for name in ("__init__", "kernel_cache", "kernel_files", "brought_kernels")),
-    *(f"{BASE}/cache/{name}.py" for name in ("source_stamp", "entry_file")),
+    *(f"{BASE}/cache/{name}.py" for name in ("__init__", "kernel_cache", "kernel_files", "kernel_library")),
+    *(f"{BASE}/cache/{name}.py" for name in ("brought_kernels", "source_stamp", "entry_file")),
 )
 """What a project needs to keep its kernels as ours does."""
 

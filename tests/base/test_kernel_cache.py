@@ -175,6 +175,19 @@ def test_what_is_kept_is_loaded_without_what_only_compiling_needs(project):
     assert _python(project, loads + compiles).stdout.split() == ["2.0", "False", "3.0", "True"]
 
 
+@pytest.mark.parametrize("others", [False, True], ids=["ours", "others'"])
+def test_bitcode_is_parsed_when_another_kernel_takes_it_in(project, others):
+    """A kept kernel answers without; one that is compiled later has it, and answers right."""
+    (project / "stranger.py").write_text("import numba\n@numba.njit(cache=True)\ndef add(x):\n    return x + 1\n")
+    source = "stranger" if others else "puncture_twin.planning.caller"
+    loads = "import puncture_twin.planning.base.numba_kernels, numba\nimport llvmlite.binding as llvm\n"
+    loads += "read, real = [], llvm.parse_bitcode\nllvm.parse_bitcode = lambda code: read.append(code) or real(code)\n"
+    loads += f"from {source} import add\nprint(add(1), sum(add.stats.cache_hits.values()), len(read))\n"
+    takes_in = "numba.njit(lambda x: add(x) + 1)(1)\nprint(numba.njit(lambda x: add(x) * 10)(1), len(read))"
+    assert _python(project, loads).stdout.split()[:2] == ["2", "0"]
+    assert _python(project, loads + takes_in).stdout.split() == ["2", "1", "0", "20", "1"]
+
+
 def test_a_users_place_for_compiled_code_stays_in_force(project):
     """Numba's setting of locators decides where kernels lie, not what they are stamped with."""
     place = "from numba.core import config\nconfig.CACHE_LOCATOR_CLASSES = 'InTreeCacheLocator'\n"

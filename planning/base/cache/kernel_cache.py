@@ -18,12 +18,12 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from numba.core import caching, config as numba_config, dispatcher as numba_dispatcher
-from numba.core.codegen import get_host_cpu_features
+from numba.core import caching, codegen as numba_codegen, config as numba_config, dispatcher as numba_dispatcher
 from numba.core.runtime.nrt import rtsys
 
 from puncture_twin.planning.base.cache.brought_kernels import BROUGHT, brought_class, brought_folder
 from puncture_twin.planning.base.cache.kernel_files import CheckedFiles
+from puncture_twin.planning.base.cache.kernel_library import KernelLibrary
 from puncture_twin.planning.base.cache.source_stamp import PACKAGE, PARTS, library_versions, sources_with, stamp_of
 
 config: Any = numba_config
@@ -111,9 +111,11 @@ class KernelCache(NumbasCache):
 
 
 def use_kernel_cache() -> None:
-    """Let numba keep this project's kernels so, and all others as ever."""
-    numbas: Any = numba_dispatcher  # its attribute is a class; what stands in for it makes an object of one of two
-    numbas.FunctionCache = _cache_of
+    """Let numba keep this project's kernels so, all others as ever, and parse no kept bitcode before it is needed."""
+    dispatcher: Any = numba_dispatcher  # its attribute is a class; what stands in for it makes an object of one of two
+    dispatcher.FunctionCache = _cache_of
+    codegen: Any = numba_codegen.JITCPUCodegen
+    codegen._library_class = KernelLibrary
     name = class_in_use()
     if name is not None:
         config.CPU_NAME, config.CPU_FEATURES = name, ""  # no feature beyond those of the class
@@ -138,7 +140,7 @@ def class_in_use() -> str | None:
 
 def host_features() -> frozenset[str]:
     """What this processor can do, in LLVM's words, without what numba is told to leave out."""
-    words = get_host_cpu_features().split(",")
+    words = numba_codegen.get_host_cpu_features().split(",")
     return frozenset(word.removeprefix("+") for word in words if word.startswith("+"))
 
 
