@@ -22,6 +22,7 @@ from benchmarks import peers
 from benchmarks.proof import prove
 from benchmarks.scenes import Scene, dense, scenes
 from benchmarks.search_profile import profile
+from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 
@@ -36,8 +37,10 @@ def took(work: Callable[[], object]) -> float:
     return time.thread_time() - start
 
 
-def rounds(scene: Scene, directions: np.ndarray, sample: int) -> dict[str, float]:
+def rounds(scene: Scene, directions: np.ndarray, sample: int, kept: Cache) -> dict[str, float]:
     """Seconds of everybody for all directions, means over rounds in which all take their turn.
+
+    Building again finds the order of the triangles in ``kept``, as a second search of the same surfaces does.
 
     FCL is asked for another part of a random sample in each round, and its time scaled to all directions. So a
     neighbour who comes or goes in between slows both sides alike. Only `FclEngine` is asked once for all of it: each of
@@ -47,11 +50,13 @@ def rounds(scene: Scene, directions: np.ndarray, sample: int) -> dict[str, float
     engine, judge, objects = FastEngine(scene.meshes, threads=1), FclEngine(scene.meshes), peers.trees(scene)
     ask = (scene.target, directions, scene.length)
     engine.measure(*ask)
+    FastEngine(scene.meshes, cache=kept, threads=1)
     sums: dict[str, float] = {}
     for part in np.array_split(directions[chosen], ROUNDS):
         scale = len(directions) / len(part)
         times = {
             "build": took(lambda: FastEngine(scene.meshes, threads=1)),
+            "build again": took(lambda: FastEngine(scene.meshes, cache=kept, threads=1)),
             "exact": took(lambda: engine.measure(*ask)),
             "FCL build": took(lambda: FclEngine(scene.meshes)),
             "FCL capsule": peers.fcl_capsule_distance(scene, part, objects) * scale,
@@ -66,7 +71,8 @@ def rounds(scene: Scene, directions: np.ndarray, sample: int) -> dict[str, float
 def measure_scene(scene: Scene, sample: int, step_deg: float) -> None:
     """Print one scene's rows."""
     directions = scene.hemisphere(step_deg)
-    s = rounds(scene, directions, sample)
+    with tempfile.TemporaryDirectory() as folder:
+        s = rounds(scene, directions, sample, Cache(Path(folder)))
     sizes = f"{scene.triangles:,} triangles, {len(scene.meshes)} surfaces, {len(directions):,} directions"
     print(f"\n## {scene.name}: {sizes}")
     print("| ratio | search alone | end to end, building included |\n|---|---|---|")
