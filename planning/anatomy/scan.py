@@ -34,6 +34,7 @@ from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.cache.array_cache import Arrays
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.mesh_guard import fits
+from puncture_twin.planning.formats.volumes.nearest_voxel import nearest
 from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.voxelize import voxels_inside
@@ -167,14 +168,8 @@ class Scan:
         Args:
             points_ct: Shape (n, 3), LPS mm.
         """
-        T = np.linalg.inv(self._ct.T_ct_index)
-        at = np.einsum("ij,nj->ni", T[:3, :3], points_ct) + T[:3, 3]  # on one core: several wait for a busy one
-        index = np.round(at).astype(np.int64)
-        within = [(column >= 0) & (column < size) for column, size in zip(index.T, self._hu.shape, strict=True)]
-        inside = within[0] & within[1] & within[2]  # one by one: numpy is slow with axis=1
-        found = np.full(len(points_ct), np.nan)
-        found[inside] = self._hu[tuple(index[inside].T)]
-        return found
+        T_index_ct = np.asarray(np.linalg.inv(self._ct.T_ct_index), dtype=np.float64)
+        return nearest(self._hu, T_index_ct, points_ct)
 
     @cached_property
     def _ct(self) -> Oriented:

@@ -15,6 +15,7 @@ import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation u
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.volumes.nearest_voxel import nearest
 from puncture_twin.planning.formats.volumes.nifti_header import TYPES
 from puncture_twin.planning.formats.volumes.nrrd_header import TYPES as NRRD_TYPES
 from puncture_twin.planning.formats.volumes.orientation import canonical
@@ -263,6 +264,20 @@ def test_canonical_order_is_right_handed_and_keeps_places() -> None:
         oriented = canonical(stored, T_stored)
         assert np.array_equal(oriented.values, VALUES)
         assert np.allclose(oriented.T_ct_index, T, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+def test_a_point_has_the_value_of_the_nearest_voxel(order: tuple[int, ...]) -> None:
+    """However the voxels lie in memory; half way between two voxels it is the even one, outside there is none."""
+    values = np.ascontiguousarray(VALUES.transpose(order), dtype=np.float32).transpose(np.argsort(order))
+    quarters = np.stack(np.meshgrid(*(np.arange(-4, 4 * n + 1) / 4 for n in SHAPE), indexing="ij"), axis=-1)
+    at = quarters.reshape(-1, 3)
+    found = nearest(values, np.linalg.inv(np.vstack([SFORM, [0, 0, 0, 1]])), at * [2.0, 3.0, 4.0] + [10.0, 20.0, 30.0])
+    for index, value in zip(at.tolist(), found.tolist(), strict=True):
+        voxel = tuple(round(v) for v in index)  # Python's rounds halves to even too
+        inside = all(0 <= v < n for v, n in zip(voxel, SHAPE, strict=True))
+        assert value == values[voxel] if inside else np.isnan(value)
+    assert np.isnan(nearest(values, np.eye(4), np.array([[np.nan, 1.0, 1.0], [np.inf, 1.0, 1.0]]))).all()
 
 
 def restored(values: np.ndarray, T: np.ndarray, order: tuple[int, ...], flips: tuple[int, ...]) -> tuple[Any, Any]:

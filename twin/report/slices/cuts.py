@@ -1,10 +1,14 @@
 """Where a plane cuts surfaces, the needle, and the ellipsoid of the tip."""
 
+# numba infers the types
+# mypy: disable-error-code="no-untyped-def"
+
 from __future__ import annotations
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.slices.planes import Plane
 
@@ -16,19 +20,42 @@ def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
     """
     if not _is_seen(mesh, plane):
         return np.zeros((0, 2, 2))
-    height = plane.height(mesh.vertices)
-    above = height > 0  # a corner in the plane counts as below it: every triangle is cut in no edge or in two
-    if above.all() or not above.any():
-        return np.zeros((0, 2, 2))
-    sides = above[mesh.faces]
-    cut = np.flatnonzero((sides[:, 0] != sides[:, 1]) | (sides[:, 0] != sides[:, 2]))
-    sides, faces = sides[cut], mesh.faces[cut]
-    alone = np.where(sides[:, 0] == sides[:, 1], 2, np.where(sides[:, 0] == sides[:, 2], 1, 0))
-    row = np.arange(len(faces))
-    tip, others = faces[row, alone], np.stack([faces[row, (alone + 1) % 3], faces[row, (alone + 2) % 3]], axis=1)
-    along = (height[tip] / (height[tip] - height[others].T)).T[:, :, None]
-    ends = mesh.vertices[tip][:, None] * (1 - along) + mesh.vertices[others] * along
-    return plane.place(ends)
+    return plane.place(_cut(mesh.vertices, mesh.faces, tuple(plane.normal), plane.at_ct @ plane.normal))
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _cut(vertices, faces, normal, offset):
+    """Where a plane cuts a mesh's triangles, shape (n, 2, 3), mm, in the order of the triangles.
+
+    Args:
+        vertices: Shape (v, 3), mm, read-only.
+        faces: Shape (m, 3), read-only.
+        normal: The plane's, three numbers.
+        offset: Of its points along the normal, mm.
+    """
+    height = np.empty(len(vertices))
+    for v in range(len(vertices)):
+        x, y, z = vertices[v, 0] * normal[0], vertices[v, 1] * normal[1], vertices[v, 2] * normal[2]
+        height[v] = x + y + z - offset
+    first = np.empty(len(faces), dtype=np.int8)  # the corner that is alone on its side
+    count = 0
+    for f in range(len(faces)):
+        # a corner in the plane counts as below it: every triangle is cut in no edge or in two
+        a, b, c = height[faces[f, 0]] > 0, height[faces[f, 1]] > 0, height[faces[f, 2]] > 0
+        first[f] = (-1 if b == c else 2) if a == b else (1 if a == c else 0)
+        count += first[f] >= 0
+    ends = np.empty((count, 2, 3))
+    count = 0
+    for f in range(len(faces)):
+        if first[f] >= 0:
+            tip = faces[f, first[f]]
+            for k in range(2):
+                other = faces[f, (first[f] + 1 + k) % 3]
+                along = height[tip] / (height[tip] - height[other])
+                for axis in range(3):
+                    ends[count, k, axis] = vertices[tip, axis] * (1 - along) + vertices[other, axis] * along
+            count += 1
+    return ends
 
 
 def _is_seen(mesh: TriangleMesh, plane: Plane) -> bool:
