@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
-from pydantic_core import to_json
+from pydantic import ConfigDict, TypeAdapter
 
 from puncture_twin.planning.base.files import atomic
 
@@ -82,7 +82,8 @@ def script_json(data: Any) -> Markup:
     Raises:
         ValueError: A number is not finite.
     """
-    text = to_json(data)  # in a quarter of the time that Python's own takes
+    writer: TypeAdapter[Any] = TypeAdapter(Any, config=ConfigDict(ser_json_inf_nan="constants"))
+    text = writer.dump_json(data)  # in a quarter of the time that Python's own takes
     if _may_follow(text, b"NaN") or _may_follow(text, b"Inf"):
         return packed(json.dumps(data, allow_nan=False))  # which knows words in a string from numbers
     return packed(text)
