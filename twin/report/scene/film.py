@@ -231,7 +231,9 @@ def _drawn_ahead(views: _Views, poses: Sequence[Sequence[Floats]]) -> Iterator[_
 
 def _moving_picture(bodies: list[SceneBody], camera: ViewCamera, layers: Sequence[Layer]) -> MovingPicture:
     """One view of bodies that stand still (CT frame) and of layers that move."""
-    opaque, translucent = ([b.surface for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
+    opaque, translucent = (
+        [b.seen_from(camera.eye) for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False)
+    )
     return MovingPicture(Layer(opaque), Layer(translucent), layers, camera)
 
 

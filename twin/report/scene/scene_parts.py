@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from puncture_twin.planning.geometry.winding import hit_fraction
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.twin.report import palette
+from puncture_twin.twin.report.raster.outwards import faces_outwards
 from puncture_twin.twin.report.raster.render import Layer, Surface
 from puncture_twin.twin.report.scene.shapes import ball, bar, box, corridor_mouth, corridor_walls, ring
 
@@ -76,6 +78,16 @@ class SceneBody:
         """For the ray caster; the corridor is flat colour, without the rim that makes a skin look like glass."""
         rim = 0.0 if self.group == "safe" else Surface.rim
         return Surface(self.mesh, self.colour, self.alpha, rim, self.solid)
+
+    def seen_from(self, eye_ct: Floats) -> Surface:
+        """The same for an eye (3,), mm: solid where that is seen to be so, and the eye is not within its box."""
+        low, high = self.mesh.bounds
+        within = bool(np.all((low <= eye_ct) & (eye_ct <= high)))
+        return replace(self.surface, solid=not within and self._hides_its_back)
+
+    @cached_property
+    def _hides_its_back(self) -> bool:
+        return self.solid or (self.alpha >= 1 and faces_outwards(self.mesh))
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,8 +98,8 @@ def draw_scene(
 
 def render_bodies(bodies: Sequence[SceneBody], camera: ViewCamera) -> NDArray[np.uint8]:
     """One view of a scene, anti-aliased: the opaque bodies, and the see-through ones over them."""
-    opaque = Layer([b.surface for b in bodies if b.alpha >= 1])
-    return picture(opaque, Layer([b.surface for b in bodies if b.alpha < 1]), camera)
+    opaque, glass = ([b.seen_from(camera.eye) for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
+    return picture(Layer(opaque), Layer(glass), camera)
 
 
 def _path(case: Any, pick: Pick | None, plan: Any | None) -> NDArray[np.float64] | None:
