@@ -1,10 +1,11 @@
 """How long a person waits, and for what: ``python -m benchmarks.wait``; beside an older state: ``--against CHECKOUT``.
 
 Every command runs in a new process, in two states: with an empty cache folder (cold), and with everything there (warm,
-the median of ``--times``); with ``--first-use`` also with nothing compiled. What is printed is processor
-time, which other work on the machine changes less than the clock; `benchmarks.wait_probe` divides it. The last row is
-the clock's: what a person waits, where nothing else runs. Two checkouts take turns. The real CT (61 structures,
-1 degree, with the arm) is left out where it is not on this machine.
+the median of ``--times``); with ``--first-use`` also with nothing compiled. What is printed is processor time, which
+other work on the machine changes less than the clock; `benchmarks.wait_probe` divides it. The last row is the clock's:
+what a person waits, where nothing else runs. The probe itself takes 0.1 to 0.2 s: ``--bare`` leaves it out and prints
+the last rows alone; ``--one-core`` lets a command use one core only. Two checkouts take turns. The real CT (61
+structures, 1 degree, with the arm) is left out where it is not on this machine.
 """
 
 from __future__ import annotations
@@ -22,10 +23,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from time import perf_counter
+from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"
 PROBE = Path(__file__).with_name("wait_probe.py")
+
+BARE = "import sys; sys.path.insert(0, sys.argv.pop(1)); from puncture_twin.run_twin import program; program()"
+"""For Python: a checkout's command, as a person runs it."""
 
 Seconds = dict[str, float]
 
@@ -65,23 +70,31 @@ def real_case(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Side:
-    """One checkout, with a folder of its own for what it keeps, and for what it compiles if ``alone``."""
+    """One checkout, with a folder of its own for what it keeps, and for what it compiles if ``alone``.
+
+    ``bare`` runs commands without the probe.
+    """
 
     name: str
     checkout: Path
     folder: Path
     alone: bool
+    bare: bool
 
     def run(self, command: Command) -> Seconds:
         """Seconds of one run in a new process, by what was waited for."""
         answer = self.folder / "answer.json"
-        words = [sys.executable, str(PROBE), str(self.checkout), str(answer), *command.words]
+        begin = ["-c", BARE, str(self.checkout)] if self.bare else [str(PROBE), str(self.checkout), str(answer)]
         start, before = perf_counter(), _used_by_others()
-        done = subprocess.run(words, env=self._environment(), capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [sys.executable, *begin, *command.words],
+            env=self._environment(),
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         passed, used = perf_counter() - start, _used_by_others() - before
-        if done.returncode:
-            raise SystemExit(done.stderr)
-        found = json.loads(answer.read_text())
+        found = {"exit_code": done.returncode, "seconds": {ALL: used}} if self.bare else _read(answer, done)
         if found["exit_code"] > 1:
             raise SystemExit(f"{self.name}: {command.name} ended with {found['exit_code']}\n{done.stderr}")
         return {**found["seconds"], END: used - found["seconds"][ALL], ALL: used, CLOCK: passed}
@@ -96,6 +109,14 @@ class Side:
         environment = {key: value for key, value in os.environ.items() if key not in unset}
         kernels = {"NUMBA_CACHE_DIR": str(self.folder / "kernels")} if self.alone else {}
         return {**environment, "PUNCTURE_TWIN_CACHE": str(self.folder / "kept"), **kernels}
+
+
+def _read(answer: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    """What the probe has written."""
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    found: dict[str, Any] = json.loads(answer.read_text())
+    return found
 
 
 def _used_by_others() -> float:
@@ -144,17 +165,23 @@ def main() -> None:
     parser.add_argument("--only", help="some of help,check,search,real,demo")
     parser.add_argument("--times", type=int, default=3, help="warm runs")
     parser.add_argument("--first-use", action="store_true", help="with nothing compiled too: minutes")
+    parser.add_argument("--bare", action="store_true", help="without the probe: as a person runs them")
+    parser.add_argument("--one-core", action="store_true", help="on one core")
     chosen = parser.parse_args()
+    if chosen.one_core:
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         shutil.copytree(REPOSITORY / "meshes" / "abdomen", folder / "abdomen")
-        sides = [Side("this", REPOSITORY, folder / "this", chosen.first_use)]
+        how = chosen.first_use, chosen.bare
+        sides = [Side("this", REPOSITORY, folder / "this", *how)]
         if chosen.against is not None:
-            sides.insert(0, Side("before", chosen.against.resolve(), folder / "before", chosen.first_use))
+            sides.insert(0, Side("before", chosen.against.resolve(), folder / "before", *how))
         for side in sides:
             side.folder.mkdir()
         only = None if chosen.only is None else set(chosen.only.split(","))
-        print(f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors")
+        cores = len(os.sched_getaffinity(0))
+        print(f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors, {cores} used")
         for command in commands(folder):
             if only is None or command.name in only:
                 print_table(command, measured(command, sides, chosen.times, first_use=chosen.first_use))
