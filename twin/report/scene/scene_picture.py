@@ -114,7 +114,7 @@ def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> Vi
     points = []
     for body in bodies:
         vertices = body.mesh.vertices
-        if body.group in {"skin", "organ"}:
+        if body.group in {"skin", "organ"} and _reach_mm(body, case.target_ct) >= BODY_RADIUS_MM:
             vertices = vertices[np.linalg.norm(vertices - case.target_ct, axis=1) < BODY_RADIUS_MM]
         if body.group != "room" and len(vertices):
             points.append(vertices)
@@ -122,6 +122,11 @@ def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> Vi
     blockers = Layer([b.surface for b in bodies if b.alpha >= 1 and b.group in {"arm", "room", "target"}])
     outward = None if path_ct is None else (path_ct[1] - path_ct[0]) / np.linalg.norm(path_ct[1] - path_ct[0])
     return overview(case, np.concatenate(points), focus, blockers, size, outward)
+
+
+def _reach_mm(body: SceneBody, point_ct: NDArray[np.float64]) -> float:
+    """No corner of a body is farther than this from a point (3,)."""
+    return float(np.linalg.norm(np.abs(body.mesh.bounds - point_ct).max(axis=0)))
 
 
 def _needle_line(case: Any, path_ct: NDArray[np.float64]) -> NDArray[np.float64]:
