@@ -1,8 +1,10 @@
 """Where rays from one point cross a surface: every crossing, in float64, without a missed edge.
 
 All rays start at the target, so a triangle is met exactly by the rays inside the solid angle that it subtends. Rays are
-binned by direction; each triangle visits the bins that its bounding cone touches. Two triangles that share an edge
-compute its edge function from the same numbers with the opposite sign, so a ray through the edge hits at least one.
+binned by direction; each triangle visits the bins that its bounding cone touches, and of their rays those inside of the
+cone: where a ray lies in the plane of a triangle far beside it, the edge functions are rounding alone. Two triangles
+that share an edge compute its edge function from the same numbers with the opposite sign, so a ray through the edge
+hits at least one.
 """
 
 from __future__ import annotations
@@ -126,12 +128,13 @@ def _visit(vertices, faces, origin, rays, order, starts, bins, length, ray, dept
         if radius >= 1.5:  # all bins, each once: in one piece, since most of them hold no ray
             first_row, last_row, low, high = 0, 0, 0, 0
         normals = _normal(b, c), _normal(c, a), _normal(a, b)
+        least = -2.0 if radius >= 1.5 else np.cos(radius) - 1e-15
         for row in range(first_row, last_row + 1):
             for column in range(low, high + 1):
                 cell = row * 2 * bins + column % (2 * bins)
                 begin, end = (0, len(order)) if radius >= 1.5 else (starts[cell], starts[cell + 1])
                 for k in range(begin, end):
-                    t = _cross(a, b, c, normals, rays[k])
+                    t = _cross(a, b, c, normals, rays[k]) if _along(center, rays[k]) >= least else -1.0
                     if 0.0 <= t <= length:
                         if found < len(ray):
                             ray[found], depth[found], face[found] = order[k], t, f

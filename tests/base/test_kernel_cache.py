@@ -188,6 +188,29 @@ def test_bitcode_is_parsed_when_another_kernel_takes_it_in(project, others):
     assert _python(project, loads + takes_in).stdout.split() == ["2", "1", "0", "20", "1"]
 
 
+def test_an_edit_between_import_and_first_call_reaches_the_next_process(project):
+    """What is compiled is what was imported, and is kept as that."""
+    edits = "import pathlib, puncture_twin.planning.callee as callee\nfrom puncture_twin.planning.caller import add\n"
+    edits += f"pathlib.Path(callee.__file__).write_text({CALLEE.format(10)!r})\nprint(add(1))"
+    assert _python(project, edits).stdout.split() == ["2"]
+    assert _answer(project) == (11, 0)
+
+
+@pytest.mark.parametrize(
+    "way", ["import puncture_twin.planning.callee as room", "from puncture_twin.planning import callee as room"]
+)
+def test_a_kernel_taken_in_as_an_attribute_counts_too(project, way):
+    """No import names it."""
+    caller = CALLER.replace(
+        "from puncture_twin.planning.callee import rule", "import puncture_twin.planning.hall as hall"
+    )
+    (project / "puncture_twin" / "planning" / "hall.py").write_text(f"{way}\nrule = room.rule\n")
+    (project / "puncture_twin" / "planning" / "caller.py").write_text(caller.replace("rule(x)", "hall.rule(x)"))
+    assert _answer(project) == (2, 0)
+    (project / "puncture_twin" / "planning" / "callee.py").write_text(CALLEE.format(10))
+    assert _answer(project) == (11, 0)
+
+
 def test_a_users_place_for_compiled_code_stays_in_force(project):
     """Numba's setting of locators decides where kernels lie, not what they are stamped with."""
     place = "from numba.core import config\nconfig.CACHE_LOCATOR_CLASSES = 'InTreeCacheLocator'\n"

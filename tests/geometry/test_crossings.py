@@ -168,3 +168,22 @@ def test_shells_within_shells_keep_their_hollows(ball):
         )
         assert side_of(both, np.zeros(3)) is expected
         assert side_of(both, np.array([35.0, 0, 0])) is Side.INSIDE
+
+
+def test_rays_in_the_plane_of_triangles_meet_the_same_alone_and_among_many():
+    """There the edge functions are rounding alone: which triangles are asked must not hang on the other rays."""
+    rng = np.random.default_rng(4)
+    at = np.stack(np.meshgrid(np.arange(13.0), np.arange(13.0), indexing="ij"), axis=-1).reshape(-1, 2) * 10.0 - 37.0
+    corner = (np.arange(12)[:, None] * 13 + np.arange(12)).ravel()
+    faces = np.concatenate([[corner, corner + 13, corner + 1], [corner + 1, corner + 13, corner + 14]], axis=1).T
+    others = rng.normal(size=(30_000, 3))
+    for _ in range(10):
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        mesh = TriangleMesh(np.column_stack([at, np.zeros(len(at))]) @ turn.T, faces)
+        angles = rng.uniform(0, 2 * np.pi, 60)
+        directions = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1) @ turn.T
+        crowd = np.concatenate([directions, others / np.linalg.norm(others, axis=1, keepdims=True)])
+        among = by_ray(crossings(mesh, np.zeros(3), crowd), len(directions))
+        alone = [by_ray(crossings(mesh, np.zeros(3), one[None]), 1)[0] for one in directions]
+        assert alone == among
+        assert any(alone)

@@ -1,8 +1,9 @@
-"""Where numba keeps compiled kernels, and when it must not trust them: when a source of theirs has changed.
+"""Where numba keeps compiled kernels, and when it must not trust them: when any kernel's source has changed.
 
 Numba stamps what it has compiled with the source of the function's own file. A kernel that takes in another file's
 kernel would be reused after an edit of that file alone, and a search would go on judging by the old rule. Kernels of
-this project are stamped with their file and all that it imports from the project instead.
+this project are stamped with the sources of all of them instead: there are many ways to take one in, and some are seen
+in no import.
 
 The places are numba's own, in numba's own order, and a user's setting of them stays in force. Functions of files
 outside the project are left to numba. What the package brings is looked up behind them.
@@ -45,12 +46,7 @@ def kernels_stamp() -> str:
 
     What they import counts too: numba freezes a constant into the kernel that names it. So do the compilers' versions.
     """
-    return _stamp(*sources_with(b"numba"))
-
-
-@cache
-def _stamp(*files: str) -> str:
-    return f"{stamp_of(files)} {library_versions(COMPILERS)}"
+    return f"{stamp_of(sources_with(b'numba'))} {library_versions(COMPILERS)}"
 
 
 @cache
@@ -87,6 +83,7 @@ class KernelCache(NumbasCache):
 
     def __init__(self, py_func: Any) -> None:
         self._name, self._py_func = repr(py_func), py_func
+        self._stamp = kernels_stamp()  # now: when the kernel is first called, the sources may be others
         self.enable()
 
     @cached_property
@@ -102,7 +99,7 @@ class KernelCache(NumbasCache):
         file = _own_file(inspect.getfile(self._py_func))
         assert file is not None  # others' functions have numba's cache
         brought = None if class_in_use() is None else brought_folder(Path(file))
-        return CheckedFiles(self._cache_path, self._impl.filename_base, _stamp(file), brought)
+        return CheckedFiles(self._cache_path, self._impl.filename_base, self._stamp, brought)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """What was compiled for these types, or None."""
