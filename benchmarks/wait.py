@@ -29,8 +29,10 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"
 PROBE = Path(__file__).with_name("wait_probe.py")
 
-BARE = "import sys; sys.path.insert(0, sys.argv.pop(1)); from puncture_twin.run_twin import program; program()"
-"""For Python: a checkout's command, as a person runs it."""
+BARE = """import sys; sys.path.insert(0, sys.argv.pop(1))
+import puncture_twin.run_twin as run
+getattr(run, "program", lambda: sys.exit(run.main()))()"""
+"""For Python: a checkout's command, as a person runs it; older ones have no ``program``."""
 
 Seconds = dict[str, float]
 
@@ -94,8 +96,9 @@ class Side:
             check=False,
         )
         passed, used = perf_counter() - start, _used_by_others() - before
-        found = {"exit_code": done.returncode, "seconds": {ALL: used}} if self.bare else _read(answer, done)
-        if found["exit_code"] > 1:
+        bare: dict[str, Any] = {"exit_code": done.returncode, "seconds": {ALL: used}}
+        found = bare if self.bare else _read(answer, done)
+        if found["exit_code"] > 1 or "Traceback" in done.stderr:
             raise SystemExit(f"{self.name}: {command.name} ended with {found['exit_code']}\n{done.stderr}")
         return {**found["seconds"], END: used - found["seconds"][ALL], ALL: used, CLOCK: passed}
 
