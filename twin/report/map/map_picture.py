@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from puncture_twin.planning.base.arrays import Bools
+from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
@@ -32,7 +33,7 @@ from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map.map_side import draw_side
 from puncture_twin.twin.report.map_view import BEYOND, MapView, map_view, step_of
 from puncture_twin.twin.report.numbers import needle_text, target_text
-from puncture_twin.twin.report.png import write_png
+from puncture_twin.twin.report.palette import PNG_LEVEL
 
 WIDTH = 1690
 
@@ -82,7 +83,8 @@ def draw_map(
     _marks(canvas, view, candidates, bests, pick)
     _title(canvas, case, candidates)
     draw_side(canvas, candidates, view, pick)
-    write_png(canvas.pixels[..., :3], Path(path))
+    with atomic(Path(path)) as temporary:
+        canvas.image.convert("RGB").save(temporary, format="PNG", compress_level=PNG_LEVEL)
 
 
 def _disc(canvas: Canvas, rgba: NDArray[np.uint8]) -> None:

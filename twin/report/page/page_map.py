@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.search.candidates import NOT_SEEN, Candidates
@@ -15,9 +18,7 @@ from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_w
 from puncture_twin.twin.report.map.front import shown_front
 from puncture_twin.twin.report.map.map_raster import PIXELS as FINE, MapRaster, map_raster
 from puncture_twin.twin.report.map_view import map_view
-from puncture_twin.twin.report.page.template import png_address
-from puncture_twin.twin.report.palette import reason_of
-from puncture_twin.twin.report.png import png_bytes
+from puncture_twin.twin.report.palette import PNG_LEVEL, reason_of
 
 PIXELS = FINE // 2
 """Side of the map on the page, CSS pixels; the picture is twice as fine for sharp screens."""
@@ -55,7 +56,7 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
     reasons = [str(r) for r in np.unique(candidates.verdict.reason)]
     return {
         "size": PIXELS,
-        "image": png_address(png_bytes(raster.rgba)),
+        "image": _png(raster.rgba),
         "runs": rows,
         "theta_max_deg": round(float(np.degrees(view.theta_max)), 4),
         "turn_deg": round(float(np.degrees(view.turn)), 4),
@@ -137,6 +138,12 @@ def _nearest(candidates: Candidates) -> tuple[list[str], Any]:
     columns = demanding[np.argmin(np.nan_to_num(clearance.distance[:, demanding], nan=np.inf), axis=1)]
     nearest = clearance.distance[np.arange(len(candidates)), columns]
     return [clearance.structures[column] for column in columns], nearest
+
+
+def _png(rgba: Any) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(rgba).save(stream, format="PNG", compress_level=PNG_LEVEL)
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 
 def _rounded(values: Any, digits: int) -> list[float | None]:

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate, palette
 from puncture_twin.twin.report.numbers import nearest_text, number, target_text
-from puncture_twin.twin.report.png import write_png
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
 from puncture_twin.twin.report.scene.scene_parts import (
@@ -93,7 +93,8 @@ def draw_scene(
     _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
     bottom = _text(draw, case, candidates, plan, bool(arm), bodies, pick, failed)
     image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
-    write_png(np.asarray(image), Path(path), shaded=True)
+    with atomic(Path(path)) as temporary:
+        image.save(temporary, format="PNG", compress_level=palette.PNG_LEVEL)
 
 
 def render_bodies(bodies: Sequence[SceneBody], camera: ViewCamera) -> NDArray[np.uint8]:

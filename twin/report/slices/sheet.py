@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from PIL import Image, ImageDraw
 
+from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report.annotate import FAINT, legend, write
 from puncture_twin.twin.report.numbers import number, target_text
-from puncture_twin.twin.report.palette import TARGET_POINT
-from puncture_twin.twin.report.png import write_png
+from puncture_twin.twin.report.palette import PNG_LEVEL, TARGET_POINT
 from puncture_twin.twin.report.slices.hu_plot import draw_hu_plot
 from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, Panel, draw_panel
 from puncture_twin.twin.report.slices.planes import needle_planes
@@ -102,4 +101,5 @@ def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
         write(draw, (GAP, row), line, size=14, colour=FAINT)
         row += 20
     sheet = sheet.crop((0, 0, size[0], min(size[1], int(row) + GAP)))
-    write_png(np.asarray(sheet), Path(path))
+    with atomic(Path(path)) as temporary:
+        sheet.save(temporary, format="PNG", compress_level=PNG_LEVEL)
