@@ -55,7 +55,9 @@ def commands(folder: Path) -> Iterator[Command]:
     yield Command("check", ("check", abdomen, "--theta", "30", "--beta", "100", "--json"))
     yield Command("search", ("search", abdomen, "--no-pictures", "--json", "--out", out))
     if DATA.is_dir():
-        yield Command("real", ("search", str(real_case(folder)), "--no-pictures", "--json", "--out", out))
+        case = str(real_case(folder))
+        yield Command("real", ("search", case, "--no-pictures", "--json", "--out", out))
+        yield Command("pictures", ("search", case, "--json", "--out", out))
     yield Command("demo", ("demo", "--json", "--out", out))
 
 
@@ -165,7 +167,7 @@ def main() -> None:
     """Parse, run, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--against", type=Path, help="another checkout, run in turn with this one")
-    parser.add_argument("--only", help="some of help,check,search,real,demo")
+    parser.add_argument("--only", help="some of help,check,search,real,pictures,demo")
     parser.add_argument("--times", type=int, default=3, help="warm runs")
     parser.add_argument("--first-use", action="store_true", help="with nothing compiled too: minutes")
     parser.add_argument("--bare", action="store_true", help="without the probe: as a person runs them")

@@ -36,18 +36,8 @@ MOST_BYTES = 2_000_000_000
 """Where it says nothing: the surfaces of some twenty whole bodies."""
 
 LIBRARIES = (
-    *(
-        "puncture-twin",
-        "numpy",
-        "scipy",
-        "scikit-image",
-        "numba",
-        "llvmlite",
-        "python-fcl",
-        "trimesh",
-        "fast-simplification",
-    ),
-    *("pydantic", "pydicom", "python-gdcm", "h5py"),
+    *("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "llvmlite", "python-fcl", "trimesh"),
+    *("fast-simplification", "pydantic", "pydicom", "python-gdcm", "h5py"),
 )
 """Whose versions decide what is made."""
 
@@ -108,8 +98,7 @@ class Cache:
         Args:
             made_from: See `arrays`.
             make: Makes the arrays.
-            read: Raises ValueError, KeyError,
-                TypeError or InputError for arrays that cannot be what ``make`` gives.
+            read: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
             by: See `arrays`.
         """
         if self.memory is NO_MEMORY:

@@ -26,6 +26,7 @@ def nearest(values: NDArray[np.float32], T_index_ct: Floats, points_ct: Floats) 
 
 @nb.njit(cache=True, error_model="numpy")
 def _nearest(values: Any, T: Any, points: Any) -> Any:
+    """As `nearest`, of values that lie in memory as they are numbered. The order of a sum decides half-way points."""
     found = np.empty(len(points))
     for n in range(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
