@@ -49,7 +49,7 @@ def test_an_edit_of_a_kernel_that_is_taken_in_reaches_its_callers(project, own):
     assert _answer(tmp_path, own) == (2, 1)
     (folder / "callee.py").write_text(CALLEE.format(10))
     assert _answer(tmp_path, own) == ((11, 0) if own else (2, 1))
-    (folder / "size.py").write_text("SIZE = 2\n")
+    (folder / "size.py").write_text("SIZE = 1 + 1\n")
     assert _answer(tmp_path, own) == ((21, 0) if own else (2, 1))
     (folder / "beside.py").write_text("SIZE = 3\n")  # no kernel names it
     assert _answer(tmp_path, own) == ((21, 1) if own else (2, 1))
@@ -158,7 +158,7 @@ def test_it_is_known_whether_a_kernel_is_compiled(project):
     assert compiled() == ["False"]
     assert compiled("add(1); print(is_compiled(add))") == ["False", "True"]
     assert compiled() == ["True"]
-    (project / "puncture_twin" / "planning" / "size.py").write_text("SIZE = 2\n")
+    (project / "puncture_twin" / "planning" / "size.py").write_text("SIZE = 1 + 1\n")
     assert compiled() == ["False"]
 
 
@@ -219,5 +219,5 @@ def test_a_users_place_for_compiled_code_stays_in_force(project):
     assert not (project / "cache").exists()
     assert list((project / "puncture_twin" / "planning" / "__pycache__").glob("caller.add*.nbc"))
     assert _python(project, asked).stdout.split() == ["2", "1"]
-    (project / "puncture_twin" / "planning" / "size.py").write_text("SIZE = 2\n")
+    (project / "puncture_twin" / "planning" / "size.py").write_text("SIZE = 1 + 1\n")
     assert _python(project, asked).stdout.split() == ["3", "0"]

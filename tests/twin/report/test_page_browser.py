@@ -157,11 +157,21 @@ def browser(case, candidates, tmp_path_factory):
         yield browser
 
 
+def map_box(browser):
+    """Where the map stands; not before it does: while the page is laid out a click would miss it."""
+    asked = "JSON.stringify(document.getElementById('map-image').getBoundingClientRect())"
+    box, before, end = browser.evaluate(asked), None, time.monotonic() + PATIENCE_S
+    while box != before:
+        assert time.monotonic() < end, "the map does not stand still"
+        time.sleep(0.1)
+        box, before = browser.evaluate(asked), box
+    return json.loads(box)
+
+
 def point_at(browser, case, candidates, theta_deg, beta_deg, *, click=False):
     """Move the pointer to a direction on the map; returns what the page says."""
     browser.evaluate("document.getElementById('map').scrollIntoView()")
-    box = browser.evaluate("JSON.stringify(document.getElementById('map-image').getBoundingClientRect())")
-    box = json.loads(box)
+    box = map_box(browser)
     x, y = map_view(case, candidates).place(np.radians(theta_deg), np.radians(beta_deg))
     at = {"x": box["x"] + (1 + x) / 2 * box["width"], "y": box["y"] + (1 - y) / 2 * box["height"]}
     browser.call("Input.dispatchMouseEvent", type="mouseMoved", **at)
