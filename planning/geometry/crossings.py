@@ -33,6 +33,9 @@ USUAL_CROSSINGS = 4
 CONE_SLACK = 1e-9
 """Radians by which a bounding cone is widened against rounding."""
 
+OUTSIDE = 1e-12
+"""By so much less than a cone's is the cosine of a ray that is outside of it whatever rounding did."""
+
 NUDGE = 1e-7
 """Radians by which a ray through an edge or corner is turned when its crossings do not add up."""
 
@@ -67,12 +70,14 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     """
     order, starts, bins = _binned(directions)
     rays = np.take(directions, order, axis=0)
+    lengths = np.sqrt(np.einsum("ij,ij->i", rays, rays))
     origin = np.array(origin, dtype=np.float64)
     room, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
     while total > room:
         room = total
         ray, depth, face = np.empty(room, np.int64), np.empty(room), np.empty(room, np.int64)
-        total = _visit(mesh.vertices, mesh.faces, origin, rays, order, starts, bins, length, ray, depth, face)
+        binned = rays, lengths, order, starts, bins
+        total = _visit(mesh.vertices, mesh.faces, origin, binned, length, ray, depth, face)
     ray, depth, face = ray[:total], depth[:total], face[:total]
     rows = np.lexsort((depth, ray))
     ray, depth, face = ray[rows], depth[rows], face[rows]
@@ -109,8 +114,9 @@ def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
 
 
 @allocation_free()
-def _visit(vertices, faces, origin, rays, order, starts, bins, length, ray, depth, face):  # type: ignore[no-untyped-def]  # numba infers
+def _visit(vertices, faces, origin, binned, length, ray, depth, face):  # type: ignore[no-untyped-def]  # numba infers
     """Count the crossings; write them too where the output arrays have room."""
+    rays, lengths, order, starts, bins = binned
     found, per_radian = 0, bins / np.pi
     for f in range(len(faces)):
         a, b, c = (
@@ -128,13 +134,14 @@ def _visit(vertices, faces, origin, rays, order, starts, bins, length, ray, dept
         if radius >= 1.5:  # all bins, each once: in one piece, since most of them hold no ray
             first_row, last_row, low, high = 0, 0, 0, 0
         normals = _normal(b, c), _normal(c, a), _normal(a, b)
-        least = -2.0 if radius >= 1.5 else np.cos(radius) - 1e-15
+        least = -2.0 if radius >= 1.5 else np.cos(radius) - OUTSIDE
         for row in range(first_row, last_row + 1):
             for column in range(low, high + 1):
                 cell = row * 2 * bins + column % (2 * bins)
                 begin, end = (0, len(order)) if radius >= 1.5 else (starts[cell], starts[cell + 1])
                 for k in range(begin, end):
-                    t = _cross(a, b, c, normals, rays[k]) if _along(center, rays[k]) >= least else -1.0
+                    inside = _along(center, rays[k]) >= least * lengths[k]
+                    t = _cross(a, b, c, normals, rays[k]) if inside else -1.0
                     if 0.0 <= t <= length:
                         if found < len(ray):
                             ray[found], depth[found], face[found] = order[k], t, f

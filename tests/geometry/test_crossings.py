@@ -187,3 +187,18 @@ def test_rays_in_the_plane_of_triangles_meet_the_same_alone_and_among_many():
         alone = [by_ray(crossings(mesh, np.zeros(3), one[None]), 1)[0] for one in directions]
         assert alone == among
         assert any(alone)
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-15, -1e-12, 1e-9, -1e-7, 1e-4])
+def test_no_ray_through_a_triangle_is_lost_however_small_it_is_and_long_the_ray(off):
+    """Seen under a hundredth of a radian to a millionth; rounding, and a direction that is not quite unit."""
+    rng = np.random.default_rng(8)
+    third = 2 * np.pi / 3 * np.arange(3)
+    shape = np.stack([np.cos(third), np.sin(third), 0 * third], axis=1)
+    for size in 10.0 ** rng.uniform(-6, -2, 300):
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        corners = 10.0 ** rng.uniform(-3, 4) * ((size * shape + [0, 0, 1]) @ turn.T)
+        toward = (0.9 * rng.dirichlet([1, 1, 1], 20) + 0.1 / 3) @ corners
+        directions = toward / np.linalg.norm(toward, axis=1, keepdims=True) * (1 + off)
+        found = crossings(TriangleMesh(corners, np.array([[0, 1, 2]])), np.zeros(3), directions)
+        assert found.count.tolist() == [1] * 20
