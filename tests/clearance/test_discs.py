@@ -57,12 +57,12 @@ def test_every_disc_holds_the_corners_below_it(seed, count, spread, size):
 
 
 def test_a_flat_round_block_has_a_flat_round_disc():
-    """By hand: six triangles about a point, in a tilted plane, half of them turned over: no thicker than rounding."""
+    """By hand: 16 triangles about a point, in a tilted plane, half of them turned over: no thicker than rounding."""
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
-    angles = np.pi / 3 * np.arange(6)
+    angles = np.pi / 8 * np.arange(16)
     rim = 5.0 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
     vertices = np.concatenate([[[0.0, 0.0, 0.0]], rim]) @ turn.T + [10.0, 20.0, 30.0]
-    faces = np.array([[0, 1 + k, 1 + (k + 1) % 6] for k in range(6)])
+    faces = np.array([[0, 1 + k, 1 + (k + 1) % 16] for k in range(16)])
     faces[::2] = faces[::2, ::-1]
     blocks = pack(TriangleMesh(vertices, faces))
     assert abs(blocks.disc[:3, 0] @ turn[:, 2]) == pytest.approx(1.0, abs=1e-6)
