@@ -21,7 +21,7 @@ def allowed_text(error: ClickException) -> str:
     if kind in NUMBERS and type(error).__name__ == "BadParameter":
         return NUMBERS[kind] + _range(option)
     context = getattr(error, "ctx", None)
-    command = "" if context is None else " ".join(context.command_path.split()[1:])
+    command = "" if context is None else context.command_path.removeprefix(context.find_root().command_path).strip()
     return f"see {command} --help" if command else "see --help"
 
 
