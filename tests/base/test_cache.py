@@ -314,11 +314,46 @@ def test_the_code_that_reads_a_volume_decides_what_is_kept_of_it(tmp_path, monke
         "import puncture_twin.planning.made.inner",
         "def late():\n    from puncture_twin.planning.made.inner import make",
         "from puncture_twin.planning.made import make  # handed on by the package without an import statement",
+        "from puncture_twin.planning import made\nSIZE = made.SIZE",
+        "import puncture_twin.planning.made as room\nSIZE = room.SIZE",
+        "from .made.inner import make",
+        "from . import made\nSIZE = made.SIZE",
+        "from .made import inner",
     ],
 )
 def test_an_edit_behind_any_kind_of_import_changes_the_stamp(tmp_path, line):
     """A module, a name of a module, a package that hands on names, inside a function or not."""
-    planning = tmp_path / "puncture_twin" / "planning"
+    made = small_package(tmp_path, line)
+    stamps = []
+    for size in (1, 1, 2):
+        (made / "inner.py").write_text(f"SIZE = {size}\n")
+        stamps.append(stamp_in(tmp_path))
+    assert stamps[0] == stamps[1] != stamps[2]
+
+
+@pytest.mark.parametrize(
+    "line", ["from puncture_twin.planning.made import SIZE", "from puncture_twin.planning import made"]
+)
+def test_where_a_stub_says_that_a_name_is_made_is_in_the_stamp(tmp_path, line):
+    """Two modules of one name's rule: the stub picks the one that is loaded, and that one may lie in a folder below."""
+    made = small_package(tmp_path, line)
+    (made / "deep").mkdir()
+    for folder in (made, made / "deep"):
+        (folder / "one.py").write_text("SIZE = 1\n")
+    (made / "two.py").write_text("SIZE = 2\n")
+    (made / "deep" / "__init__.py").write_text("")
+    stamps = []
+    for module in ("one", "two", "deep.one", "deep.one"):
+        (made / "__init__.pyi").write_text(f"from .{module} import SIZE as SIZE\n")
+        stamps.append(stamp_in(tmp_path))
+    (made / "deep" / "one.py").write_text("SIZE = 3\n")
+    assert len({*stamps, stamp_in(tmp_path)}) == 4
+    assert stamps[2] == stamps[3]
+
+
+def small_package(root, line):
+    """A package whose module ``maker`` is one line, with a room ``made``, whose folder is returned."""
+    planning = root / "puncture_twin" / "planning"
     made, stamps_folder = planning / "made", planning / "base" / "cache"
     for folder in (made, stamps_folder):
         folder.mkdir(parents=True)
@@ -327,18 +362,18 @@ def test_an_edit_behind_any_kind_of_import_changes_the_stamp(tmp_path, line):
     for folder in (planning.parent, planning, made):
         (folder / "__init__.py").write_text("")
     (planning / "maker.py").write_text(line + "\n")
-    stamps = []
-    for size in (1, 1, 2):
-        (made / "inner.py").write_text(f"SIZE = {size}\n")
-        code = (
-            "from puncture_twin.planning.base.cache.source_stamp import source_stamp; "
-            "print(source_stamp('puncture_twin.planning.maker'))"
-        )
-        environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-        options = {"cwd": tmp_path, "capture_output": True, "text": True, "check": True}
-        run = subprocess.run([sys.executable, "-c", code], env=environment, **options)
-        stamps.append(run.stdout)
-    assert stamps[0] == stamps[1] != stamps[2]
+    return made
+
+
+def stamp_in(root):
+    """The stamp of that package's maker, by a process of its own."""
+    code = (
+        "from puncture_twin.planning.base.cache.source_stamp import source_stamp; "
+        "print(source_stamp('puncture_twin.planning.maker'))"
+    )
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    options = {"cwd": root, "capture_output": True, "text": True, "check": True}
+    return subprocess.run([sys.executable, "-c", code], env=environment, **options).stdout
 
 
 SHARED = """

@@ -102,14 +102,38 @@ def _source_digest(file: str) -> bytes:
 
 @cache
 def _imported(file: str) -> tuple[str, ...]:
-    """The project's files that a file imports."""
-    found: list[str] = []
+    """The project's files that a file imports, and those whose names a package hands on without an import."""
+    found = list(_handed_on(file))
     for module, names, modules in _imports(_source(file)):
         if module:
-            found += [one for name in NAME.findall(names) for one in _files_of_name(module.decode(), name.decode())]
+            place = _absolute(module.decode(), file)
+            found += [one for name in NAME.findall(names) for one in _files_of_name(place, name.decode())]
         else:
             found += [one for name in NAME.findall(modules) for one in _files_of(name.decode())]
     return tuple(found)
+
+
+def _handed_on(file: str) -> tuple[str, ...]:
+    """The stub beside a package's own file, which says where each of its names is made, and the package's modules.
+
+    They are loaded when a name is asked for, as an attribute too: no import need name it.
+    """
+    folder, _, name = file.rpartition("/")
+    if name != "__init__.py":
+        return ()
+    stub = f"{file}i"
+    stubs = (stub,) if os.path.isfile(stub) else ()  # noqa: PTH113  # a path of each costs 0.01 s
+    return (*stubs, *sorted(map(str, Path(folder).glob("*.py"))))
+
+
+def _absolute(module: str, file: str) -> str:
+    """The name of a module that a file may name from its own place, by leading dots."""
+    name = module.lstrip(".")
+    dots = len(module) - len(name)
+    if not dots:
+        return module
+    place = file.removeprefix(f"{PROJECT}/").split("/")[:-dots]
+    return ".".join((*place, name) if name else place)
 
 
 def _imports(source: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
@@ -123,18 +147,8 @@ def _imports(source: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
 
 
 def _files_of_name(module: str, name: str) -> tuple[str, ...]:
-    """The files behind ``from module import name``: a module, or a name of a module.
-
-    A package may hand on the names of its modules without an import statement; then any of them may be meant.
-    """
-    if module.partition(".")[0] != PACKAGE.name:
-        return ()
-    return _files_of(f"{module}.{name}") or (*_files_of(module), *_files_in(module))
-
-
-@cache
-def _files_in(package: str) -> tuple[str, ...]:
-    return tuple(sorted(map(str, Path(PROJECT, *package.split(".")).glob("*.py"))))
+    """The files behind ``from module import name``: a module, or a name of a module."""
+    return _files_of(f"{module}.{name}") or _files_of(module)
 
 
 @cache
