@@ -12,7 +12,7 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test quick durations fuzz kill kill-batch lint mutants install reinstall wheel docs pictures meshes clean
+.PHONY: demo test quick durations fuzz kill kill-batch lint mutants install reinstall kernels wheel docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -62,7 +62,16 @@ reinstall:
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
 	@command -v chromium chromium-browser google-chrome >/dev/null || $(BIN)/playwright install chromium || \
 	  echo "no browser: the page's tests in one will skip"
+	$(MAKE) --no-print-directory kernels
 	cat pyproject.toml constraints.txt > $(VENV)/installed
+
+# Compiled here, not while a person waits for a first answer. What is not compiled here is where it is first used.
+kernels:
+	@echo "compiling the kernels (a minute)"
+	@out=$$(mktemp -d) && export PUNCTURE_TWIN_CACHE=$$out/cache && \
+	  { $(BIN)/python run_twin.py demo --out $$out/demo && \
+	    $(BIN)/python run_twin.py check meshes/abdomen --theta 64 --beta 98; } > $$out/log 2>&1 || \
+	  { tail -n 1 $$out/log; echo "kernels will be compiled where they are first used"; }; rm -rf $$out
 
 # In out/wheels, some minutes: one for every machine, and one for this Python on Linux x86-64 that brings machine code.
 wheel: install
