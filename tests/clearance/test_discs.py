@@ -56,6 +56,27 @@ def test_every_disc_holds_the_corners_below_it(seed, count, spread, size):
             assert np.linalg.norm(d - up[:, None] * n, axis=1).max() <= rho
 
 
+@pytest.mark.parametrize("least", [1e-81, 1.6e-162, 1e-161, 1e-155, 1e-142, 1e-139])
+def test_no_area_too_small_to_square_spoils_a_block(least):
+    """Lines, and a whisker whose area, squared, is lost or keeps a digit: a text file may state one."""
+    line, whisker = [[0.0, 0, -100], [0, 0, 100], [0, 0, 0]], [[0.0, 0, 0], [least, 0, 0], [0, 1, 0]]
+    assert_sound_discs(np.array([*(15 * [line]), whisker]))
+
+
+@pytest.mark.parametrize("size", [1e-162, 1.3e-81, 1e-80, 1e-75, 1e-71, 1e-69])
+def test_no_radius_too_small_to_square_spoils_a_parent(size):
+    """Two blocks of equal triangles so small that the square of their disc's area is lost or keeps a digit."""
+    assert_sound_discs(np.array(32 * [[[0.0, 0, 0], [size, 0, size], [0, size, 0]]]))
+
+
+def assert_sound_discs(triangles):
+    """Their normals have length one, and the highest disc holds all corners."""
+    blocks = pack(TriangleMesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3)))
+    at = [LANES * base + node for base, many in zip(blocks.base, counts(blocks), strict=True) for node in range(many)]
+    np.testing.assert_allclose(np.linalg.norm(blocks.disc[:3, at].astype(float), axis=0), 1.0, atol=1e-6)
+    assert np.hypot(*blocks.disc[3:, at[-1]]) >= np.linalg.norm(triangles - blocks.center[at[-1]], axis=2).max()
+
+
 def test_a_flat_round_block_has_a_flat_round_disc():
     """By hand: 16 triangles about a point, in a tilted plane, half of them turned over: no thicker than rounding."""
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]

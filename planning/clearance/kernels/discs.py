@@ -10,6 +10,9 @@ from puncture_twin.planning.clearance.kernels.lanes import LANES
 PARALLEL = 1e-6
 """Share of its triangles' area below which a block's mean normal says nothing."""
 
+FAINT = 1e-140
+"""Length, mm^2, below which a mean normal says nothing: its square nears the least number, and is not its length's."""
+
 
 @allocation_free(nogil=True)
 def block_discs(triangles, local, center, disc):  # type: ignore[no-untyped-def]  # numba infers
@@ -77,7 +80,7 @@ def _mean_normal(corners):  # type: ignore[no-untyped-def]  # numba infers
         sign = -1.0 if _dot(normal, first) < 0.0 else 1.0
         x, y, z = x + sign * normal[0], y + sign * normal[1], z + sign * normal[2]
     norm = np.sqrt(x * x + y * y + z * z)
-    if not norm > PARALLEL * area:
+    if not norm > max(PARALLEL * area, FAINT):
         return 0.0, 0.0, 1.0
     return x / norm, y / norm, z / norm
 
@@ -115,7 +118,7 @@ def _mean_of_discs(disc, low, high):  # type: ignore[no-untyped-def]  # numba in
         sign = 1.0 if _dot(n, first) >= 0.0 else -1.0
         x, y, z = x + sign * n[0] * square, y + sign * n[1] * square, z + sign * n[2] * square
     norm = np.sqrt(_dot((x, y, z), (x, y, z)))
-    return (x / norm, y / norm, z / norm) if norm > 0.0 else (0.0, 0.0, 1.0)
+    return (x / norm, y / norm, z / norm) if norm > FAINT else (0.0, 0.0, 1.0)
 
 
 @allocation_free(nogil=True)
