@@ -2,9 +2,11 @@
 
 All rays start at the target, so a triangle is met exactly by the rays inside the solid angle that it subtends. Rays are
 binned by direction; each triangle visits the bins that its bounding cone touches, and of their rays those inside of the
-cone: where a ray lies in the plane of a triangle far beside it, the edge functions are rounding alone. Two triangles
-that share an edge compute its edge function from the same numbers with the opposite sign, so a ray through the edge
-hits at least one.
+cone: where a ray lies in the plane of a triangle far beside it, the edge functions are rounding alone.
+
+Corners are moved along the ray into a plane, each by its own numbers alone, so triangles that share corners share them
+there. On which side of an edge the ray passes is then told rightly or as both: a ray through an edge or a corner hits
+at least one of the triangles about it (Woop, Benthin and Wald, JCGT 2(1), 2013).
 """
 
 from __future__ import annotations
@@ -133,7 +135,6 @@ def _visit(vertices, faces, origin, binned, length, ray, depth, face):  # type: 
         low, high = _azimuths(center, polar, radius, bins)
         if radius >= 1.5:  # all bins, each once: in one piece, since most of them hold no ray
             first_row, last_row, low, high = 0, 0, 0, 0
-        normals = _normal(b, c), _normal(c, a), _normal(a, b)
         least = -2.0 if radius >= 1.5 else np.cos(radius) - OUTSIDE
         for row in range(first_row, last_row + 1):
             for column in range(low, high + 1):
@@ -141,7 +142,7 @@ def _visit(vertices, faces, origin, binned, length, ray, depth, face):  # type: 
                 begin, end = (0, len(order)) if radius >= 1.5 else (starts[cell], starts[cell + 1])
                 for k in range(begin, end):
                     inside = _along(center, rays[k]) >= least * lengths[k]
-                    t = _cross(a, b, c, normals, rays[k]) if inside else -1.0
+                    t = _cross(a, b, c, rays[k]) if inside else -1.0
                     if 0.0 <= t <= length:
                         if found < len(ray):
                             ray[found], depth[found], face[found] = order[k], t, f
@@ -206,9 +207,10 @@ def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # n
 
 
 @allocation_free()
-def _cross(a, b, c, normals, u):  # type: ignore[no-untyped-def]  # numba infers
+def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
     """Depth at which the ray from the origin along u crosses the triangle; -1 where it does not."""
-    wa, wb, wc = _along(normals[0], u), _along(normals[1], u), _along(normals[2], u)
+    p, q, r = _beside(a, u), _beside(b, u), _beside(c, u)
+    wa, wb, wc = _turn(q, r), _turn(r, p), _turn(p, q)
     if not ((wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)):
         return -1.0
     total = wa + wb + wc
@@ -218,14 +220,24 @@ def _cross(a, b, c, normals, u):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @allocation_free()
-def _normal(p, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Of the plane through the origin and the edge p-q: p x q; swapping p and q negates it exactly."""
-    return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
+def _beside(p, u):  # type: ignore[no-untyped-def]  # numba infers
+    """A point moved along the ray into the plane of the two axes that the ray follows least."""
+    if abs(u[2]) >= max(abs(u[0]), abs(u[1])):
+        return p[0] - u[0] / u[2] * p[2], p[1] - u[1] / u[2] * p[2]
+    if abs(u[1]) >= abs(u[0]):
+        return p[2] - u[2] / u[1] * p[1], p[0] - u[0] / u[1] * p[1]
+    return p[1] - u[1] / u[0] * p[0], p[2] - u[2] / u[0] * p[0]
+
+
+@allocation_free()
+def _turn(p, q):  # type: ignore[no-untyped-def]  # numba infers
+    """On which side of the edge p-q the ray passes: the right sign or 0, for rounding keeps two products' order."""
+    return p[0] * q[1] - p[1] * q[0]
 
 
 @allocation_free()
 def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
-    """How far a point lies along a ray; of an edge's normal, on which side of the edge the ray passes."""
+    """How far a point lies along a ray."""
     return p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 from oracles import ray_crossings
 
 from puncture_twin.planning.case.entry import grid
@@ -202,3 +203,24 @@ def test_no_ray_through_a_triangle_is_lost_however_small_it_is_and_long_the_ray(
         directions = toward / np.linalg.norm(toward, axis=1, keepdims=True) * (1 + off)
         found = crossings(TriangleMesh(corners, np.array([[0, 1, 2]])), np.zeros(3), directions)
         assert found.count.tolist() == [1] * 20
+
+
+def shells(vertices, faces, count, off):
+    """Copies of a surface about a point, each twice as large as the last, far from or at the origin."""
+    points = np.concatenate([vertices * 2.0**k for k in range(count)]) + off
+    return TriangleMesh(points, np.concatenate([faces + k * len(vertices) for k in range(count)]))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("off", [0.0, 7.3, 5e3])
+@pytest.mark.parametrize("form", ["geodesic", "meridians"])
+def test_a_ray_through_corners_and_edges_leaves_every_shell_once(rng, form, off, count):
+    """Rounding tells at random on which side of a corner's edges a ray passes: it must not be between all of them."""
+    for _ in range(8):
+        ball = trimesh.creation.icosphere(3) if form == "geodesic" else trimesh.creation.uv_sphere(count=[19, 24])
+        turned = ball.vertices @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        mesh = shells(turned * rng.uniform(30, 40, (len(turned), 1)), ball.faces, count, off)
+        a, b, c = (mesh.triangles[: len(ball.faces)] - off).swapaxes(0, 1)
+        toward = np.concatenate([a, b, (a + b) / 2, 0.3 * a + 0.7 * c, (1 - 1e-6) * a + 5e-7 * (b + c)])
+        directions = toward / np.linalg.norm(toward, axis=1, keepdims=True)
+        assert np.unique(crossings(mesh, np.full(3, off), directions).count).tolist() == [count]
