@@ -1,5 +1,6 @@
 """The cache: right when it is right, and never trusted when it is not."""
 
+import ast
 import os
 import pickle
 import subprocess
@@ -14,7 +15,14 @@ from puncture_twin.planning.anatomy import surfaces
 from puncture_twin.planning.base.cache import array_cache as cache_module
 from puncture_twin.planning.base.cache.array_cache import LIBRARIES, Cache, user_cache
 from puncture_twin.planning.base.cache.entry_file import packed
-from puncture_twin.planning.base.cache.source_stamp import IMPORTED, NAME, PROJECT, closure, source_stamp
+from puncture_twin.planning.base.cache.source_stamp import (
+    IMPORTED,
+    NAME,
+    PROJECT,
+    closure,
+    source_stamp,
+    sources_with,
+)
 from puncture_twin.planning.base.errors import CacheWarning, InputError
 
 BY = "puncture_twin.planning.anatomy.surfaces"
@@ -351,6 +359,59 @@ def test_where_a_stub_says_that_a_name_is_made_is_in_the_stamp(tmp_path, line):
     assert stamps[2] == stamps[3]
 
 
+@pytest.mark.parametrize("edit", ["again", "another", "gone", "swapped", "nothing"])
+def test_a_source_that_was_written_since_its_stamp_is_told(tmp_path, edit):
+    """With the same words too: it may have said other ones when it was loaded. What it hands on counts."""
+    made = small_package(tmp_path, "from puncture_twin.planning.made.inner import make")
+    (made / "inner.py").write_text("SIZE = 1\n")
+    (made / "new.py").write_text("SIZE = 1\n")
+    edits = {
+        "again": "file.write_text('SIZE = 1\\n')",
+        "another": "file.write_text('SIZE = 2\\n')",
+        "gone": "file.unlink()",
+        "swapped": "file.with_name('new.py').replace(file)",
+        "nothing": "",
+    }
+    code = (
+        "import pathlib, puncture_twin\n"
+        "from puncture_twin.planning.base.cache.source_stamp import module_unedited, source_stamp\n"
+        "file = pathlib.Path(puncture_twin.__file__).parent / 'planning' / 'made' / 'inner.py'\n"
+        f"source_stamp('puncture_twin.planning.maker')\n{edits[edit]}\n"
+        "print(module_unedited('puncture_twin.planning.maker'))"
+    )
+    assert python_in(tmp_path, code).split() == [str(edit == "nothing")]
+
+
+def test_what_an_edited_source_makes_is_not_kept(cache, monkeypatch):
+    """It is given, and made anew."""
+    monkeypatch.setattr(cache_module, "module_unedited", lambda maker: maker != BY)
+    made = []
+    for _ in range(2):
+        cache.arrays({"name": 1}, counted(made), by=BY)
+    assert len(made) == 2
+    assert not cache.folder.exists()
+
+
+def imported_by_python(file):
+    """The modules that a source imports, by Python's own grammar, and for each name of one its module and the name."""
+    for node in ast.walk(ast.parse(Path(file).read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0
+            yield from (f"{node.module}.{name.name}" for name in node.names)
+
+
+def test_no_import_of_the_project_is_written_so_that_a_stamp_misses_it():
+    """They are found by a pattern, which knows the usual ways alone."""
+    for file in sources_with(b"import"):
+        for name in imported_by_python(file):
+            places = (f"{PROJECT}/{name.replace('.', '/')}", f"{PROJECT}/{name.rpartition('.')[0].replace('.', '/')}")
+            found = [place + end for place in places for end in (".py", "/__init__.py")]
+            files = [one for one in found if Path(one).is_file()]
+            assert not files or files[0] in closure([file]), f"{file}: {name}"
+
+
 def small_package(root, line):
     """A package whose module ``maker`` is one line, with a room ``made``, whose folder is returned."""
     planning = root / "puncture_twin" / "planning"
@@ -371,6 +432,11 @@ def stamp_in(root):
         "from puncture_twin.planning.base.cache.source_stamp import source_stamp; "
         "print(source_stamp('puncture_twin.planning.maker'))"
     )
+    return python_in(root, code)
+
+
+def python_in(root, code):
+    """What a process of that package prints."""
     environment = os.environ | {"PYTHONPATH": str(root)}
     options = {"cwd": root, "capture_output": True, "text": True, "check": True}
     return subprocess.run([sys.executable, "-c", code], env=environment, **options).stdout

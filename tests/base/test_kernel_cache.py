@@ -196,6 +196,21 @@ def test_an_edit_between_import_and_first_call_reaches_the_next_process(project)
     assert _answer(project) == (11, 0)
 
 
+@pytest.mark.parametrize("back", ["before it is compiled", "at the end"])
+def test_what_is_loaded_after_an_edit_is_not_kept_as_made_before_it(project, back):
+    """Sources are stamped with the first kernel; a later one may be another's, and the edit taken back by then."""
+    edit, undo = (f"file.write_text({CALLEE.format(number)!r})\n" for number in (10, 1))
+    code = "import pathlib\nimport puncture_twin.planning.base.numba_kernels\n"
+    code += "from puncture_twin.planning import first\n"
+    code += "file = pathlib.Path(first.__file__).with_name('callee.py')\n"
+    code += edit + "from puncture_twin.planning.caller import add\n"
+    code += undo + "print(add(1))" if back == "before it is compiled" else "print(add(1))\n" + undo
+    first = CALLEE.format(1).replace("rule", "other").replace("* SIZE", "")
+    (project / "puncture_twin" / "planning" / "first.py").write_text(first)
+    assert _python(project, code).stdout.split() == ["11"]
+    assert _answer(project) == (2, 0)
+
+
 @pytest.mark.parametrize(
     "way", ["import puncture_twin.planning.callee as room", "from puncture_twin.planning import callee as room"]
 )

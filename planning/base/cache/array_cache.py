@@ -21,7 +21,7 @@ from typing import Any, Generic, TypeVar
 from puncture_twin.planning.base.cache.cache_folder import StoredFile, store, touch
 from puncture_twin.planning.base.cache.entry_file import Arrays, DamagedError, packed, read_plain_file, unpacked
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
-from puncture_twin.planning.base.cache.source_stamp import library_versions, source_stamp
+from puncture_twin.planning.base.cache.source_stamp import library_versions, module_unedited, source_stamp
 from puncture_twin.planning.base.errors import CacheWarning, InputError
 
 __all__ = ["NO_CACHE", "Arrays", "Cache", "user_cache"]
@@ -115,7 +115,7 @@ class Cache:
         if found is None:
             made = _frozen(make())
             found = _Read(made, read(made))
-            if self.folder is not None:
+            if self.folder is not None and module_unedited(entry.maker):  # else it may be of newer code than its stamp
                 self._store(entry, made)
         return found
 

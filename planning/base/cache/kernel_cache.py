@@ -25,7 +25,14 @@ from numba.core.runtime.nrt import rtsys
 from puncture_twin.planning.base.cache.brought_kernels import BROUGHT, brought_class, brought_folder
 from puncture_twin.planning.base.cache.kernel_files import CheckedFiles
 from puncture_twin.planning.base.cache.kernel_library import KernelLibrary
-from puncture_twin.planning.base.cache.source_stamp import PACKAGE, PARTS, library_versions, sources_with, stamp_of
+from puncture_twin.planning.base.cache.source_stamp import (
+    PACKAGE,
+    PARTS,
+    files_unedited,
+    library_versions,
+    sources_with,
+    stamp_of,
+)
 
 config: Any = numba_config
 """It makes its attributes when it is loaded."""
@@ -46,7 +53,12 @@ def kernels_stamp() -> str:
 
     What they import counts too: numba freezes a constant into the kernel that names it. So do the compilers' versions.
     """
-    return f"{stamp_of(sources_with(b'numba'))} {library_versions(COMPILERS)}"
+    return f"{stamp_of(_kernels_files())} {library_versions(COMPILERS)}"
+
+
+@cache
+def _kernels_files() -> tuple[str, ...]:
+    return tuple(sources_with(b"numba"))
 
 
 @cache
@@ -105,6 +117,11 @@ class KernelCache(NumbasCache):
         """What was compiled for these types, or None."""
         rtsys.initialize(target_context)
         return self._load_overload(sig, target_context)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep what was compiled, unless a source was edited meanwhile: the stamp may be of other code than this."""
+        if files_unedited(_kernels_files()):
+            super().save_overload(sig, data)
 
 
 def use_kernel_cache() -> None:

@@ -27,7 +27,7 @@ IMPORTED = re.compile(
 """An import: the module and the names taken from it, or a list of modules. One in a docstring counts too: it costs
 nothing but a result made anew."""
 
-NAME = re.compile(rb"([\w.]+)(?:[ \t]+as[ \t]+\w+)?")
+NAME = re.compile(rb"([\w.]+|\*)(?:[ \t]+as[ \t]+\w+)?")
 
 
 def source_stamp(module: str) -> str:
@@ -76,6 +76,23 @@ def closure(files: Iterable[str]) -> frozenset[str]:
     return frozenset(taken)
 
 
+def module_unedited(module: str) -> bool:
+    """Whether a module's files are still those of its stamp: see `files_unedited`."""
+    return files_unedited(_files_of(module))
+
+
+def files_unedited(files: Iterable[str]) -> bool:
+    """Whether these files, and all that they import, are still those that were read for a stamp.
+
+    A module that is loaded after an edit is not the one that was stamped: what it makes must not be kept. A file that
+    was written again counts as edited, whatever it says now: who knows what it said in between.
+    """
+    try:
+        return all(_state(os.stat(file)) == _opened(file)[1] for file in closure(files))  # noqa: PTH116  # as above
+    except FileNotFoundError:
+        return False
+
+
 def library_versions(libraries: Iterable[str]) -> dict[str, str]:
     """The version of each library that is installed."""
     return {name: _version(name) for name in libraries}
@@ -90,9 +107,19 @@ def _version(name: str) -> str:
 
 
 @cache
-def _source(file: str) -> bytes:
+def _opened(file: str) -> tuple[bytes, tuple[int, ...]]:
+    """What a source says, and its state when it was read."""
     with open(file, "rb") as stream:  # noqa: PTH123  # a path of each costs 0.01 s
-        return stream.read()
+        return stream.read(), _state(os.fstat(stream.fileno()))
+
+
+def _state(status: os.stat_result) -> tuple[int, ...]:
+    """What changes when a file is written or replaced."""
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def _source(file: str) -> bytes:
+    return _opened(file)[0]
 
 
 @cache
