@@ -25,8 +25,8 @@ class Side(Enum):
 def side_of(mesh: TriangleMesh, point: NDArray[np.float64]) -> Side:
     """Inside or outside of a closed surface, whatever its orientation; unknown for an open one.
 
-    Where triangles are wound against their neighbours, the winding number means nothing: it may be 0 deep inside. Then
-    a point is inside if rays from it cross the surface an odd number of times.
+    Where triangles are given twice or wound against their neighbours, the winding number means nothing: it may be 0
+    deep inside. Then a point is inside if rays from it cross the surface an odd number of times.
 
     Args:
         mesh: The surface, mm.

@@ -79,8 +79,13 @@ class TriangleMesh:
 
     @cached_property
     def wound_alike(self) -> bool:
-        """Whether every edge is run as often one way as the other: else no side of the surface is its outer side."""
+        """Whether every edge is run as often one way as the other: else no side of the surface is its outer side.
+
+        Not where a triangle is given again: both ways round, it has no side, and its solid angle is undone.
+        """
         a, b, c = self._welded.T
+        if not (self.distinct | (a == b) | (b == c) | (c == a)).all():
+            return False
         starts, ends = np.concatenate([a, b, c]), np.concatenate([b, c, a])
         count = len(self.vertices)
         return bool(np.array_equal(np.sort(starts * count + ends), np.sort(ends * count + starts)))

@@ -6,7 +6,7 @@ import trimesh
 from oracles import ray_crossings
 
 from puncture_twin.planning.case.entry import grid
-from puncture_twin.planning.geometry.containment import Side, holds, side_of
+from puncture_twin.planning.geometry.containment import Side, holds, inside_each, side_of
 from puncture_twin.planning.geometry.crossings import crossings, first_crossing
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.winding import winding_number
@@ -158,6 +158,20 @@ def test_triangles_given_again_the_other_way_do_not_hide_an_inside(ball):
     again = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces, near, near]))
     assert again.closed and abs(winding_number(again, point)) < 0.5
     assert side_of(again, point) is Side.INSIDE
+
+
+@pytest.mark.parametrize("welded", [True, False])
+def test_a_surface_given_both_ways_round_has_its_inside(ball, welded):
+    """As some programs write organs, to be seen from either side: the solid angles add up to nothing."""
+    mesh = ball(50, subdivisions=2)
+    faces = np.concatenate([mesh.faces, mesh.faces[:, ::-1]])
+    both = TriangleMesh(mesh.vertices, faces)
+    if not welded:
+        both = TriangleMesh(both.triangles.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))
+    points = np.array([[1.0, 2, 3], [40, 0, 0], [0, 0, 49], [45, 45, 0], [0, 0, 51]])
+    assert both.closed and winding_number(both, points[0]) == pytest.approx(0.0)
+    assert [side_of(both, point) is Side.INSIDE for point in points] == [True, True, True, False, False]
+    assert inside_each(both, points).tolist() == [True, True, True, False, False]
 
 
 def test_shells_within_shells_keep_their_hollows(ball):

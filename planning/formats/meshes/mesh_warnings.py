@@ -28,7 +28,7 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
             "if it should be closed, the file may be incomplete"
         )
     elif not mesh.wound_alike:
-        warnings.append(f"{name}: triangles are wound against their neighbours: inside is found by rays")
+        warnings.append(f"{name}: triangles are given twice or wound against their neighbours: inside is found by rays")
     elif _signed_volume(mesh) < 0.0:
         warnings.append(f"{name}: inverted normals: they point inward; inside is found without them")
     return tuple(warnings)
