@@ -50,6 +50,8 @@ class Crossings:
         ray: Shape (c,), row of the ray.
         depth: Shape (c,), mm from the origin.
         face: Shape (c,), triangle that is crossed.
+        way: Shape (c,), 1 where the ray comes out through the triangle's front (its corners run counterclockwise seen
+            from there), -1 where it goes in, 0 where it does both at once: two surfaces touch there, or one is folded.
         count: Shape (n,), crossings of each ray.
         first: Shape (n,), row in ``depth`` of each ray's first crossing (meaningless where count is 0).
     """
@@ -57,6 +59,7 @@ class Crossings:
     ray: Ints
     depth: Floats
     face: Ints
+    way: Ints
     count: Ints
     first: Ints
 
@@ -78,16 +81,27 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     while total > room:
         room = total
         ray, depth, face = np.empty(room, np.int64), np.empty(room), np.empty(room, np.int64)
+        way = np.empty(room, np.int64)
         binned = rays, lengths, order, starts, bins
-        total = _visit(mesh.vertices, mesh.faces, origin, binned, length, ray, depth, face)
-    ray, depth, face = ray[:total], depth[:total], face[:total]
+        total = _visit(mesh.vertices, mesh.faces, origin, binned, length, ray, depth, face, way)
+    ray, depth, face, way = ray[:total], depth[:total], face[:total], way[:total]
     rows = np.lexsort((depth, ray))
-    ray, depth, face = ray[rows], depth[rows], face[rows]
+    ray, depth, face, way = ray[rows], depth[rows], face[rows], way[rows]
     fresh = np.ones(total, bool)
     fresh[1:] = (ray[1:] != ray[:-1]) | (depth[1:] - depth[:-1] > SAME_CROSSING_MM)
+    way = _ways(way, fresh)
     ray, depth, face = ray[fresh], depth[fresh], face[fresh]
     count = np.bincount(ray, minlength=len(directions))
-    return Crossings(ray, depth, face, count, np.cumsum(count) - count)
+    return Crossings(ray, depth, face, way, count, np.cumsum(count) - count)
+
+
+def _ways(way: Ints, fresh: Bools) -> Ints:
+    """Of crossings that are one, from one that is fresh to the next: the way that all have, 0 if they differ."""
+    starts = np.flatnonzero(fresh)
+    if len(starts) == 0:
+        return way
+    most, least = np.maximum.reduceat(way, starts), np.minimum.reduceat(way, starts)
+    return np.where(most == least, most, 0)
 
 
 def first_crossing(mesh: TriangleMesh, origin: Floats, directions: Floats, length: float) -> Floats:
@@ -116,7 +130,7 @@ def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
 
 
 @allocation_free()
-def _visit(vertices, faces, origin, binned, length, ray, depth, face):  # type: ignore[no-untyped-def]  # numba infers
+def _visit(vertices, faces, origin, binned, length, ray, depth, face, way):  # type: ignore[no-untyped-def]  # numba infers
     """Count the crossings; write them too where the output arrays have room."""
     rays, lengths, order, starts, bins = binned
     found, per_radian = 0, bins / np.pi
@@ -142,10 +156,10 @@ def _visit(vertices, faces, origin, binned, length, ray, depth, face):  # type: 
                 begin, end = (0, len(order)) if radius >= 1.5 else (starts[cell], starts[cell + 1])
                 for k in range(begin, end):
                     inside = _along(center, rays[k]) >= least * lengths[k]
-                    t = _cross(a, b, c, rays[k]) if inside else -1.0
+                    t, out = _cross(a, b, c, rays[k]) if inside else (-1.0, 0)
                     if 0.0 <= t <= length:
                         if found < len(ray):
-                            ray[found], depth[found], face[found] = order[k], t, f
+                            ray[found], depth[found], face[found], way[found] = order[k], t, f, out
                         found += 1
     return found
 
@@ -208,15 +222,16 @@ def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # n
 
 @allocation_free()
 def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
-    """Depth at which the ray from the origin along u crosses the triangle; -1 where it does not."""
+    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; which way: 1 or -1."""
     p, q, r = _beside(a, u), _beside(b, u), _beside(c, u)
     wa, wb, wc = _turn(q, r), _turn(r, p), _turn(p, q)
     if not ((wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)):
-        return -1.0
+        return -1.0, 0
     total = wa + wb + wc
     if total == 0.0:
-        return -1.0
-    return (wa * _along(a, u) + wb * _along(b, u) + wc * _along(c, u)) / total
+        return -1.0, 0
+    depth = (wa * _along(a, u) + wb * _along(b, u) + wc * _along(c, u)) / total
+    return depth, 1 if total * _most(u) > 0.0 else -1
 
 
 @allocation_free()
@@ -227,6 +242,14 @@ def _beside(p, u):  # type: ignore[no-untyped-def]  # numba infers
     if abs(u[1]) >= abs(u[0]):
         return p[2] - u[2] / u[1] * p[1], p[0] - u[0] / u[1] * p[1]
     return p[1] - u[1] / u[0] * p[0], p[2] - u[2] / u[0] * p[0]
+
+
+@allocation_free()
+def _most(u):  # type: ignore[no-untyped-def]  # numba infers
+    """The component of a ray along the axis that it follows most: where it is negative, `_beside` mirrors."""
+    if abs(u[2]) >= max(abs(u[0]), abs(u[1])):
+        return u[2]
+    return u[1] if abs(u[1]) >= abs(u[0]) else u[0]
 
 
 @allocation_free()
@@ -242,18 +265,31 @@ def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
 
 
 def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
-    """Crossings, and which rays leave the body an odd number of times, as a ray from inside a closed surface must.
+    """Crossings, and of which rays they add up: as those of a ray from inside a closed surface must.
+
+    Such a ray leaves an odd number of times. Where triangles are wound alike it comes out and goes in by turns: if not,
+    one shell lies within another, or two share a wall, and the first crossing need not be the way out.
 
     A ray through an edge or corner may count twice or touch without crossing; it is turned by `NUDGE` and asked again.
     """
     found = crossings(mesh, origin, directions)
-    odd = found.count % 2 == 1
-    if mesh.closed and not odd.all():
+    settled = _adds_up(mesh, found)
+    if mesh.closed and not settled.all():
         rotated = directions.copy()
-        rotated[~odd] = _rotated(directions[~odd])
+        rotated[~settled] = _rotated(directions[~settled])
         found = crossings(mesh, origin, rotated)
-        odd = found.count % 2 == 1
-    return found, odd
+        settled = _adds_up(mesh, found)
+    return found, settled
+
+
+def _adds_up(mesh: TriangleMesh, found: Crossings) -> Bools:
+    """Of which rays the crossings are odd and, on a closed surface wound alike, out and in by turns."""
+    odd = found.count % 2 == 1
+    if not (mesh.closed and mesh.wound_alike):
+        return odd
+    wrong = found.way == 0
+    wrong[1:] |= (found.ray[1:] == found.ray[:-1]) & (found.way[1:] == found.way[:-1])
+    return np.asarray(odd & (np.bincount(found.ray[wrong], minlength=len(odd)) == 0))
 
 
 def _rotated(directions: Floats) -> Floats:

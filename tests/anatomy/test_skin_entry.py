@@ -59,7 +59,8 @@ def test_the_second_look_is_a_nudge_aside_and_only_for_rays_that_need_it(monkeyp
         asked.append(directions.copy())
         count = np.array([1, 2, 3, 0]) if len(asked) == 1 else np.array([1, 1, 3, 2])
         ray, first = np.repeat(np.arange(4), count), np.concatenate([[0], np.cumsum(count)[:-1]])
-        return Crossings(ray, 10.0 + np.arange(len(ray)), 0 * ray, count, first)
+        way = (-1) ** (np.arange(len(ray)) - first[ray])
+        return Crossings(ray, 10.0 + np.arange(len(ray)), 0 * ray, way, count, first)
 
     monkeypatch.setattr("puncture_twin.planning.geometry.crossings.crossings", crossings)
     box = trimesh.creation.box([100, 100, 100])

@@ -7,7 +7,7 @@ from oracles import ray_crossings
 
 from puncture_twin.planning.case.entry import grid
 from puncture_twin.planning.geometry.containment import Side, holds, inside_each, side_of
-from puncture_twin.planning.geometry.crossings import crossings, first_crossing
+from puncture_twin.planning.geometry.crossings import crossings, first_crossing, settled_crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.winding import winding_number
 
@@ -238,3 +238,45 @@ def test_a_ray_through_corners_and_edges_leaves_every_shell_once(rng, form, off,
         toward = np.concatenate([a, b, (a + b) / 2, 0.3 * a + 0.7 * c, (1 - 1e-6) * a + 5e-7 * (b + c)])
         directions = toward / np.linalg.norm(toward, axis=1, keepdims=True)
         assert np.unique(crossings(mesh, np.full(3, off), directions).count).tolist() == [count]
+
+
+def box_between(low, high):
+    """A closed box wound outward, shape (12, 3, 3)."""
+    box = trimesh.creation.box(np.subtract(high, low))
+    return (box.vertices + np.add(low, high) / 2)[box.faces]
+
+
+def soup_of(*solids):
+    """Triangles of several solids as one mesh, each with its own corners."""
+    triangles = np.concatenate(solids)
+    return TriangleMesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+
+
+WHOLE = box_between([-300, -430, -300], [300, 200, 300])
+INNER = box_between([-250, -400, -250], [250, -60, 250])
+STACK = [
+    ([-300, -60, -300], [300, 200, 300]),
+    ([-300, -400, -300], [300, -60, 300]),
+    ([-300, -430, -300], [300, -400, 300]),
+]
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["outward", "inward"])
+@pytest.mark.parametrize(
+    ("solids", "ways", "settled"),
+    [
+        pytest.param([WHOLE], [1], True, id="one"),
+        pytest.param([WHOLE, INNER[:, ::-1]], [1, -1, 1], True, id="a hollow"),
+        pytest.param([WHOLE, INNER], [-1, 1, 1], False, id="a shell wound alike"),
+        pytest.param([box_between(*part) for part in STACK], [0, 0, 1], False, id="shared walls"),
+    ],
+)
+def test_the_first_crossing_is_the_way_out_or_nothing_is_settled(solids, ways, settled, turned):
+    """An odd count is not enough: where shells lie in shells or share walls, the body goes on behind the first."""
+    mesh = soup_of(*(solid[:, ::-1] if turned else solid for solid in solids))
+    directions = np.array([[0.01, -1.0, 0.02], [-0.1, -1.0, 0.03]])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    found, adds_up = settled_crossings(mesh, np.zeros(3), directions)
+    assert mesh.closed and mesh.wound_alike
+    assert adds_up.tolist() == [settled] * 2
+    assert found.way.tolist() == [-way if turned else way for way in ways] * 2
