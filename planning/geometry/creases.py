@@ -12,6 +12,10 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 CREASE = np.radians(60.0)
 """Two triangles that meet at more are faces of a thing with an edge. Steps of a meshed voxel mask stay below (55)."""
 
+COHERENT = 0.5
+"""Share of the areas about a corner that their sum keeps at least, where they are one side of a smooth surface. Of
+triangles given both ways round, or wound against each other, it keeps less: their blend is no normal."""
+
 
 def split_at_creases(mesh: TriangleMesh) -> TriangleMesh:
     """The same surface with one vertex for each smooth fan of triangles about a point.
@@ -44,7 +48,8 @@ def _smooth_pairs(mesh: TriangleMesh, corner_vertex: NDArray[np.int64]) -> NDArr
     same = np.flatnonzero(edge[order][1:] == edge[order][:-1])
     a, b = order[same], order[same + 1]
     normals = _normals(mesh)
-    smooth = np.abs(np.einsum("ij,ij->i", normals[faces[a]], normals[faces[b]])) >= np.cos(CREASE)
+    along = np.where(swap[a] == swap[b], -1.0, 1.0)  # of neighbours wound alike one runs the edge back
+    smooth = along * np.einsum("ij,ij->i", normals[faces[a]], normals[faces[b]]) >= np.cos(CREASE)
     a, b = a[smooth], b[smooth]
     return np.concatenate(
         [np.stack([low_corner[a], low_corner[b]], axis=1), np.stack([high_corner[a], high_corner[b]], axis=1)]
@@ -59,17 +64,30 @@ def _normals(mesh: TriangleMesh) -> NDArray[np.float64]:
 
 
 def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) -> Floats:
-    """Unit normals at points of triangles: the corners' normals (area weighted), blended; shape (n, 3)."""
+    """Unit normals at points of triangles: the corners' normals (area weighted), blended; shape (n, 3).
+
+    The triangle's own where those about one of its corners have no common side.
+    """
     asked = np.zeros(len(mesh.vertices), bool)
     asked[mesh.faces[face]] = True
     around = np.flatnonzero(asked[mesh.faces].any(axis=1))
     a, b, c = np.moveaxis(mesh.triangles[around], 1, 0)
     areas = np.cross(b - a, c - a)
     corners, at_vertex = mesh.faces[around].T.reshape(-1), np.empty_like(mesh.vertices)
+
+    def about_vertices(part: Floats) -> Floats:
+        return np.asarray(np.bincount(corners, weights=np.tile(part, 3), minlength=len(at_vertex)))
+
     for axis, part in enumerate(areas.T):
-        at_vertex[:, axis] = np.bincount(corners, weights=np.tile(part, 3), minlength=len(at_vertex))
+        at_vertex[:, axis] = about_vertices(part)
+    kept, whole = np.linalg.norm(at_vertex, axis=1), about_vertices(np.linalg.norm(areas, axis=1))
     weights = _corner_weights(mesh.triangles[face], points)
-    return _unit(np.einsum("ij,ijk->ik", weights, _unit(at_vertex)[mesh.faces[face]]))
+    own = _normals(TriangleMesh(mesh.vertices, mesh.faces[face]))
+    normals = _unit(at_vertex)[mesh.faces[face]]
+    turned = np.where(np.einsum("ijk,ik->ij", normals, own) < 0.0, -1.0, 1.0)
+    blended = _unit(np.einsum("ij,ij,ijk->ik", weights, turned, normals))
+    coherent = (kept >= COHERENT * whole)[mesh.faces[face]].all(axis=1)
+    return np.where(coherent[:, None], blended, own)
 
 
 def _corner_weights(triangles: Floats, points: Floats) -> Floats:
