@@ -38,6 +38,10 @@ CONE_SLACK = 1e-9
 OUTSIDE = 1e-12
 """By so much less than a cone's is the cosine of a ray that is outside of it whatever rounding did."""
 
+DOUBTFUL = 1e-12
+"""A triangle seen so nearly edge-on that the share of its area across the ray is of rounding: where on it the ray is
+crossed is not known."""
+
 NUDGE = 1e-7
 """Radians by which a ray through an edge or corner is turned when its crossings do not add up."""
 
@@ -51,7 +55,8 @@ class Crossings:
         depth: Shape (c,), mm from the origin.
         face: Shape (c,), triangle that is crossed.
         way: Shape (c,), 1 where the ray comes out through the triangle's front (its corners run counterclockwise seen
-            from there), -1 where it goes in, 0 where it does both at once: two surfaces touch there, or one is folded.
+            from there), -1 where it goes in, 0 where it does both at once (two surfaces touch there, or one is folded)
+            or the triangle is seen edge-on.
         count: Shape (n,), crossings of each ray.
         first: Shape (n,), row in ``depth`` of each ray's first crossing (meaningless where count is 0).
     """
@@ -231,7 +236,21 @@ def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
     if total == 0.0:
         return -1.0, 0
     depth = (wa * _along(a, u) + wb * _along(b, u) + wc * _along(c, u)) / total
+    if abs(total) < DOUBTFUL * _largest(a, b, c) * max(_span(p), _span(q), _span(r)):
+        return depth, 0
     return depth, 1 if total * _most(u) > 0.0 else -1
+
+
+@allocation_free()
+def _largest(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
+    """The largest coordinate of three points."""
+    return max(abs(a[0]), abs(a[1]), abs(a[2]), abs(b[0]), abs(b[1]), abs(b[2]), abs(c[0]), abs(c[1]), abs(c[2]))
+
+
+@allocation_free()
+def _span(p):  # type: ignore[no-untyped-def]  # numba infers
+    """How far from the ray a point of the plane across it lies, along one axis or the other."""
+    return max(abs(p[0]), abs(p[1]))
 
 
 @allocation_free()

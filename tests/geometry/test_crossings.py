@@ -280,3 +280,24 @@ def test_the_first_crossing_is_the_way_out_or_nothing_is_settled(solids, ways, s
     assert mesh.closed and mesh.wound_alike
     assert adds_up.tolist() == [settled] * 2
     assert found.way.tolist() == [-way if turned else way for way in ways] * 2
+
+
+@pytest.mark.parametrize("height", [0.0, 1e-15, 1e-14, 1e-13, 1e-12, 1e-11])
+def test_a_sliver_that_closes_a_gap_does_not_say_where_a_ray_leaves(rng, height):
+    """A corner in the middle of a neighbour's edge: where a ray meets the sliver between them rounding alone tells."""
+    for _ in range(40):
+        ball = trimesh.creation.icosphere(1)
+        points = ball.vertices * rng.uniform(50, 150, (len(ball.vertices), 1))
+        a, b, c = ball.faces[0]
+        middle = points[a] + rng.uniform(0.05, 0.95) * (points[b] - points[a]) + 100 * height * rng.normal(size=3)
+        new = len(points)
+        faces = np.concatenate([ball.faces[1:], [[a, new, c], [new, b, c], [a, b, new]]])
+        mesh = TriangleMesh(np.concatenate([points, middle[None]]), faces)
+        toward = rng.dirichlet([1, 1, 1], 200) @ mesh.vertices[[a, b, new]]
+        directions = toward / np.linalg.norm(toward, axis=1, keepdims=True)
+        found, settled = settled_crossings(mesh, np.zeros(3), directions)
+        assert mesh.closed and mesh.wound_alike
+        assert found.count[settled].max() == 1
+        depth = found.depth[found.first[settled]]
+        np.testing.assert_allclose(depth, np.linalg.norm(toward[settled], axis=1), atol=0.01)
+        assert settled.mean() > 0.9
