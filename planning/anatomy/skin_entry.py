@@ -47,7 +47,7 @@ def skin_paths(
         farthest: How far skin matters, mm: to where the flange can be while the tip waits; ``length`` if left out.
     """
     view = view_depth(skin, target_ct, outward_ct)
-    found, odd = settled_crossings(skin.mesh, target_ct, outward_ct)
+    found, settled = settled_crossings(skin.mesh, target_ct, outward_ct)
     has = found.count > 0
     first = found.first[has]
     depth, face = np.full(len(outward_ct), np.nan), np.zeros(len(outward_ct), np.int64)
@@ -60,7 +60,7 @@ def skin_paths(
     unknown = np.where(view < length, view, np.nan)
     unknown[cut] = depth[cut]
     if skin.mesh.closed:
-        unknown[~odd] = 0.0
+        unknown[~settled] = 0.0
     depth[cut] = np.nan
     entry = target_ct + depth[:, None] * outward_ct
     cosine = np.abs(np.einsum("ij,ij->i", smooth_normals(skin.mesh, face, entry), outward_ct))

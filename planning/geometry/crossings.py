@@ -227,7 +227,7 @@ def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # n
 
 @allocation_free()
 def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
-    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; which way: 1 or -1."""
+    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; and its way."""
     p, q, r = _beside(a, u), _beside(b, u), _beside(c, u)
     wa, wb, wc = _turn(q, r), _turn(r, p), _turn(p, q)
     if not ((wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)):
