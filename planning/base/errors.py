@@ -22,12 +22,14 @@ class InputError(PlanningError):
         what: What is wrong, with the offending value.
         where: The file, and the place in it (key, line, marker name).
         allowed: What would have been accepted.
+        code: What kind of fault it is, in one word, for those who ask a program and not a person.
     """
 
     most_what = MOST_WHAT
     """Characters of what is wrong."""
 
-    def __init__(self, what: str, *, where: str | Path, allowed: str) -> None:
+    def __init__(self, what: str, *, where: str | Path, allowed: str, code: str = "") -> None:
+        self.code = code
         self.what = one_line(what, self.most_what)
         self.where = one_line(str(where), MOST_WHERE)
         self.allowed = one_line(allowed, MOST_ALLOWED)
