@@ -28,7 +28,7 @@ FUNCTIONS = {
     "planning.case.case": {"load_case": "files"},
     "planning.registration.placement": {"load_placement": "files"},
     "planning.anatomy.anatomy": {"load_anatomy": "meshes"},
-    "planning.search.consistency.consistency": {"check_consistency": "inputs compared"},
+    "planning.evidence.checks": {"findings": "inputs compared"},
     "planning.clearance.fast_engine": {"FastEngine.__init__": "engine's blocks"},
     "planning.collision.workcell": {"case_checker": "workcell"},
     "planning.search.search": {"organ_distances": "search"},

@@ -7,7 +7,6 @@ from .anatomy import (
     surface_distance as surface_distance,
 )
 from .body.field_of_view import FieldOfView as FieldOfView
-from .inside_skin import LEAST_TOLERANCE_MM as LEAST_TOLERANCE_MM
 from .regions import absent_organs as absent_organs
 from .skin import Skin as Skin
 from .skin_entry import SkinPaths as SkinPaths, skin_paths as skin_paths

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,20 +16,18 @@ from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.sources import StructureSources
 from puncture_twin.planning.anatomy.structure import Role as Role, Structure as Structure
-from puncture_twin.planning.anatomy.target_readings import readings_inside
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.findings import Finding
 from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.meshes.mesh_warnings import kept_mesh_warnings
-from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.spaces import point_text
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 OUTSIDE_BODY, ATTACHED_LIMB = "outside_body", "attached_limb"
@@ -47,18 +43,7 @@ LIMB_ATTACHED = (
     f"unknown_region ({ATTACHED_LIMB})"
 )
 
-MOST_AIR = 0.02
-"""Of a body, that a CT beside its skin may show as the ambient air: an open mouth and nose hold less."""
-CT_SHIFTED = (
-    "the CT {name} shows {fraction:.0%} of what the skin encloses as the room's air: it is likely shifted against the "
-    "skin (a slip of space, another position or breath); what it adds (outside_body, unnamed_dense, unnamed_gas) lies "
-    "elsewhere then"
-)
-
 LABELS_TRUSTED = "search.trust_labels: what the CT shows inside the body beside the structures is not checked"
-
-ON_SURFACE_MM = 1e-3
-"""A target this close to its structure's surface lies on it: meshes in single precision round to 1e-5 mm."""
 
 CELLS = 24
 """Along the ball's diameter."""
@@ -76,6 +61,7 @@ class Anatomy:
         warnings: One sentence each.
         surroundings: Solids outside of the body: what the CT shows there, obstacles, the gantry.
         scan: The CT of the case, or None.
+        findings: The warnings again, and what is said besides, with code and numbers.
         ignored: Names of labels that the case leaves out on purpose.
         couch: What lies beyond what the body lies on in the CT, or None where no CT shows it.
     """
@@ -87,6 +73,7 @@ class Anatomy:
     scan: Scan | None = None
     ignored: tuple[str, ...] = ()
     couch: TriangleMesh | None = None
+    findings: tuple[Finding, ...] = ()
 
     @property
     def checked(self) -> tuple[Structure, ...]:
@@ -108,7 +95,7 @@ class Anatomy:
 
 
 def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE) -> Anatomy:
-    """Read every structure of a case, and check the target against them.
+    """Read every structure of a case. What they say of each other and of the target: `planning.evidence.checks`.
 
     Args:
         case: The validated case.
@@ -116,7 +103,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         cache: Where surfaces of volumes are kept.
 
     Raises:
-        InputError: A file that cannot be trusted, a label that no rule names, or a target that contradicts them.
+        InputError: A file that cannot be trusted, or a label that no rule names.
     """
     loader = StructureSources(case, progress, cache)
     structures = [loader.one(section) for section in case.structure if section.role != "skin"]
@@ -134,8 +121,6 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     else:
         shown = scan.outside(case.ct.air_hu)
         outside, couch = _outside(case, scan, shown, loader.warnings), shown.couch
-        if (fraction := scan.air_in_skin()) > MOST_AIR:
-            loader.warnings.append(CT_SHIFTED.format(name=scan.name, fraction=fraction))
         if any(structure.name == ATTACHED_LIMB for structure in outside):
             loader.warnings.append(LIMB_ATTACHED)
         if case.ct.trust_labels:
@@ -146,7 +131,6 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     _check_names(case, [*structures, *outside])
     read = {one.name: one.mesh for one in structures if one.source != OWN_TARGET}  # the ball is ours
     of_meshes = kept_mesh_warnings(read, cache)
-    _check_target(case, structures, skin)
     warnings = (*loader.warnings, *beyond.warnings, *left_out, *skin.warnings, *of_meshes)
     return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch)
 
@@ -227,44 +211,6 @@ def _check_demands(case: Case, structures: list[Structure]) -> None:
 def surface_distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     """Distance of a point (3,) from a surface, on either side, mm."""
     return float(np.sqrt(squared_distance(point, mesh.triangles).min()))
-
-
-def _check_target(case: Case, structures: list[Structure], skin: Skin) -> None:
-    """A target must lie inside the skin and its own structure, and inside nothing that is to be avoided."""
-    low, high = (np.array([structure.mesh.bounds[end] for structure in structures]) for end in (0, 1))
-    in_box = np.all((low <= case.target_ct) & (case.target_ct <= high), axis=1)
-    if side_of(skin.mesh, case.target_ct) is Side.OUTSIDE:
-        hint = readings_inside(case.target_ct, case.space, partial(_holds, skin.mesh))
-        _refuse_target(case, f"outside the skin{hint}", "a point in the body, in mm, in the case's space")
-    for structure, near in zip(structures, in_box, strict=True):
-        if structure.name != case.target_structure and not near:
-            continue
-        side = side_of(structure.mesh, case.target_ct)
-        if structure.role is Role.AVOID and side is Side.INSIDE:
-            what = f"inside '{structure.name}', which is to be avoided"
-            _refuse_target(case, what, "a target outside every 'avoid' structure")
-        if structure.name != case.target_structure:
-            continue
-        if structure.role is not Role.TARGET:
-            raise InputError(
-                f"target.structure '{structure.name}' has role '{structure.role}'",
-                where=case.path,
-                allowed='role "target" for the structure that holds the target',
-            )
-        if side is Side.OUTSIDE and (gap := surface_distance(structure.mesh, case.target_ct)) > ON_SURFACE_MM:
-            hint = readings_inside(case.target_ct, case.space, partial(_holds, structure.mesh), "inside")
-            what = f"{gap:.1f} mm outside its structure '{structure.name}'{hint}"
-            _refuse_target(case, what, "a point inside target.structure")
-
-
-def _refuse_target(case: Case, lies: str, allowed: str) -> NoReturn:
-    what = f"target ({point_text(case.target_ct, case.space)}) lies {lies}"
-    raise InputError(what, where=case.path, allowed=allowed)
-
-
-def _holds(mesh: TriangleMesh, point_ct: Floats) -> bool:
-    """Whether a point (3,) lies inside a closed surface."""
-    return side_of(mesh, point_ct) is Side.INSIDE
 
 
 def own_target(case: Case) -> Iterator[Structure]:

@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.attached_limbs import attached_limbs
-from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask, outside_air_fraction
+from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.anatomy.body.outside_body import (
@@ -141,21 +141,6 @@ class Scan:
         named = {"structures": [f"{one.name} {one.mesh.digest}" for one in structures]}
         return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
 
-    def air_in_skin(self) -> float:
-        """How much of a body, whose skin comes from elsewhere, is the ambient air in this CT; 0..1."""
-        if self.skin is None:
-            return 0.0
-
-        def make() -> Arrays:
-            return {
-                "fraction": np.array(
-                    outside_air_fraction(self._hu, self._body, self._ct.spacing_mm, self._tolerance_mm)
-                )
-            }
-
-        made_from = {"what": "room in skin", "skin": self.skin.mesh.digest}
-        return self.source.kept(made_from, make, _fraction, by=__name__)
-
     def contains(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
         grid = self.source.source.grid
@@ -170,6 +155,11 @@ class Scan:
         """
         T_index_ct = np.asarray(np.linalg.inv(self._ct.T_ct_index), dtype=np.float64)
         return nearest(self._hu, T_index_ct, points_ct)
+
+    @property
+    def voxels(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
+        """Hounsfield units as they are stored, shape (nx, ny, nz), and the map (4, 4) of an index to LPS mm."""
+        return self._ct.values, self._ct.T_ct_index
 
     @cached_property
     def _ct(self) -> Oriented:
@@ -212,13 +202,6 @@ def _joined(meshes: Sequence[TriangleMesh | None]) -> TriangleMesh | None:
     """Those that are there as one, or None."""
     found = [mesh for mesh in meshes if mesh is not None]
     return joined(found) if found else None
-
-
-def _fraction(stored: Arrays) -> float:
-    fraction = float(stored["fraction"])
-    if not 0.0 <= fraction <= 1.0:
-        raise ValueError("a fraction")
-    return fraction
 
 
 def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 MOST_WHAT, MOST_WHERE, MOST_ALLOWED = 400, 300, 600
 """Characters of an error's parts: what is longer loses its middle, so that the line can still be read."""
@@ -23,13 +26,22 @@ class InputError(PlanningError):
         where: The file, and the place in it (key, line, marker name).
         allowed: What would have been accepted.
         code: What kind of fault it is, in one word, for those who ask a program and not a person.
+        numbers: What was measured, by name with its unit.
     """
 
     most_what = MOST_WHAT
     """Characters of what is wrong."""
 
-    def __init__(self, what: str, *, where: str | Path, allowed: str, code: str = "") -> None:
-        self.code = code
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str | Path,
+        allowed: str,
+        code: str = "",
+        numbers: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        self.code, self.numbers = code, dict(numbers)
         self.what = one_line(what, self.most_what)
         self.where = one_line(str(where), MOST_WHERE)
         self.allowed = one_line(allowed, MOST_ALLOWED)

@@ -22,14 +22,16 @@ class Finding:
     Attributes:
         code: What kind of thing it is, in one word.
         severity: A refusal stops the work, a warning stands in every result, a note is for those who look.
-        sentence: For a person; of a refusal it names the way out.
+        sentence: For a person.
         numbers: What was measured, by name with its unit.
+        way_out: Of a refusal, what would be accepted.
     """
 
     code: str
     severity: Severity
     sentence: str
     numbers: Mapping[str, float | list[float] | str] = field(default_factory=dict)
+    way_out: str = ""
 
     def document(self) -> dict[str, object]:
         """As it stands under ``findings`` of ``--json``."""

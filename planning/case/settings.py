@@ -37,6 +37,16 @@ class Needle:
         """Half the diameter."""
         return self.diameter_mm / 2
 
+    @property
+    def longest_path_mm(self) -> float:
+        """The longest path, target to skin, that it can travel.
+
+        The shaft must reach; and with a fixed standoff the tip must still lie ``skin_gap_mm`` outside, along it.
+        """
+        if self.standoff_mm is None:
+            return self.shaft_mm
+        return min(self.shaft_mm, self.standoff_mm - self.skin_gap_mm)
+
 
 @dataclass(frozen=True)
 class SearchSettings:

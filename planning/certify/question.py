@@ -13,7 +13,6 @@ from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.cells import Cells
 from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
-from puncture_twin.planning.search.constraints import longest_path
 from puncture_twin.planning.uncertainty.any_pose import any_pose
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
@@ -100,7 +99,7 @@ def question_of(
         skin_gap=case.needle.skin_gap_mm,
         farthest=farthest_flange(case.needle, case.search.max_skin_angle),
         radius=case.needle.radius_mm,
-        longest=longest_path(case.needle),
+        longest=case.needle.longest_path_mm,
         max_skin_angle=float(case.search.max_skin_angle),
         structures=tuple(s.name for s in demanding),
         margins=_margins(case, demanding, touch, error),

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,6 +120,12 @@ class TriangleMesh:
         bounds.setflags(write=False)
         return bounds
 
+    @cached_property
+    def area(self) -> float:
+        """Of all triangles, mm^2."""
+        a, b, c = np.moveaxis(self.triangles, 1, 0)
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
+
     def transformed(self, T_b_a: NDArray[np.float64]) -> TriangleMesh:
         """The same surface in frame b.
 
@@ -127,6 +133,28 @@ class TriangleMesh:
             T_b_a: Shape (4, 4), maps coordinates of this mesh's frame a to frame b, mm.
         """
         return TriangleMesh(apply(T_b_a, self.vertices), self.faces)
+
+
+class Spread(NamedTuple):
+    """Points on a surface: coordinates (n, 3), mm, and the triangle that each lies on, shape (n,)."""
+
+    points: Floats
+    triangle: NDArray[np.intp]
+
+
+def spread_on(mesh: TriangleMesh, count: int) -> Spread:
+    """So many points spread evenly over a surface's area, the same in every run.
+
+    Along the triangles by cumulative area, within a triangle by the R2 sequence (Roberts 2018), folded at its diagonal.
+    """
+    a, b, c = np.moveaxis(mesh.triangles, 1, 0)
+    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    number = np.arange(count)
+    at = np.minimum(np.searchsorted(area, (number + 0.5) / count * area[-1]), len(area) - 1)
+    u, v = (0.5 + 0.7548776662466927 * number) % 1.0, (0.5 + 0.5698402909980532 * number) % 1.0
+    folded = u + v > 1.0
+    u, v = np.where(folded, 1.0 - u, u)[:, None], np.where(folded, 1.0 - v, v)[:, None]
+    return Spread(np.asarray(a[at] + u * (b[at] - a[at]) + v * (c[at] - a[at])), at)
 
 
 def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:

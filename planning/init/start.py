@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.anatomy.default_roles import BODY
-from puncture_twin.planning.anatomy.target_readings import readings_inside
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError, InputListError
 from puncture_twin.planning.base.progress import Names
+from puncture_twin.planning.evidence.target import readings_inside
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.rigid import apply

@@ -12,10 +12,10 @@ from puncture_twin.planning.anatomy.default_roles import (
     DefaultRole,
     never_crossed,
 )
-from puncture_twin.planning.anatomy.likely_target import Likely, likely_target
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.near_names import did_you_mean
+from puncture_twin.planning.evidence.target import Likely, likely_target
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh

@@ -1,6 +1,6 @@
 from .arm_reach import ArmReach as ArmReach, reach_request as reach_request, with_reach as with_reach
 from .candidates import ARM_CHECKED as ARM_CHECKED, Candidates as Candidates
-from .constraints import closest_miss as closest_miss, longest_path as longest_path
+from .constraints import closest_miss as closest_miss
 from .context import CaseContext as CaseContext, prepare as prepare
 from .explain import (
     Explanation as Explanation,

@@ -22,16 +22,6 @@ SKIN = "skin"
 """Its name in the reasons."""
 
 
-def longest_path(needle: Needle) -> float:
-    """The longest path, target to skin, that the needle can travel, mm.
-
-    The shaft must reach; and with a fixed standoff the tip must still lie ``skin_gap_mm`` outside, along the needle.
-    """
-    if needle.standoff_mm is None:
-        return needle.shaft_mm
-    return min(needle.shaft_mm, needle.standoff_mm - needle.skin_gap_mm)
-
-
 def first_broken(
     paths: SkinPaths,
     clearances: Clearances,
@@ -70,7 +60,7 @@ def first_broken(
     give(Reason.UNKNOWN_REGION, ~np.isnan(paths.unknown_depth), SKIN, paths.unknown_depth)
     give(Reason.NO_SKIN_ENTRY, np.isnan(length), SKIN, np.nan)
     give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), SKIN, paths.reentry_depth)
-    give(Reason.TOO_LONG, length > longest_path(needle), SKIN, length, length)
+    give(Reason.TOO_LONG, length > needle.longest_path_mm, SKIN, length, length)
     give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, SKIN, length, np.degrees(paths.skin_angle))
     waiting = paths.view_depth < waiting_flange(needle, length, paths.skin_angle)
     give(Reason.UNKNOWN_REGION, waiting, SKIN, paths.view_depth)

@@ -18,6 +18,7 @@ from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.base.progress import Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import Case
@@ -29,6 +30,7 @@ from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.collision.surroundings import with_surroundings
 from puncture_twin.planning.collision.workcell import case_checker
+from puncture_twin.planning.evidence.checks import findings
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.arm_reach import ArmReach
@@ -36,7 +38,6 @@ from puncture_twin.planning.search.bedside.entry_facts import EntryFacts, entry_
 from puncture_twin.planning.search.bedside.entry_place import Landmark
 from puncture_twin.planning.search.bending.path_layers import check_tissues
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
-from puncture_twin.planning.search.consistency.consistency import check_consistency
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases.moving_weights import breath_warnings
@@ -176,6 +177,7 @@ class CaseContext:
             "step_deg": float(np.degrees(self.case.search.step)),
             "arm": self.arm,
             "warnings": list(self.anatomy.warnings),
+            "findings": [one.document() for one in self.anatomy.findings],
         }
 
 
@@ -218,10 +220,15 @@ def prepare(
         cache = replace(user_cache(), memory=memory)
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), cache)
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
-        warnings = (*case.warnings, *anatomy.warnings, *check_consistency(case, anatomy, placement, cache))
-        warnings += breath_warnings(case, anatomy)
+        read = (*case.warnings, *anatomy.warnings)
+        found = (
+            *(Finding("reading", Severity.WARNING, one) for one in read),
+            *findings(case, anatomy, placement, cache),
+            *(Finding("breathing", Severity.WARNING, one) for one in breath_warnings(case, anatomy)),
+        )
         check_tissues(case, anatomy)
-        anatomy = replace(anatomy, warnings=warnings)
+        shown = tuple(one.sentence for one in found if one.severity is not Severity.NOTE)
+        anatomy = replace(anatomy, warnings=shown, findings=found)
         case.files.release()
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]

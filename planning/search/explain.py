@@ -19,7 +19,6 @@ from puncture_twin.planning.search.along_path import Stretch, stretches
 from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
 from puncture_twin.planning.search.bending.insertion import Insertion, insertion_along
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.constraints import longest_path
 from puncture_twin.planning.search.doubt import Doubt
 
 MOST = 0.5
@@ -119,6 +118,7 @@ class Explanation:
                 for part in self.along_path
             ],
             "warnings": list(self.anatomy.warnings),
+            "findings": [one.document() for one in self.anatomy.findings],
             **self._chances(),
             **self._needle(),
             **self._breathing(),
@@ -198,7 +198,7 @@ class Explanation:
         before, flange = standoff - row.path.length[0], standoff + needle.length_mm
         return [
             *described,
-            f"  path length    {row.path.length[0]:8.2f} mm, allowed {longest_path(needle):g}",
+            f"  path length    {row.path.length[0]:8.2f} mm, allowed {needle.longest_path_mm:g}",
             f"  skin angle     {np.degrees(row.path.skin_angle[0]):8.2f} deg, allowed {limit:g}",
             f"  standoff       {standoff:8.2f} mm, its tip {before:.1f} mm before the skin, the flange at {flange:.1f}",
             f"  tissue crossed {row.path.tissue[0]:8.2f} mm",
@@ -311,7 +311,7 @@ def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
         return []
     return [
         f"the needle is too short for {short} of {len(candidates)} directions: its longest path is "
-        f"{longest_path(case.needle):g} mm"
+        f"{case.needle.longest_path_mm:g} mm"
     ]
 
 

@@ -13,7 +13,7 @@ from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
 from puncture_twin.planning.search.bending.bent_needle import with_bending
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
-from puncture_twin.planning.search.constraints import first_broken, longest_path
+from puncture_twin.planning.search.constraints import first_broken
 from puncture_twin.planning.search.phases.organ_phases import with_breathing
 from puncture_twin.planning.search.tissue import tissue_crossed
 
@@ -64,5 +64,5 @@ def organ_candidates(
         safe_cone=np.full(count, np.nan),
         grid=directions.grid,
     )
-    bound = None if case.bending is None else case.bending.bound(longest_path(needle))
+    bound = None if case.bending is None else case.bending.bound(needle.longest_path_mm)
     return with_breathing(case, anatomy, engine, with_bending(anatomy, found, bound), bound)

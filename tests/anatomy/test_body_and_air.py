@@ -460,7 +460,7 @@ def test_beyond_a_ct_that_ends_in_the_body_nothing_is_free(scene):
     assert prepare(narrow, arm=False).search().safe.sum() == 0
 
 
-def test_a_ct_that_is_shifted_against_the_skin_is_named(scene):
+def test_a_ct_that_is_shifted_against_the_skin_is_refused(scene):
     """Its air was blamed on gas that nobody labelled. In its place, the same CT is not blamed."""
     folder, parts = scene("bed")
     write_trunk(folder, parts, supine.grid())
@@ -468,9 +468,13 @@ def test_a_ct_that_is_shifted_against_the_skin_is_named(scene):
         if shift:
             crop(folder, np.s_[:, :, :], (shift, 0.0, 0.0))
         file = '[ct]\nfile = "ct.nii.gz"' if not shift else '[ct]\nfile = "crop.nii.gz"'
-        context = prepare(write_case(folder, skin=TRUNK_SKIN, more=file, name=name), arm=False)
-        blamed = [warning for warning in context.anatomy.warnings if "likely shifted against the skin" in warning]
-        assert len(blamed) == (1 if shift else 0)
+        path = write_case(folder, skin=TRUNK_SKIN, more=file, name=name)
+        if not shift:
+            assert "labels_beside_image" not in {one.code for one in prepare(path, arm=False).anatomy.findings}
+            continue
+        with pytest.raises(InputError) as caught:
+            prepare(path, arm=False)
+        assert caught.value.code == "labels_beside_image"
 
 
 def test_a_table_beside_a_long_image_is_drawn_as_far_as_is_plausible(tmp_path):

@@ -5,9 +5,7 @@ import json
 import pytest
 from case_world import write_case
 
-from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 
@@ -55,4 +53,4 @@ def test_a_target_outside_says_by_how_much(tmp_path):
     """Ten mm beyond a ball of 20 mm."""
     path = write_case(tmp_path, ("position_mm = [0.0, 0.0, 0.0]", "position_mm = [0.0, 30.0, 0.0]"))
     with pytest.raises(InputError, match=r"lies 10\.\d mm outside its structure 'organ'"):
-        load_anatomy(load_case(path))
+        prepare(path, arm=False)

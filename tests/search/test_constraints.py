@@ -12,7 +12,7 @@ from puncture_twin.planning.case.settings import Needle, SearchSettings
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.constraints import first_broken, longest_path
+from puncture_twin.planning.search.constraints import first_broken
 
 NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
 UP = np.array([[0.0, 0.0, 1.0]])
@@ -107,7 +107,7 @@ def test_too_long(box):
 def test_a_fixed_standoff_limits_the_path(box):
     """With the tip 60 mm from the target before the insertion, and 10 mm off the skin, 50 mm of path are the most."""
     needle = Needle(200.0, 150.0, 1.0, 60.0, 10.0, 30.0)
-    assert longest_path(needle) == 50
+    assert needle.longest_path_mm == 50
     assert verdict(skin_from_mesh(box([100, 100, 99])), needle=needle)[0] == ""
     assert verdict(skin_from_mesh(box([100, 100, 101])), needle=needle)[0] == Reason.TOO_LONG
 

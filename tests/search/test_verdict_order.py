@@ -12,7 +12,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.clearance.measure import Clearances
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.constraints import closest_miss, first_broken, longest_path, worst_violation
+from puncture_twin.planning.search.constraints import closest_miss, first_broken, worst_violation
 
 NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
 DOT = TriangleMesh([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
@@ -124,7 +124,7 @@ def test_limits_themselves_are_kept():
 @pytest.mark.parametrize(("standoff", "longest"), [(None, 150), (100.0, 90), (170.0, 150), (160.0, 150), (159.0, 149)])
 def test_the_longest_path(standoff, longest):
     """The shaft; with a fixed standoff no more than leaves the tip its gap outside."""
-    assert longest_path(Needle(200.0, 150.0, 1.0, standoff, 10.0, 30.0)) == longest
+    assert Needle(200.0, 150.0, 1.0, standoff, 10.0, 30.0).longest_path_mm == longest
 
 
 def scene():

@@ -19,7 +19,7 @@ from puncture_twin.planning.anatomy.body.detached_parts import (
 from puncture_twin.planning.anatomy.body.drawn_side import LEAST_LENGTH_MM, TOO_SHORT, DrawnSide, drawn_sides
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide, flat_sides
 from puncture_twin.planning.anatomy.body.unscanned import find_unscanned
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.errors import InputError
 
 BODY_HU = -500.0
@@ -134,28 +134,3 @@ def _with_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warni
         total = sizes_ml[inside].sum()
         warnings.append(f"{total:.1f} ml of air at the border of the volume were taken as lung or gas inside the body")
     return np.asarray(body | np.isin(labels, numbers[inside]))
-
-
-def outside_air_fraction(hu: NDArray[np.float32], body: Bools, spacing_mm: Floats, tolerance_mm: float) -> float:
-    """How much of a body is air that holds together with the room's, 0..1.
-
-    Args:
-        hu: Shape (nx, ny, nz), Hounsfield units.
-        body: Same shape, what a skin from elsewhere encloses, widened by twice the tolerance at most.
-        spacing_mm: Shape (3,).
-        tolerance_mm: How far the skin may be off.
-    """
-    air = hu < BODY_HU
-    wide = (
-        scipy.ndimage.distance_transform_edt(np.pad(air, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
-        > WIDE_MM
-    )
-    labels, _ = scipy.ndimage.label(wide)
-    outside = np.unique(labels[~body])
-    ambient = np.isin(labels, outside[outside > 0])
-    near_ambient = (
-        scipy.ndimage.distance_transform_edt(~ambient, sampling=spacing_mm) <= WIDE_MM if ambient.any() else ambient
-    )
-    deep = scipy.ndimage.distance_transform_edt(np.pad(body, 1, mode="edge"), sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
-    inside = deep > 2.0 * tolerance_mm
-    return float((air & near_ambient)[inside].mean()) if inside.any() else 0.0

@@ -73,7 +73,9 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
             context = prepare(draft, arm=False, watcher=watcher)
         except InputError as error:
             what, where = (text.replace(draft.name, CASE) for text in (error.what, error.where))
-            raise InputError(what, where=where, allowed=error.allowed) from error
+            raise type(error)(
+                what, where=where, allowed=error.allowed, code=error.code, numbers=error.numbers
+            ) from error
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
     return InitRun(path, start, context, (*start.notes, *found))
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
+from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy
 from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
 from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
+from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.crossings import settled_crossings
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 SAMPLES = 1000
@@ -22,6 +26,19 @@ SAMPLES = 1000
 LEAST_TOLERANCE_MM = 2.0
 """A point this near to the skin counts as inside. Surfaces of label maps run up to half a voxel outside of the organ, a
 skin from a CT up to half a voxel inside of the dermis, and meshes of other programs are smoothed by about as much."""
+
+USUAL_INSIDE = 0.99
+"""Of a structure's area, inside the skin; a smaller fraction is a warning. One percent is what smoothing moves."""
+
+LEAST_INSIDE = 0.9
+"""A smaller fraction is refused: whatever the cause is, the organ is not where the search takes it to be."""
+
+CODE = "outside_skin"
+ALLOWED_INSIDE = (
+    f"at least {100 * LEAST_INSIDE:g} % of a structure's surface inside the skin; "
+    'role "unknown" for what is known to lie outside'
+)
+CAUSES = "a part of the body that the skin does not hold (such as an arm), or a slip of space (LPS/RAS) or unit?"
 
 
 @dataclass(frozen=True)
@@ -56,7 +73,7 @@ def inside_skin(meshes: Sequence[TriangleMesh], skin: Skin, inner_ct: Floats, to
         inner_ct: Shape (3,), a point inside the skin, such as the target.
         tolerance_mm: Shape (k,); a sample of a structure this near to the skin counts as inside.
     """
-    points = np.concatenate([spread_points(mesh, SAMPLES) for mesh in meshes] or [np.empty((0, 3))])
+    points = np.concatenate([spread_on(mesh, SAMPLES).points for mesh in meshes] or [np.empty((0, 3))])
     reach = np.repeat(np.asarray(tolerance_mm, dtype=np.float64), SAMPLES)
     outside = np.flatnonzero(~_before_skin(points, skin, inner_ct))
     outside = outside[~near_surface(points[outside], skin.mesh, reach[outside])]
@@ -84,21 +101,6 @@ def kept_inside_skin(
         return {"counts": np.array([(one.inside, one.outside, one.beyond) for one in found], np.int64).reshape(-1, 3)}
 
     return [Inside(*counts) for counts in cache.arrays(made_from, make, by=__name__)["counts"].tolist()]
-
-
-def spread_points(mesh: TriangleMesh, count: int) -> Floats:
-    """Points (count, 3) spread evenly over a surface's area, the same in every run; mm.
-
-    Along the triangles by cumulative area, within a triangle by the R2 sequence (Roberts 2018), folded at its diagonal.
-    """
-    a, b, c = np.moveaxis(mesh.triangles, 1, 0)
-    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    number = np.arange(count)
-    at = np.minimum(np.searchsorted(area, (number + 0.5) / count * area[-1]), len(area) - 1)
-    u, v = (0.5 + 0.7548776662466927 * number) % 1.0, (0.5 + 0.5698402909980532 * number) % 1.0
-    folded = u + v > 1.0
-    u, v = np.where(folded, 1.0 - u, u)[:, None], np.where(folded, 1.0 - v, v)[:, None]
-    return np.asarray(a[at] + u * (b[at] - a[at]) + v * (c[at] - a[at]))
 
 
 def near_surface(points: Floats, mesh: TriangleMesh, distance_mm: Floats) -> Bools:
@@ -140,3 +142,41 @@ def _beyond_cut(points: Floats, view: FieldOfView | None, tolerance_mm: Floats) 
     low = view.to_box(points)
     outward = np.stack([-low, low - view.size_mm], axis=2)
     return np.asarray(np.any((outward > tolerance_mm[:, None, None]) & view.cut, axis=(1, 2)))
+
+
+def outside_skin(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding]:
+    """An organ that is elsewhere protects nothing; what is `unknown`, or a ball about the target, may lie anywhere."""
+    known = [structure for structure in anatomy.structures if structure.role is not Role.UNKNOWN]
+    placed = [structure for structure in known if structure.source != OWN_TARGET]
+    beside = [structure for structure in placed if _wholly_outside(anatomy.skin, structure)]
+    if beside:
+        said = f"structure '{beside[0].name}' lies wholly outside the skin: a slip of space (LPS/RAS) or unit?"
+        yield Finding(CODE, Severity.REFUSAL, said, way_out="structures that reach into the body")
+        return
+    if not anatomy.skin.mesh.closed:
+        said = "the skin mesh is open: how much of each structure lies inside the body is not known"
+        yield Finding("skin_open", Severity.WARNING, said)
+        return
+    tolerances = np.array([_surface_tolerance_mm(case, structure) for structure in placed])
+    meshes = [structure.mesh for structure in placed]
+    for structure, part in zip(
+        placed, kept_inside_skin(meshes, anatomy.skin, case.target_ct, tolerances, cache), strict=True
+    ):
+        if part.fraction < USUAL_INSIDE:
+            outside = f"{100 * (1 - part.fraction):.1f} % of its surface lies outside the skin"
+            said = f"structure '{structure.name}': {outside}: {CAUSES}"
+            severity = Severity.REFUSAL if part.fraction < LEAST_INSIDE else Severity.WARNING
+            yield Finding(CODE, severity, said, {"inside": round(part.fraction, 4)}, ALLOWED_INSIDE)
+
+
+def _wholly_outside(skin: Skin, structure: Structure) -> bool:
+    """Also where the skin is open, or its cut sides say nothing: no box of an organ lies beside the body's."""
+    (low, high), (below, above) = skin.mesh.bounds, structure.mesh.bounds
+    return bool(np.any(below > high) or np.any(above < low))
+
+
+def _surface_tolerance_mm(case: Case, structure: Structure) -> float:
+    """How far a structure's surface and the skin may be off: half a voxel each, and no less than a mesh may."""
+    skin = case.skin_section.ct or case.skin_section.labelmap
+    skin_mm = 0.0 if skin is None else float(case.volumes.source(skin).grid.spacing_mm.max())
+    return max(LEAST_TOLERANCE_MM, (skin_mm + structure.voxel_mm) / 2)

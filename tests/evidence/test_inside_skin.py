@@ -7,11 +7,11 @@ import pytest
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import Role, Structure
-from puncture_twin.planning.anatomy.inside_skin import SAMPLES, inside_skin, near_surface, spread_points
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.consistency.consistency import check_consistency
+from puncture_twin.planning.evidence.checks import findings
+from puncture_twin.planning.evidence.inside_skin import SAMPLES, inside_skin, near_surface
+from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
 from puncture_twin.planning.search.context import prepare
 from tests.oracles import point_triangle_distance
 
@@ -84,8 +84,8 @@ def test_a_part_of_the_body_beside_the_trunk_counts(ball):
 def test_samples_are_spread_by_area(box):
     """A flat box: each face carries its share of the points, and every run makes the same ones."""
     mesh = box((100, 50, 10))
-    points = spread_points(mesh, 2000)
-    np.testing.assert_array_equal(points, spread_points(mesh, 2000))
+    points = spread_on(mesh, 2000).points
+    np.testing.assert_array_equal(points, spread_on(mesh, 2000).points)
     on_top = np.isclose(points[:, 2], 5).mean()
     assert on_top == pytest.approx(5000 / (2 * (5000 + 1000 + 500)), abs=0.01)
 
@@ -103,38 +103,40 @@ def test_nearness_is_exact(ball, box, rng):
 def test_the_embedded_cases_lie_inside_their_skin(name):
     """No structure of an embedded case is warned about."""
     context = prepare(folder() / name, arm=False)
-    assert not [w for w in check_consistency(context.case, context.anatomy, None) if "outside the skin" in w]
+    assert not [w for w in findings(context.case, context.anatomy, None) if "outside the skin" in w.sentence]
 
 
 def test_a_structure_of_role_unknown_may_lie_outside(carton, ball):
     """What is unknown may be anywhere, such as a line on the skin: nothing is said of it, nor refused."""
     line = Structure("line", Role.UNKNOWN, 0.0, ball(5, (0, 0, 400)), "line.ply")
     anatomy = with_structure(carton, line)
-    assert not [w for w in check_consistency(carton.case, anatomy, None) if "line" in w]
+    assert not [w for w in findings(carton.case, anatomy, None) if "line" in w.sentence]
     with pytest.raises(InputError, match="'line' lies wholly outside"):
-        check_consistency(carton.case, with_structure(carton, replace(line, role=Role.AVOID)), None)
+        findings(carton.case, with_structure(carton, replace(line, role=Role.AVOID)), None)
 
 
 @pytest.mark.parametrize(("outside_mm", "warned"), [(1.5, False), (5.0, True)])
 def test_a_little_outside_is_a_warning(carton, ball, outside_mm, warned):
     """An organ that reaches out of the carton's wall: within the tolerance nothing is said; then its fraction is."""
     organ = Structure("organ", Role.TRAVERSE, 0.0, ball(40, (160 + outside_mm - 40, 100, 60), 4), "organ.ply")
-    found = check_consistency(carton.case, with_structure(carton, organ), None)
-    found = [w for w in found if "'organ'" in w]
+    found = findings(carton.case, with_structure(carton, organ), None)
+    found = [w for w in found if "'organ'" in w.sentence]
     assert len(found) == warned
-    assert all("of its surface lies outside the skin: a part of the body that the skin does not" in w for w in found)
+    assert all(
+        "of its surface lies outside the skin: a part of the body that the skin does not" in w.sentence for w in found
+    )
 
 
 def test_a_tenth_outside_is_refused(carton, ball):
     """Whatever the cause: the organ is not where the search takes it to be."""
     organ = Structure("organ", Role.AVOID, 0.0, ball(40, (160 + 15 - 40, 100, 60), 4), "organ.ply")
     with pytest.raises(InputError, match=r"'organ': 1\d\.\d % of its surface lies outside the skin: .* slip of space"):
-        check_consistency(carton.case, with_structure(carton, organ), None)
+        findings(carton.case, with_structure(carton, organ), None)
 
 
 def test_an_open_skin_has_no_inside(carton):
     """How much lies inside is not known then, and that is said once."""
     mesh = carton.anatomy.skin.mesh
     skin = skin_from_mesh(TriangleMesh(mesh.vertices, mesh.faces[:-3]))
-    found = check_consistency(carton.case, replace(carton.anatomy, skin=skin), None)
-    assert len([w for w in found if "how much of each structure lies inside the body is not known" in w]) == 1
+    found = findings(carton.case, replace(carton.anatomy, skin=skin), None)
+    assert len([w for w in found if "how much of each structure lies inside the body is not known" in w.sentence]) == 1

@@ -1,0 +1,329 @@
+"""Do surfaces lie where an image changes? Organs end there, so labels that belong to a CT lie on its edges.
+
+For points x_i of all surfaces with normals n_i, and g the gradient of the CT, the edge strength of a placement T is
+
+    A(T) = mean_i | g(T x_i) . n_i(T) |,      n(T) = inv(R)^T n / |inv(R)^T n|,   R the linear part of T.
+
+The true placement is a peak of A where there are enough structures; with few another may look better by chance. So no
+ratio decides, but the paired differences d_i = |g . n|(T) - |g . n|(1), summed over patches (a cube of 20 mm of one
+structure, whose points see the same edge):
+
+    z(T) = sum_p D_p / sqrt(sum_p D_p^2),     D_p = sum of d_i over patch p.
+
+z is bounded by the square root of the number of patches, so that a small structure alone convicts nothing.
+`python -m benchmarks.placements` has how z is distributed for true and for wrong placements.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rotations import exp_rotation
+
+HU_RANGE = (-200.0, 400.0)
+"""What lies beyond counts as its end: air against skin or the core of a bone must not outweigh an organ's edge."""
+
+COPY_MM = 2.0
+"""The CT is averaged to voxels of at most so much: fine enough for edges, and filtered in no time."""
+
+POINTS = 15_000
+LEAST_POINTS = 200
+"""On all surfaces together, by area; and on each of them, unless they are very many."""
+
+PATCH_MM = 20.0
+
+LEAST_SHIFT_MM = 6.0
+LEAST_SHIFT_VOXELS = 1.5
+MOST_SHIFT_MM = 50.0
+"""Shifts that are tried: from the larger of the first two, doubled up to the last."""
+
+SCALES = (0.9, 0.95, 1.05, 1.1)
+
+LEAST_SEEN = 0.5
+"""A placement that leaves less than this in the image, of the points that are in it as they are, says nothing."""
+
+LEAST_SUM = 1e-12
+"""Below every sum of edge strengths, so that nothing is divided by 0."""
+
+REFINING_POINTS = 4_000
+
+
+class Placement(NamedTuple):
+    """Another place of the surfaces.
+
+    Attributes:
+        kind: ``shift``, ``scale``, ``axes``, ``grid`` or ``unit``.
+        T: Shape (4, 4), maps the surfaces as they are to where they would lie, LPS mm.
+    """
+
+    kind: str
+    T: Floats
+
+
+class Fit(NamedTuple):
+    """How a placement compares with the surfaces as they are.
+
+    Attributes:
+        placement: The other place.
+        z: Of the paired differences; above 0 where the other place lies better on the edges.
+        ratio: A(T) / A(1) on the points that both have in the image.
+    """
+
+    placement: Placement
+    z: float
+    ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeImage:
+    """A CT on voxels of at most `COPY_MM`, clipped and smoothed by one voxel.
+
+    Attributes:
+        values: Shape (nx, ny, nz).
+        T_ct_index: Shape (4, 4), voxel index to LPS mm.
+    """
+
+    values: NDArray[np.float32]
+    T_ct_index: Floats
+
+    def strength(self, points_ct: Floats, normals_ct: Floats) -> Floats:
+        """|g . n| at points (n, 3) with unit normals (n, 3), HU/mm, shape (n,); NaN outside of the image.
+
+        By the central difference over one voxel to each side along the normal.
+        """
+        T_index_ct = np.linalg.inv(self.T_ct_index)
+        index, along = apply(T_index_ct, points_ct), normals_ct @ T_index_ct[:3, :3].T
+        half_mm = 1.0 / np.linalg.norm(along, axis=1)
+        step = along * half_mm[:, None]
+        ends = [
+            scipy.ndimage.map_coordinates(self.values, (index + side * step).T, order=1, mode="nearest")
+            for side in (1.0, -1.0)
+        ]
+        strength = np.abs(ends[0] - ends[1]) / (2.0 * half_mm)
+        strength[np.any((index < 1.0) | (index > np.array(self.values.shape) - 2.0), axis=1)] = np.nan
+        return strength
+
+
+def edge_image(hu: NDArray[np.generic], T_ct_index: Floats) -> EdgeImage:
+    """The CT as the edge test sees it.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units, of any type.
+        T_ct_index: Shape (4, 4), voxel index to LPS mm.
+    """
+    spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
+    factor = np.maximum(1, np.floor(COPY_MM / spacing + 1e-6)).astype(int)
+    count = np.array(hu.shape) // factor
+    values = np.zeros(count, np.float32)
+    for first in itertools.product(*(range(n) for n in factor)):
+        part = tuple(slice(f, f + n * s, s) for f, n, s in zip(first, count, factor, strict=True))
+        values += np.clip(hu[part], *HU_RANGE)
+    values /= np.float32(factor.prod())
+    T_index_copy = np.diag([*factor.astype(float), 1.0])
+    T_index_copy[:3, 3] = (factor - 1) / 2
+    return EdgeImage(scipy.ndimage.gaussian_filter(values, 1.0, mode="nearest"), T_ct_index @ T_index_copy)
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Points on several surfaces.
+
+    Attributes:
+        points_ct: Shape (n, 3), LPS mm.
+        normals_ct: Shape (n, 3), unit; their sign does not matter.
+        structure: Shape (n,), which surface each lies on.
+        patch: Shape (n,), which patch of it.
+    """
+
+    points_ct: Floats
+    normals_ct: Floats
+    structure: NDArray[np.intp]
+    patch: NDArray[np.intp]
+
+    @property
+    def middle_ct(self) -> Floats:
+        """Shape (3,), LPS mm."""
+        return np.asarray(self.points_ct.mean(axis=0))
+
+    def thinned(self, count: int) -> Sample:
+        """About so many of its points."""
+        rows = slice(None, None, max(1, len(self.points_ct) // count))
+        return Sample(self.points_ct[rows], self.normals_ct[rows], self.structure[rows], self.patch[rows])
+
+    def moved(self, T: Floats) -> Sample:
+        """The same surfaces elsewhere, by a map (4, 4)."""
+        points, normals = self.placed(T)
+        return Sample(points, normals, self.structure, self.patch)
+
+    def placed(self, T: Floats) -> tuple[Floats, Floats]:
+        """Its points and normals by a placement (4, 4)."""
+        normals = self.normals_ct @ np.linalg.inv(T[:3, :3])
+        return apply(T, self.points_ct), normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def sample_surfaces(meshes: Sequence[TriangleMesh], count: int = POINTS) -> Sample:
+    """Points spread evenly over surfaces, at least `LEAST_POINTS` on each, the same in every run."""
+    areas = np.array([mesh.area for mesh in meshes])
+    least = min(LEAST_POINTS, count // len(meshes))
+    counts = np.maximum(np.round(count * areas / areas.sum()), least).astype(int)
+    points, normals = [], []
+    for mesh, number in zip(meshes, counts, strict=True):
+        spread = spread_on(mesh, number)
+        a, b, c = np.moveaxis(mesh.triangles[spread.triangle], 1, 0)
+        normal = np.cross(b - a, c - a)
+        points.append(spread.points)
+        normals.append(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny))
+    structure = np.repeat(np.arange(len(meshes)), counts)
+    where = np.concatenate(points)
+    cube = np.floor((where - where.min(axis=0)) / PATCH_MM).astype(np.intp)
+    patch = np.unique(np.column_stack([structure, cube]), axis=0, return_inverse=True)[1].ravel()
+    return Sample(where, np.concatenate(normals), structure, patch)
+
+
+def shifts(axes: Floats, voxel_mm: Floats) -> Iterator[Placement]:
+    """Moved along each axis, doubling from the least shift that counts.
+
+    Args:
+        axes: Shape (3, 3), unit columns.
+        voxel_mm: Shape (3,), of the coarser of image and labels along these axes.
+    """
+    for axis, voxel in zip(axes.T, voxel_mm, strict=True):
+        step = max(LEAST_SHIFT_MM, LEAST_SHIFT_VOXELS * float(voxel))
+        while step <= MOST_SHIFT_MM:
+            for along in (step, -step):
+                T = np.eye(4)
+                T[:3, 3] = along * axis
+                yield Placement("shift", T)
+            step *= 2.0
+
+
+def scalings(about: Sequence[Floats], factors: Sequence[float] = SCALES, kind: str = "scale") -> Iterator[Placement]:
+    """Made larger and smaller about points (3,)."""
+    for point, factor in itertools.product(about, factors):
+        yield Placement(kind, _about(point, np.eye(3) * factor))
+
+
+def axis_slips(about: Sequence[Floats], axes: Floats) -> Iterator[Placement]:
+    """Every other way to name and to direct three axes: mirror images, half and quarter turns, arrays reversed.
+
+    Args:
+        about: Points (3,) that stay in place.
+        axes: Shape (3, 3), unit columns: of the patient, or of a grid.
+    """
+    ways = [
+        (order, signs) for order in itertools.permutations(range(3)) for signs in itertools.product((1, -1), repeat=3)
+    ]
+    for point, (order, signs) in itertools.product(about, ways):
+        slip = np.eye(3)[:, list(order)] * np.array(signs)
+        if not np.array_equal(slip, np.eye(3)):
+            yield Placement("axes", _about(point, axes @ slip @ axes.T))
+
+
+def axes_text(order: Sequence[int], signs: Sequence[float]) -> str:
+    """Exchanged and negated axes in words; empty where neither is."""
+    negated = [name for name, sign in zip("xyz", signs, strict=True) if sign < 0]
+    if tuple(order) != (0, 1, 2):
+        return "with its axes exchanged"
+    if len(negated) == 2:
+        return f"turned by half a turn ({' and '.join(negated)} negated)"
+    return f"mirrored in {', '.join(negated)}" if negated else ""
+
+
+def _about(point: Floats, linear: Floats) -> Floats:
+    """The affine map (4, 4) with a linear part (3, 3) that leaves a point (3,) in place."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = linear, point - linear @ point
+    return T
+
+
+class Compared(NamedTuple):
+    """All placements that were tried, and how each structure by itself takes them.
+
+    Attributes:
+        fits: One a placement.
+        own_z: Shape (placements, structures), z over the patches of one structure; -inf where it is not seen.
+        own_ratio: The same shape, its A(T) / A(1).
+    """
+
+    fits: tuple[Fit, ...]
+    own_z: Floats
+    own_ratio: Floats
+
+    @property
+    def best(self) -> Fit:
+        """The placement that lies better with the most certainty."""
+        return max(self.fits, key=lambda fit: fit.z)
+
+
+def compare(image: EdgeImage, sample: Sample, placements: Sequence[Placement]) -> Compared:
+    """Compare placements with the surfaces as they are."""
+    here = image.strength(sample.points_ct, sample.normals_ct)
+    inside = max(1, int(np.count_nonzero(np.isfinite(here))))
+    owner = np.zeros(int(sample.patch.max()) + 1, np.intp)
+    owner[sample.patch] = sample.structure
+    fits, own_z, own_ratio = [], [], []
+    for placement in placements:
+        there = image.strength(*sample.placed(placement.T))
+        both = np.isfinite(here) & np.isfinite(there)
+        before, after = np.where(both, here, 0.0), np.where(both, there, 0.0)
+        gain = _sums(after - before, sample.patch)
+        z = float(_z(gain.sum(), gain @ gain)) if np.count_nonzero(both) >= LEAST_SEEN * inside else -np.inf
+        fits.append(Fit(placement, z, float(after.sum() / max(before.sum(), LEAST_SUM))))
+        own_z.append(_z(_sums(gain, owner), _sums(gain**2, owner)))
+        own_ratio.append(_sums(after, sample.structure) / np.maximum(_sums(before, sample.structure), LEAST_SUM))
+    return Compared(tuple(fits), np.array(own_z), np.array(own_ratio))
+
+
+def _sums(values: Floats, group: NDArray[np.intp]) -> Floats:
+    """The sum of the values of each group, in the order of their numbers."""
+    return np.asarray(np.bincount(group, values), dtype=np.float64)
+
+
+def _z(total: Any, square: Any) -> Floats:
+    """Z = total / sqrt(square); -inf where nothing was summed."""
+    return np.where(square > 0.0, total / np.sqrt(np.maximum(square, LEAST_SUM)), -np.inf)
+
+
+def refined(image: EdgeImage, sample: Sample, start: Placement, most_mm: float = np.inf) -> Placement:
+    """The placement near another one at which the surfaces lie best: shifted, turned and scaled further.
+
+    Nelder-Mead over shift (mm), turn and scale, about the middle of the surfaces.
+
+    Args:
+        image: The CT.
+        sample: Of the surfaces.
+        start: Near which it is looked for.
+        most_mm: No point of the surfaces moves farther from there, to first order.
+    """
+    some = sample.thinned(REFINING_POINTS)
+    middle = apply(start.T, sample.middle_ct[None])[0]
+    inside = np.count_nonzero(np.isfinite(image.strength(*some.placed(start.T))))
+    radius_mm = float(np.linalg.norm(some.points_ct - sample.middle_ct, axis=1).max())
+    step_mm = min(3.0, most_mm / 2.0)
+
+    def moved(x: Floats) -> Floats:
+        T = _about(middle, exp_rotation(x[3:6] / radius_mm) * np.exp(x[6] / radius_mm))
+        T[:3, 3] += x[:3]
+        return np.asarray(T @ start.T)
+
+    def loss(x: Floats) -> float:
+        if np.linalg.norm(x[:3]) + np.linalg.norm(x[3:6]) + abs(x[6]) > most_mm:
+            return 0.0
+        strength = image.strength(*some.placed(moved(x)))
+        seen = np.isfinite(strength)
+        return -float(strength[seen].mean()) if np.count_nonzero(seen) > 0.8 * inside else 0.0
+
+    simplex = np.vstack([np.zeros(7), np.eye(7) * step_mm])
+    options = {"initial_simplex": simplex, "maxfev": 400, "xatol": 0.1, "fatol": 1e-4}
+    found = scipy.optimize.minimize(loss, np.zeros(7), method="Nelder-Mead", options=options)
+    return start._replace(T=moved(np.asarray(found.x)))

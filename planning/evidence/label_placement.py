@@ -1,0 +1,341 @@
+"""Do the structures belong to the image? The edge test for every file or folder that structures come from.
+
+Each source (a label map, a folder of masks, a DICOM object, all meshes together) is tested by itself, with the skin
+where that does not come from the CT. What is said:
+
+- another place lies better on the CT's edges beyond chance (z >= `REFUSING_Z`): refused, and named where it is a peak;
+- it may lie better (z >= `WARNING_Z`): a warning;
+- the place as it is lies better than every other one: nothing but a note with the numbers;
+- else the edges cannot tell, which is said with what they cannot exclude.
+
+A refused case may state ``[search] trust_labels = true``: its owner has looked, and the finding is a warning.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.label_grids import label_grids
+from puncture_twin.planning.anatomy.scan import Scan
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import Arrays
+from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.evidence.edges import (
+    LEAST_SHIFT_MM,
+    Compared,
+    EdgeImage,
+    Fit,
+    Placement,
+    Sample,
+    axes_text,
+    axis_slips,
+    compare,
+    edge_image,
+    refined,
+    sample_surfaces,
+    scalings,
+    shifts,
+)
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rotations import log_rotation
+from puncture_twin.planning.geometry.spaces import Space
+
+REFUSING_Z = 6.0
+WARNING_Z = 3.0
+"""z of true placements stays below the first, also of one structure alone, and of six and more below the second: the
+table of `python -m benchmarks.placements`."""
+
+STRUCTURE_Z = 8.0
+STRUCTURE_RATIO = 1.5
+"""One structure of a source that fits is named where it lies so much better elsewhere."""
+
+UNITS = (0.001, 0.1, 10.0, 1000.0)
+"""Meshes in m or cm taken for mm, and the other way round."""
+
+LEAST_SCALE, LEAST_TURN = 0.015, np.radians(1.5)
+"""What a refined place may be off is not said."""
+
+KINDS = {
+    "shift": "a shift",
+    "scale": "another scale",
+    "axes": "a mirror image or a turn of it",
+    "unit": "another unit",
+    "grid": "the CT's own grid",
+}
+
+AS_IT_IS = Placement("shift", np.eye(4))
+
+CODE = "labels_beside_image"
+ALLOWED = (
+    "structures that lie where the CT shows them; [search] trust_labels = true where a person has looked at both and "
+    "knows that they do"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Structures that were written together, and lie right or wrong together.
+
+    Attributes:
+        name: The file or folder, or "the meshes".
+        meshes: Name to surface.
+        axes: Shape (3, 3), unit columns: of its grid, or of the patient.
+        middles: Places (3,) about which it may be mirrored or turned: the middle of its grid, or of the image, and the
+            origin.
+        first: Shape (3,), the first voxel of its grid, about which it may be scaled too.
+        voxel_mm: Shape (3,), of the coarser of its voxels and the image's along each of its axes.
+        in_units: Whether it may be in another unit.
+        grid_slip: Where the CT has its matrix on another grid: the map (4, 4) to that; else None.
+    """
+
+    name: str
+    meshes: dict[str, TriangleMesh]
+    axes: Floats
+    middles: tuple[Floats, Floats]
+    first: Floats
+    voxel_mm: Floats
+    in_units: bool = False
+    grid_slip: Floats | None = None
+
+    def placements(self) -> list[Placement]:
+        """Every other place that is tried."""
+        middles = self.middles[: 1 if np.allclose(*self.middles, atol=LEAST_SHIFT_MM) else 2]
+        found = [
+            *shifts(self.axes, self.voxel_mm),
+            *scalings([middles[0], self.first]),
+            *axis_slips(middles, self.axes),
+        ]
+        if self.in_units:
+            found += scalings([np.zeros(3)], UNITS, "unit")
+        if self.grid_slip is not None:
+            found.append(Placement("grid", self.grid_slip))
+        return found
+
+
+class Assessed(NamedTuple):
+    """What the edges say of one source.
+
+    Attributes:
+        z: The largest over all placements that were tried; -inf where the image shows none of the surfaces.
+        ratio: Of the edge strength there to that as it is.
+        kind: Of that placement; see `Placement`.
+        T: Shape (4, 4), LPS mm: the refined place where one is named, else None.
+        middle_ct: Shape (3,), of the surfaces as they are.
+        open: The kinds of placements that are not excluded.
+        odd: Structures that lie better elsewhere by themselves.
+    """
+
+    z: float
+    ratio: float
+    kind: str
+    T: Floats | None
+    middle_ct: Floats
+    open: tuple[str, ...]
+    odd: tuple[str, ...]
+
+    @property
+    def refuses(self) -> bool:
+        """Whether they lie elsewhere beyond doubt: sooner on the CT's own grid, whose matrix they have."""
+        return self.z >= (WARNING_Z if self.kind == "grid" else REFUSING_Z)
+
+
+def assess(image: EdgeImage, source: Source) -> Assessed:
+    """Hold the surfaces of one source against the edges of the CT.
+
+    What elsewhere has to beat is the best place so near that it is no slip: half a voxel by which labels are off, or a
+    smoothed surface, must not let the mirror image of a symmetric body win.
+    """
+    sample = sample_surfaces(list(source.meshes.values()))
+    compared = compare(image, sample, source.placements())
+    ahead = compared.best
+    if ahead.z >= WARNING_Z:
+        ahead = _ahead(image, sample, ahead.placement)
+    doubtful = ahead.z >= WARNING_Z
+    named = doubtful and (ahead.placement.kind == "grid" or _is_peak(image, sample, ahead, source))
+    return Assessed(
+        z=ahead.z,
+        ratio=ahead.ratio,
+        kind=ahead.placement.kind,
+        T=ahead.placement.T if named else None,
+        middle_ct=sample.middle_ct,
+        open=tuple(dict.fromkeys(fit.placement.kind for fit in compared.fits if not _excluded(fit))),
+        odd=() if doubtful else _odd(list(source.meshes), compared),
+    )
+
+
+def _ahead(image: EdgeImage, sample: Sample, start: Placement) -> Fit:
+    """The place near a better one at which the surfaces lie best, against the best that is no slip."""
+    near = refined(image, sample, AS_IT_IS, most_mm=LEAST_SHIFT_MM / 2.0).T
+    place = start if start.kind == "grid" else refined(image, sample, start)
+    fit = compare(image, sample.moved(near), [place._replace(T=place.T @ np.linalg.inv(near))]).fits[0]
+    return fit._replace(placement=place)
+
+
+def _is_peak(image: EdgeImage, sample: Sample, ahead: Fit, source: Source) -> bool:
+    """Whether a place can be named: it is better beyond doubt, and every shift from there is worse."""
+    around = compare(image, sample.moved(ahead.placement.T), list(shifts(source.axes, source.voxel_mm))).best
+    return ahead.z >= REFUSING_Z and around.z <= -WARNING_Z
+
+
+def _excluded(fit: Fit) -> bool:
+    """Whether the surfaces do not belong there. Out of the image nothing belongs, but a shift may be the image's."""
+    return fit.z <= -WARNING_Z and (fit.z > -np.inf or fit.placement.kind != "shift")
+
+
+def _peak(image: EdgeImage, sample: Sample, start: Placement, source: Source) -> Fit | None:
+    """The refined placement, where it beats the given one beyond doubt and is itself a peak; else None."""
+    fit = compare(image, sample, [refined(image, sample, start)]).fits[0]
+    around = compare(image, sample.moved(fit.placement.T), list(shifts(source.axes, source.voxel_mm))).best
+    return fit if fit.z >= REFUSING_Z and around.z <= -WARNING_Z else None
+
+
+def _odd(names: Sequence[str], compared: Compared) -> tuple[str, ...]:
+    """Structures that lie better shifted, turned or mirrored by themselves, though their source fits."""
+    z = np.where(compared.own_ratio >= STRUCTURE_RATIO, compared.own_z, -np.inf)
+    return tuple(name for name, best in zip(names, z.max(axis=0), strict=True) if best >= STRUCTURE_Z)
+
+
+def label_placement(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
+    """Whether the structures of each source, and the skin, lie on the edges of the case's CT."""
+    scan = anatomy.scan
+    if scan is None or case.space is Space.LOCAL:
+        return
+    edges = cache(lambda: edge_image(*scan.voxels))
+    for source in sources(case, anatomy, scan):
+        made_from = {
+            "what": "edges",
+            "meshes": [f"{name} {mesh.digest}" for name, mesh in source.meshes.items()],
+            "placements": [placement.T.tolist() for placement in source.placements()],
+        }
+        found = scan.source.kept(made_from, partial(_assessed, edges, source), _read, by=__name__)
+        yield from _findings(case, scan, source, found)
+
+
+def _assessed(edges: Callable[[], EdgeImage], source: Source) -> Arrays:
+    return _stored(assess(edges(), source))
+
+
+def sources(case: Case, anatomy: Anatomy, scan: Scan) -> Iterator[Source]:
+    """The structures of a case by what they were written in; none that the CT itself or the case adds."""
+    ct = scan.source.source.grid
+    middle, origin = apply(ct.T_ct_index, (np.array(ct.shape)[None] - 1) / 2)[0], np.zeros(3)
+    skin = [] if scan.skin is None else [("skin", scan.skin.mesh, _skin_source(case))]
+    rest = [(one.name, one.mesh, one.source.rpartition(":")[0] or one.source) for one in anatomy.structures] + skin
+    for grid in label_grids(case):
+        own = {name: mesh for name, mesh, file in rest if file in grid.files}
+        if not own:
+            continue
+        T, shape = grid.voxels.T_ct_index, np.array(grid.voxels.shape)
+        axes = T[:3, :3] / np.linalg.norm(T[:3, :3], axis=0)
+        voxel = np.maximum(grid.voxels.spacing_mm, _along(axes, ct.T_ct_index))
+        middles = (apply(T, (shape[None] - 1) / 2)[0], origin)
+        slip = ct.T_ct_index @ np.linalg.inv(T)
+        lost = tuple(shape) == tuple(ct.shape) and not np.allclose(slip, np.eye(4), atol=1e-3)
+        yield Source(grid.name, own, axes, middles, T[:3, 3], voxel, grid_slip=slip if lost else None)
+    files = {section.mesh for section in case.structure if section.mesh is not None}
+    meshes = {name: mesh for name, mesh, file in rest if file in files}
+    if meshes:
+        voxel = _along(np.eye(3), ct.T_ct_index)
+        yield Source("the meshes", meshes, np.eye(3), (middle, origin), origin, voxel, in_units=True)
+
+
+def _skin_source(case: Case) -> str:
+    section = case.skin_section
+    return str(section.mesh or section.labelmap)
+
+
+def _along(axes: Floats, T_ct_index: Floats) -> Floats:
+    """The size of a grid's voxel along each of some axes (unit columns), mm, shape (3,)."""
+    return np.asarray(np.abs(axes.T @ T_ct_index[:3, :3]).max(axis=1))
+
+
+def _findings(case: Case, scan: Scan, source: Source, found: Assessed) -> Iterator[Finding]:
+    count = len(source.meshes)
+    numbers: dict[str, Any] = {"source": source.name, "structures": float(count)}
+    numbers |= {"z": round(found.z, 2)} if np.isfinite(found.z) else {}
+    of = f"{source.name} ({count} structures)" if count > 1 else f"{source.name} ('{next(iter(source.meshes))}')"
+    if found.odd:
+        names = ", ".join(found.odd)
+        said = f"{source.name}: {names} would lie better on the edges of {scan.name} elsewhere: do they lie right?"
+        yield Finding("structure_beside_image", Severity.WARNING, said, numbers | {"names": names})
+    if found.z >= WARNING_Z:
+        slip = None if found.T is None else slip_of(found.T, found.middle_ct)
+        place = "elsewhere" if slip is None else slip.text(own_grid=found.kind == "grid")
+        sure = "does" if found.refuses else "may"
+        said = (
+            f"{of} {sure} not lie where {scan.name} shows it: it lies better on its edges {place} "
+            f"(z {found.z:.1f}, edges {found.ratio:.2f} times as strong)"
+        )
+        severity = Severity.REFUSAL if found.refuses and not case.ct.trust_labels else Severity.WARNING
+        yield Finding(CODE, severity, said, numbers | ({} if slip is None else slip.numbers()), ALLOWED)
+    elif found.open:
+        said = (
+            f"{of}: the edges of {scan.name} cannot tell its place from {', '.join(KINDS[one] for one in found.open)}"
+        )
+        severity = Severity.WARNING if "shift" in found.open else Severity.NOTE
+        yield Finding("edges_cannot_tell", severity, said, numbers)
+    else:
+        said = f"{of} lies on the edges of {scan.name} as it is, and worse wherever else it was tried"
+        yield Finding("labels_on_edges", Severity.NOTE, said, numbers)
+
+
+class Slip(NamedTuple):
+    """A placement in words and numbers.
+
+    Attributes:
+        shift_mm: Shape (3,), LPS: of the middle of the surfaces.
+        scale: 1 for none.
+        axes: How axes are exchanged or negated, in words; empty for not at all.
+        turn: By how much it is turned besides, rad.
+    """
+
+    shift_mm: Floats
+    scale: float
+    axes: str
+    turn: float
+
+    def text(self, *, own_grid: bool) -> str:
+        """After "it lies better"."""
+        parts = [self.axes] if self.axes else []
+        parts += [f"scaled by {self.scale:.3g}"] if abs(self.scale - 1) > LEAST_SCALE else []
+        parts += [f"turned by {np.degrees(self.turn):.0f} degrees"] if self.turn > LEAST_TURN else []
+        parts.append(f"moved by ({', '.join(f'{one:.1f}' for one in self.shift_mm)}) mm LPS")
+        return ("on the CT's own grid, whose matrix it has: " if own_grid else "") + " and ".join(parts)
+
+    def numbers(self) -> dict[str, Any]:
+        """For a program."""
+        shift = [round(float(one), 2) for one in self.shift_mm]
+        return {"shift_mm": shift, "scale": round(self.scale, 4), "turn_deg": round(float(np.degrees(self.turn)), 2)}
+
+
+def slip_of(T: Floats, middle_ct: Floats) -> Slip:
+    """What a placement (4, 4) does to surfaces about a point (3,), LPS mm."""
+    linear = T[:3, :3]
+    scale = float(np.cbrt(abs(np.linalg.det(linear))))
+    order = np.abs(linear).argmax(axis=0)
+    signs = np.sign(linear[order, range(3)])
+    exchanged = np.zeros((3, 3))
+    exchanged[order, range(3)] = signs
+    rest = linear / scale @ exchanged.T
+    shift = apply(T, middle_ct[None])[0] - middle_ct
+    return Slip(shift, scale, axes_text(order.tolist(), signs.tolist()), float(np.linalg.norm(log_rotation(rest))))
+
+
+def _stored(found: Assessed) -> Arrays:
+    T = None if found.T is None else found.T.tolist()
+    return {"json": np.array(json.dumps(found._asdict() | {"T": T, "middle_ct": found.middle_ct.tolist()}))}
+
+
+def _read(stored: Arrays) -> Assessed:
+    plain = json.loads(str(stored["json"]))
+    arrays = {name: None if plain[name] is None else np.array(plain[name], np.float64) for name in ("T", "middle_ct")}
+    return Assessed(**plain | arrays | {name: tuple(plain[name]) for name in ("open", "odd")})

@@ -1,0 +1,120 @@
+"""Structures that are not of their image are refused, warned of, or said to be open; those that are, never refused."""
+
+import numpy as np
+import pytest
+from placed_trunk import PHANTOMS, moved, write_trunk
+from places import DATA
+
+from benchmarks.placements import changed, meshes_of, real, source_of, wrong
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.findings import Severity
+from puncture_twin.planning.evidence.edges import edge_image
+from puncture_twin.planning.evidence.label_placement import REFUSING_Z, WARNING_Z, assess, slip_of
+from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.search.context import prepare
+
+
+@pytest.mark.parametrize("name", ["trunk", "head"])
+def test_slips_are_found_and_true_placements_pass(name):
+    """Of six seeded slips none passes in silence. In noise, cropped, on thick slices the true is not doubted."""
+    rng = np.random.default_rng(2)
+    patient = PHANTOMS[name]
+    image, source = edge_image(patient.hu, patient.T), source_of(patient, meshes_of(patient))
+    for _ in range(6):
+        kind, T = wrong(source, rng)
+        found = assess(image, source_of(patient, {n: mesh.transformed(T) for n, mesh in source.meshes.items()}))
+        assert found.z >= WARNING_Z or found.open, (kind, found)
+    for change in ("as it is", "noise 40 HU", "cropped", "every third slice"):
+        same = changed(patient, change, rng)
+        found = assess(edge_image(same.hu, same.T), source_of(same, meshes_of(same)))
+        assert found.z < WARNING_Z, (change, found)
+
+
+@pytest.mark.skipif(not (DATA / "slicer_chest_ct4").is_dir(), reason="the real scans are not on this machine")
+@pytest.mark.parametrize("name", ["abdomen", "chest"])
+def test_real_labels_are_told_from_the_same_off_by_least(name):
+    """A voxel and a half (15 mm along the chest's slices), 5 %, a mirror image: refused, and the true ones excluded."""
+    patient = dict(real(DATA))[name]
+    image, source = edge_image(patient.hu, patient.T), source_of(patient, meshes_of(patient))
+    assert assess(image, source).open == ()
+    least = np.maximum(6.0, 1.5 * source.voxel_mm)
+    mirror = np.eye(4)
+    mirror[0, 0], mirror[0, 3] = -1.0, 2 * source.middles[0][0]
+    slips = [moved(*(row * sign)) for row, sign in zip(np.diag(least)[1:], (-1, 1), strict=True)]
+    for T in (*slips, np.diag([0.95, 0.95, 0.95, 1.0]), mirror):
+        found = assess(image, source_of(patient, {n: mesh.transformed(T) for n, mesh in source.meshes.items()}))
+        assert found.z >= REFUSING_Z
+        assert found.T is not None
+        points = np.concatenate([mesh.vertices[::20] for mesh in source.meshes.values()])
+        back = np.c_[points, np.ones(len(points))] @ (found.T @ T).T
+        assert np.sqrt(np.mean(np.sum((back[:, :3] - points) ** 2, axis=1))) < max(3.0, 0.5 * source.voxel_mm.max())
+
+
+def test_what_edges_cannot_tell_is_said():
+    """Rods in an image without any edge: no place is excluded, and none is claimed to be right."""
+    patient = PHANTOMS["cylinder"]
+    image = edge_image(np.full(patient.hu.shape, 30.0), patient.T)
+    found = assess(image, source_of(patient, meshes_of(patient)))
+    assert "shift" in found.open
+    assert found.z < WARNING_Z
+
+
+def test_surfaces_beside_the_image_are_not_said_to_fit():
+    """Nothing of them is seen, so nothing is excluded."""
+    patient = PHANTOMS["trunk"]
+    far = {n: mesh.transformed(moved(2000.0)) for n, mesh in meshes_of(patient).items()}
+    found = assess(edge_image(patient.hu, patient.T), source_of(patient, far))
+    assert "shift" in found.open
+
+
+def test_a_case_with_labels_beside_its_ct_is_refused_with_the_shift(tmp_path):
+    """9 mm to the back: code and numbers say it, and the way that brings them back."""
+    path = write_trunk(tmp_path, moved(0.0, 9.0, 0.0))
+    with pytest.raises(InputError) as caught:
+        prepare(path, arm=False)
+    assert caught.value.code == "labels_beside_image"
+    np.testing.assert_allclose(caught.value.numbers["shift_mm"], (0.0, -9.0, 0.0), atol=1.5)
+    assert "trust_labels" in caught.value.allowed
+
+
+def test_a_person_who_has_looked_may_go_on(tmp_path):
+    """With trust_labels the same is a warning in every result, with its numbers among the findings."""
+    path = write_trunk(tmp_path, moved(0.0, 9.0, 0.0), more="trust_labels = true")
+    context = prepare(path, arm=False)
+    found = [one for one in context.anatomy.findings if one.code == "labels_beside_image"]
+    assert [one.severity for one in found] == [Severity.WARNING]
+    assert found[0].sentence in context.anatomy.warnings
+    documents = context.provenance()["findings"]
+    assert {"code", "severity", "numbers", "sentence"} == set(documents[0])
+
+
+def test_true_labels_are_confirmed_and_kept(tmp_path):
+    """A note says so, which is no warning; the second time nothing is computed anew, and the same is said."""
+    path = write_trunk(tmp_path, np.eye(4))
+    first, second = (prepare(path, arm=False).anatomy.findings for _ in range(2))
+    assert "labels_on_edges" in {one.code for one in first}
+    assert first == second
+
+
+def test_a_lost_grid_is_named(tmp_path):
+    """The CT's matrix on voxels of 1 mm at the origin: read so, eight organs lie in a corner of the trunk."""
+    patient = PHANTOMS["trunk"]
+    grid = np.diag([1.0, 1.0, 1.0, 1.0])
+    grid[:3, 3] = (-90.0, -35.0, -10.0)
+    with pytest.raises(InputError) as caught:
+        prepare(write_trunk(tmp_path, grid @ np.linalg.inv(patient.T)), arm=False)
+    assert caught.value.code == "labels_beside_image"
+    assert "own grid" in caught.value.what
+    assert caught.value.numbers["scale"] == pytest.approx(3.0)
+
+
+def test_a_slip_in_words_and_numbers():
+    """A mirror image that was also scaled, turned and moved, about a point."""
+    middle = np.array([10.0, 20.0, 30.0])
+    T = np.eye(4)
+    T[:3, :3] = 1.1 * exp_rotation([0.0, 0.0, np.radians(4.0)]) @ np.diag([-1.0, 1.0, 1.0])
+    T[:3, 3] = middle - T[:3, :3] @ middle + (1.0, 2.0, 3.0)
+    slip = slip_of(T, middle)
+    assert slip.axes == "mirrored in x"
+    assert slip.numbers() == {"shift_mm": [1.0, 2.0, 3.0], "scale": 1.1, "turn_deg": 4.0}
+    assert "scaled by 1.1 and turned by 4 degrees" in slip.text(own_grid=False)

@@ -1,0 +1,94 @@
+"""Sides, order and Hounsfield units that names promise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from placed_trunk import moved, write_trunk
+
+from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.base.findings import Severity
+from puncture_twin.planning.evidence.named_places import TISSUES, densities, inside_out, order_of_organs
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.context import prepare
+
+
+@pytest.fixture(scope="module")
+def trunk(tmp_path_factory):
+    """The trunk, its labels where they belong."""
+    return prepare(write_trunk(tmp_path_factory.mktemp("trunk"), np.eye(4)), arm=False)
+
+
+def mirrored(context, axis):
+    """Its anatomy with all structures mirrored along an LPS axis, the CT where it was."""
+    flip = np.eye(4)
+    flip[axis, axis] = -1.0
+    structures = tuple(replace(one, mesh=one.mesh.transformed(flip)) for one in context.anatomy.structures)
+    return replace(context.anatomy, structures=structures)
+
+
+def test_organs_in_order_say_nothing(trunk):
+    """Liver on the right, kidneys by their names, the spine behind."""
+    assert list(order_of_organs(trunk.case, trunk.anatomy)) == []
+
+
+@pytest.mark.parametrize(("axis", "pairs"), [(0, 2), (1, 2)])
+def test_a_mirror_image_is_refused(trunk, axis, pairs):
+    """Left and right exchanged, or front and back: every pair contradicts."""
+    found = list(order_of_organs(trunk.case, mirrored(trunk, axis)))
+    assert [one.severity for one in found] == [Severity.REFUSAL]
+    assert found[0].code == "organs_out_of_order"
+    assert found[0].numbers["wrong"] == found[0].numbers["pairs"] >= pairs
+
+
+def test_one_pair_of_several_is_a_warning(trunk):
+    """Two kidneys whose names are exchanged, in a body whose liver lies right: names, no mirror image."""
+    names = {"kidney_left": "kidney_right", "kidney_right": "kidney_left"}
+    renamed = tuple(replace(one, name=names.get(one.name, one.name)) for one in trunk.anatomy.structures)
+    found = list(order_of_organs(trunk.case, replace(trunk.anatomy, structures=renamed)))
+    assert [one.severity for one in found] == [Severity.WARNING]
+
+
+def test_bones_that_are_none_are_doubted(trunk):
+    """The vertebrae 40 mm in front of where the CT shows them; in place, nothing is said."""
+    assert list(densities(trunk.anatomy)) == []
+    off = tuple(
+        replace(one, mesh=one.mesh.transformed(moved(0.0, -40.0, 0.0))) if one.name == "vertebrae" else one
+        for one in trunk.anatomy.structures
+    )
+    found = list(densities(replace(trunk.anatomy, structures=off)))
+    assert [one.code for one in found] == ["densities"]
+    assert found[0].numbers["within"] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "tissue"),
+    [
+        ("rib_left_7", "bone"), ("vertebrae_L1", "bone"), ("Left Lung", "lung"), ("lung_upper_lobe_left", "lung"),
+        ("lung_nodule", None), ("lung_vessels", None), ("liver", "solid organs"), ("liver_vessels", None),
+    ],
+)  # fmt: skip
+def test_a_tissue_is_told_by_the_whole_name(name, tissue):
+    """A part of a name is not enough: the vessels of a lung are no air."""
+    assert next((one.name for one in TISSUES if one.has(name)), None) == tissue
+
+
+def test_meshes_that_are_all_inside_out_are_told(trunk, ball):
+    """As a program leaves them that mirrors points and keeps triangles; one of several is no such sign."""
+    right = ball(20.0)
+    inner = TriangleMesh(right.vertices, right.faces[:, ::-1])
+    section = trunk.case.structure[1]
+    case = replace(
+        trunk.case,
+        structure=tuple(section.model_copy(update={"mesh": file, "labelmap": None}) for file in ("a.stl", "b.stl")),
+    )
+
+    def anatomy(*meshes):
+        files = zip("ab", meshes, strict=True)
+        return replace(
+            trunk.anatomy,
+            structures=tuple(Structure(f, Role.AVOID, 1.0, mesh, f"{f}.stl") for f, mesh in files),
+        )
+
+    assert [one.code for one in inside_out(case, anatomy(inner, inner))] == ["meshes_inside_out"]
+    assert list(inside_out(case, anatomy(inner, right))) == []
