@@ -54,7 +54,7 @@ WARNING_Z = 3.0
 """z of true placements stays below the first, also of one structure alone, and of six and more below the second: the
 table of `python -m benchmarks.placements`."""
 
-STRUCTURE_Z = 8.0
+STRUCTURE_Z = 5.0
 STRUCTURE_RATIO = 1.5
 """One structure of a source that fits is named where it lies so much better elsewhere."""
 
