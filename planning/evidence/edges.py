@@ -52,6 +52,9 @@ SCALES = (0.9, 0.95, 1.05, 1.1)
 LEAST_SEEN = 0.5
 """A placement that leaves less than this in the image, of the points that are in it as they are, says nothing."""
 
+OFFSETS = (-1.0, -0.5, 0.5, 1.0)
+"""Voxels by which a segmentation may be drawn thicker or thinner than what it shows."""
+
 LEAST_SUM = 1e-12
 """Below every sum of edge strengths, so that nothing is divided by 0."""
 
@@ -197,14 +200,18 @@ def shifts(axes: Floats, voxel_mm: Floats) -> Iterator[Placement]:
         axes: Shape (3, 3), unit columns.
         voxel_mm: Shape (3,), of the coarser of image and labels along these axes.
     """
-    for axis, voxel in zip(axes.T, voxel_mm, strict=True):
-        step = max(LEAST_SHIFT_MM, LEAST_SHIFT_VOXELS * float(voxel))
+    for axis, step in zip(axes.T, least_shift_mm(voxel_mm), strict=True):
         while step <= MOST_SHIFT_MM:
             for along in (step, -step):
                 T = np.eye(4)
                 T[:3, 3] = along * axis
                 yield Placement("shift", T)
             step *= 2.0
+
+
+def least_shift_mm(voxel_mm: Floats) -> Floats:
+    """The least shift that counts, of voxels of some size; any shape."""
+    return np.maximum(LEAST_SHIFT_MM, LEAST_SHIFT_VOXELS * voxel_mm)
 
 
 def scalings(about: Sequence[Floats], factors: Sequence[float] = SCALES, kind: str = "scale") -> Iterator[Placement]:
@@ -268,20 +275,49 @@ class Compared(NamedTuple):
 def compare(image: EdgeImage, sample: Sample, placements: Sequence[Placement]) -> Compared:
     """Compare placements with the surfaces as they are."""
     here = image.strength(sample.points_ct, sample.normals_ct)
-    inside = max(1, int(np.count_nonzero(np.isfinite(here))))
     owner = np.zeros(int(sample.patch.max()) + 1, np.intp)
     owner[sample.patch] = sample.structure
     fits, own_z, own_ratio = [], [], []
     for placement in placements:
         there = image.strength(*sample.placed(placement.T))
-        both = np.isfinite(here) & np.isfinite(there)
-        before, after = np.where(both, here, 0.0), np.where(both, there, 0.0)
+        fits.append(fit_of(placement, sample, here, there))
+        before, after = _seen(here, there)
         gain = _sums(after - before, sample.patch)
-        z = float(_z(gain.sum(), gain @ gain)) if np.count_nonzero(both) >= LEAST_SEEN * inside else -np.inf
-        fits.append(Fit(placement, z, float(after.sum() / max(before.sum(), LEAST_SUM))))
         own_z.append(_z(_sums(gain, owner), _sums(gain**2, owner)))
         own_ratio.append(_sums(after, sample.structure) / np.maximum(_sums(before, sample.structure), LEAST_SUM))
     return Compared(tuple(fits), np.array(own_z), np.array(own_ratio))
+
+
+def fit_of(placement: Placement, sample: Sample, here: Floats, there: Floats) -> Fit:
+    """Z and ratio of edge strengths (n,) at a placement, and as it is; NaN outside of the image."""
+    before, after = _seen(here, there)
+    gain = _sums(after - before, sample.patch)
+    seen = np.count_nonzero(np.isfinite(here) & np.isfinite(there))
+    enough = seen >= LEAST_SEEN * max(1, int(np.count_nonzero(np.isfinite(here))))
+    z = float(_z(gain.sum(), gain @ gain)) if enough else -np.inf
+    return Fit(placement, z, float(after.sum() / max(before.sum(), LEAST_SUM)))
+
+
+def _seen(here: Floats, there: Floats) -> tuple[Floats, Floats]:
+    """Both strengths where both are in the image, and 0 elsewhere."""
+    both = np.isfinite(here) & np.isfinite(there)
+    return np.where(both, here, 0.0), np.where(both, there, 0.0)
+
+
+def settled(image: EdgeImage, sample: Sample) -> Floats:
+    """The strength (n,) where each structure is drawn thicker or thinner by up to a voxel, whichever lies best.
+
+    Segmentations lie to one side of the edge, by partial volume, smoothing or habit; that is no other place.
+    """
+    best = image.strength(sample.points_ct, sample.normals_ct)
+    count = int(sample.structure.max()) + 1
+    per_mm = np.linalg.norm(sample.normals_ct @ np.linalg.inv(image.T_ct_index)[:3, :3].T, axis=1, keepdims=True)
+    for voxels in OFFSETS:
+        offset = image.strength(sample.points_ct + sample.normals_ct * voxels / per_mm, sample.normals_ct)
+        before, after = _seen(best, offset)
+        better = np.bincount(sample.structure, after - before, count) > 0.0
+        best = np.where(better[sample.structure], offset, best)
+    return best
 
 
 def _sums(values: Floats, group: NDArray[np.intp]) -> Floats:

@@ -39,9 +39,12 @@ from puncture_twin.planning.evidence.edges import (
     axis_slips,
     compare,
     edge_image,
+    fit_of,
+    least_shift_mm,
     refined,
     sample_surfaces,
     scalings,
+    settled,
     shifts,
 )
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -53,6 +56,10 @@ REFUSING_Z = 6.0
 WARNING_Z = 3.0
 """z of true placements stays below the first, also of one structure alone, and of six and more below the second: the
 table of `python -m benchmarks.placements`."""
+
+LEAST_SLIP = {"shift": 0.9, "axes": 0.9, "grid": 0.9, "unit": 0.9, "scale": 1.25}
+"""In shifts of the least that counts, by kind of placement: what moves the surfaces by less is never refused. A rib cage
+by itself lies better on the edge of the lungs, 4 % smaller: .96."""
 
 STRUCTURE_Z = 5.0
 STRUCTURE_RATIO = 1.5
@@ -128,6 +135,7 @@ class Assessed(NamedTuple):
         z: The largest over all placements that were tried; -inf where the image shows none of the surfaces.
         ratio: Of the edge strength there to that as it is.
         kind: Of that placement; see `Placement`.
+        slip: How far it is, rms over the surfaces, in shifts of the least that counts.
         T: Shape (4, 4), LPS mm: the refined place where one is named, else None.
         middle_ct: Shape (3,), of the surfaces as they are.
         open: The kinds of placements that are not excluded.
@@ -137,6 +145,7 @@ class Assessed(NamedTuple):
     z: float
     ratio: float
     kind: str
+    slip: float
     T: Floats | None
     middle_ct: Floats
     open: tuple[str, ...]
@@ -144,8 +153,8 @@ class Assessed(NamedTuple):
 
     @property
     def refuses(self) -> bool:
-        """Whether they lie elsewhere beyond doubt: sooner on the CT's own grid, whose matrix they have."""
-        return self.z >= (WARNING_Z if self.kind == "grid" else REFUSING_Z)
+        """Whether they lie elsewhere beyond doubt, and far: sooner on the CT's own grid, whose matrix they have."""
+        return self.z >= (WARNING_Z if self.kind == "grid" else REFUSING_Z) and self.slip >= LEAST_SLIP[self.kind]
 
 
 def assess(image: EdgeImage, source: Source) -> Assessed:
@@ -165,6 +174,7 @@ def assess(image: EdgeImage, source: Source) -> Assessed:
         z=ahead.z,
         ratio=ahead.ratio,
         kind=ahead.placement.kind,
+        slip=_slip(sample, ahead.placement.T, source),
         T=ahead.placement.T if named else None,
         middle_ct=sample.middle_ct,
         open=tuple(dict.fromkeys(fit.placement.kind for fit in compared.fits if not _excluded(fit))),
@@ -176,14 +186,20 @@ def _ahead(image: EdgeImage, sample: Sample, start: Placement) -> Fit:
     """The place near a better one at which the surfaces lie best, against the best that is no slip."""
     near = refined(image, sample, AS_IT_IS, most_mm=LEAST_SHIFT_MM / 2.0).T
     place = start if start.kind == "grid" else refined(image, sample, start)
-    fit = compare(image, sample.moved(near), [place._replace(T=place.T @ np.linalg.inv(near))]).fits[0]
-    return fit._replace(placement=place)
+    here, there = (settled(image, sample.moved(T)) for T in (near, place.T))
+    return fit_of(place, sample, here, there)
 
 
 def _is_peak(image: EdgeImage, sample: Sample, ahead: Fit, source: Source) -> bool:
     """Whether a place can be named: it is better beyond doubt, and every shift from there is worse."""
     around = compare(image, sample.moved(ahead.placement.T), list(shifts(source.axes, source.voxel_mm))).best
     return ahead.z >= REFUSING_Z and around.z <= -WARNING_Z
+
+
+def _slip(sample: Sample, T: Floats, source: Source) -> float:
+    """How far a map (4, 4) moves the surfaces, rms, each axis in its least shift that counts."""
+    moved = (apply(T, sample.points_ct) - sample.points_ct) @ source.axes / least_shift_mm(source.voxel_mm)
+    return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
 
 def _excluded(fit: Fit) -> bool:
