@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 
 from puncture_twin.planning.evidence.edges import edge_image
-from puncture_twin.planning.evidence.label_placement import REFUSING_Z, WARNING_Z, Source, assess
+from puncture_twin.planning.evidence.label_placement import WARNING_Z, Source, assess
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
@@ -198,7 +198,7 @@ def rows(patients, draws: int, rng: np.random.Generator) -> Iterator[dict]:
 def _row(name, change, count, kind, found):
     return {
         "name": name, "change": change, "structures": count, "kind": kind, "z": found.z, "named": found.T is not None,
-        "told": bool(found.open), "odd": len(found.odd),
+        "told": bool(found.open), "odd": len(found.odd), "refused": found.refuses,
     }  # fmt: skip
 
 
@@ -224,18 +224,19 @@ def main() -> None:
         z = np.array([row["z"] for row in some if row["kind"] == "true"])
         off = [row for row in some if row["kind"] != "true"]
         part = [np.mean([test(row) for row in off]) for test in (_refused, _warned, _open, _passed)]
-        counted = f"{z.max():.1f} | {np.sum(z >= REFUSING_Z)} of {len(z)} | {np.sum(z >= WARNING_Z)}"
+        true = [row for row in some if row["kind"] == "true"]
+        counted = f"{z.max():.1f} | {sum(map(_refused, true))} of {len(z)} | {sum(map(_warned, true))}"
         print(f"| {name} | {count} | {counted} | {' | '.join(f'{one:.2f}' for one in part)} |")
     if arguments.json:
         arguments.json.write_text(json.dumps(found, indent=1))
 
 
 def _refused(row):
-    return row["z"] >= REFUSING_Z
+    return row["refused"]
 
 
 def _warned(row):
-    return WARNING_Z <= row["z"] < REFUSING_Z
+    return row["z"] >= WARNING_Z and not row["refused"]
 
 
 def _open(row):
