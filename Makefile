@@ -97,7 +97,7 @@ pictures: demo
 	$(BIN)/python docs/copy_pictures.py $(OUT) out/place out/selfcal out/servo out/budget
 
 meshes: install
-	$(BIN)/python -m puncture_twin.twin.phantoms --out meshes
+	$(BIN)/python -m tools.phantoms --out meshes
 
 clean:
 	rm -rf $(VENV) build out

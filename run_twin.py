@@ -492,7 +492,7 @@ def export(
 ) -> None:
     """Write a plan for a robot, read back and within the arm's limits. Research software, not a medical device."""
     from puncture_twin.planning.export.exporter import FORMATS
-    from puncture_twin.planning.export.moveit import MOVEIT
+    from puncture_twin.planning.export.moveit.moveit_files import MOVEIT
     from puncture_twin.planning.export.slicer.slicer_files import SLICER
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.choosing.candidates_export import CANDIDATE_FORMATS

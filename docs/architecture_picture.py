@@ -23,7 +23,7 @@ WIDTH, STEP = 2.5, 1.9
 COLUMNS = {
     "run_twin": 1.15, "api": 2.3, "twin/jobs": 1.15,
     "twin/experiment": -3.8, "twin/guidance/ultrasound": -2.7, "twin/guidance/stereo": -1.6, "twin/rehearsal": -0.5,
-    "twin/report": 0.6, "twin/guidance/ct": 1.7, "twin/phantoms": -3.8, "twin/plant": -1.6, "twin/world": -0.5,
+    "twin/report": 0.6, "twin/guidance/ct": 1.7, "twin/plant": -1.6, "twin/world": -0.5,
     "planning/export": 1.7, "planning/touch": 2.8, "planning/collision_cases": 3.9,
     "planning/place": 0.6, "planning/plan": 1.7, "planning/certify": 2.8, "planning/batch": 3.9,
     "planning/budget": 5.0, "planning/sweep": 6.1, "planning/search": 2.8, "planning/uncertainty": 2.8,

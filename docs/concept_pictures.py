@@ -24,8 +24,8 @@ from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.reach.skin_gap import skin_gaps
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
-from puncture_twin.twin.phantoms import supine
-from puncture_twin.twin.phantoms.ct_image import rendered
+from tools.phantoms import supine
+from tools.phantoms.ct_image import rendered
 
 PICTURES = Path(__file__).parent / "pictures"
 BLUE, ORANGE, GREEN, RED, GREY = "#1f4e8c", "#b9770e", "#1e8449", "#c0392b", "#8a8a8a"

@@ -11,7 +11,7 @@ import numpy as np
 
 import puncture_twin as pt
 from puncture_twin.meshes import folder
-from puncture_twin.planning.geometry import apply, exp_twist, inverse, log_twist
+from puncture_twin.planning.geometry.rigid import apply, exp_twist, inverse, log_twist
 
 SLIP = np.array([0.0, 0.0, 3.0, 0.0, 0.0, np.radians(1.0)])
 """How the patient might slip: a twist in the CT frame, 3 mm to the head and a turn of 1 degree about that axis."""

@@ -1,4 +1,4 @@
-"""The embedded cases: meshes and point lists made by ``python -m twin.phantoms``, and their case files."""
+"""The embedded cases: meshes and point lists made by ``python -m tools.phantoms``, and their case files."""
 
 from pathlib import Path
 

@@ -247,7 +247,8 @@ def read_volume(path: Path | str) -> Volume:
     Raises:
         InputError: It is cut, contradicts itself, or holds a voxel that is no finite number.
     """
-    from puncture_twin.planning.formats.dicom import is_series, read_series
+    from puncture_twin.planning.formats.dicom.ct_series import read_series
+    from puncture_twin.planning.formats.dicom.storage import is_series
     from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
     path = Path(path)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from puncture_twin.twin.phantoms.carton import BOX_HIGH_MM, BOX_LOW_MM, LESIONS_CT_MM
+from tools.phantoms.carton import BOX_HIGH_MM, BOX_LOW_MM, LESIONS_CT_MM
 
 BOLT_RADIUS_MM = 4.0
 

@@ -2,7 +2,3 @@
 
 It knows names and millimetres only; which candidates that leaves safe is found in `planning.search.phases`.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

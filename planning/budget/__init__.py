@@ -2,7 +2,3 @@
 
 It computes with the one error model; nothing here decides a verdict.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

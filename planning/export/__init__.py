@@ -2,7 +2,3 @@
 
 What is written is read back and compared with the plan before it is published.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

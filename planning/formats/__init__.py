@@ -3,7 +3,3 @@
 The guard stands before all compiled code. Each kind of file has its room below. What a file means to a case (roles,
 margins, markers) is not decided here.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,7 +3,3 @@
 What a file is, is found by its content. Each kind of segmentation has a recogniser, and gives what `Segmentation`
 demands; the finder tries them all.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,7 +2,3 @@
 
 Pure mechanics in N and mm; it knows neither cases nor patients.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

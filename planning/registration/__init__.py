@@ -2,7 +2,3 @@
 
 The equations are Arun's and Horn's rigid fit and Fitzpatrick's error formulas; each module names its source.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,7 +2,3 @@
 
 `prepare` puts together what a search needs from the rooms below; `constraints` holds the order of the reasons.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

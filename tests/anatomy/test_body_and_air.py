@@ -18,10 +18,10 @@ from puncture_twin.planning.formats.volumes import voxels
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.phantoms import supine
-from puncture_twin.twin.phantoms.ct_image import Grid, ScannedPart, rendered
-from puncture_twin.twin.phantoms.implicit import capsule, ellipsoid
 from puncture_twin.twin.plant.scanner.image import ScanSettings, scan_solids
+from tools.phantoms import supine
+from tools.phantoms.ct_image import Grid, ScannedPart, rendered
+from tools.phantoms.implicit import capsule, ellipsoid
 
 STEP_DEG = 6.0
 KIDNEY_FIELD = ellipsoid((75.0, 40.0, 0.0), (20, 15, 40))

@@ -5,8 +5,8 @@ import csv
 import places
 import pytest
 
+from puncture_twin.twin.experiment import chen2019_tables
 from puncture_twin.twin.jobs.papers import chen2019
-from puncture_twin.twin.phantoms import chen2019_tables
 
 DATA = places.DATA / "chen2019"
 

@@ -15,9 +15,9 @@ from benchmarks.beside.scene import Asked, judged
 from puncture_twin.meshes import folder
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.run_twin import main
-from puncture_twin.twin.phantoms import __main__ as phantoms
 from puncture_twin.twin.plant.beside.beside import Beside
 from puncture_twin.twin.plant.scanner.image import ScanSettings
+from tools.phantoms import __main__ as phantoms
 
 THICK = ("arm_", "table", "mattress", "pad")
 """Bodies thicker than a voxel; lines are not (`docs/concepts/virtual-ct.md`)."""
@@ -69,7 +69,7 @@ def test_the_judge_sees_what_a_needle_passes():
 
 
 def test_a_drawn_trunk_is_a_case_that_can_be_scanned(tmp_path, capsys, monkeypatch):
-    """`python -m puncture_twin.twin.phantoms --seed`, then `scan` with everything: the surfaces lie beside the CT."""
+    """`python -m tools.phantoms --seed`, then `scan` with everything: the surfaces lie beside the CT."""
     monkeypatch.setattr("sys.argv", ["phantoms", "--out", str(tmp_path / "drawn"), "--seed", "7"])
     assert phantoms.main() == 0
     flags = ["--arms", "across", "--bed", "flat", "--lines", "2", "--pixel", "4", "--spacing", "5", "--length", "60"]

@@ -13,7 +13,7 @@ from puncture_twin.planning.registration.conditioning import conditioning, lever
 from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2, TABLE_4
+from puncture_twin.twin.experiment.chen2019_tables import TABLE_1, TABLE_2, TABLE_4
 
 TARGET = np.array([50.0, 130.0, 63.0])
 MARKERS = np.array([TABLE_1[name] for name in "ABCE"], dtype=float)

@@ -19,8 +19,8 @@ from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.phantoms import supine
-from puncture_twin.twin.phantoms.ct_image import rendered
+from tools.phantoms import supine
+from tools.phantoms.ct_image import rendered
 
 SPINE = structure("spine", "avoid", {"labelmap": "labels.nii.gz", "label": 2}, margin_mm=2.0)
 LESION = structure("lesion", "target", {"labelmap": "labels.nii.gz", "label": 1})

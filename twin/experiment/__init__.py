@@ -2,7 +2,3 @@
 
 Arithmetic on points alone; what a robot and a scanner do lives in the plant.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,7 +8,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_triad
-from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_2, TABLE_4, Point
+from puncture_twin.twin.experiment.chen2019_tables import TABLE_1, TABLE_2, TABLE_4, Point
 
 NAMES = tuple(TABLE_1)
 """Of all points, in the order of the rows below."""

@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.world.arm import Arm
 from puncture_twin.twin.world.engine import pybullet
-from puncture_twin.twin.world.units import to_m, to_mm
+from puncture_twin.twin.world.units import to_mm
 
 
 class Touch(NamedTuple):
@@ -45,12 +45,3 @@ def felt_force(arm: Arm, link: str) -> Floats:
             normal, (first, along_first, second, along_second) = np.array(point[7]), point[10:14]
             force += point[9] * normal + first * np.array(along_first) + second * np.array(along_second)
     return force
-
-
-def gap_mm(client: int, first: int, second: int, within_mm: float) -> float:
-    """How far two bodies are apart, mm; negative where they overlap, infinite beyond ``within_mm``.
-
-    Of a surface triangle by triangle: a body wholly inside a closed one is apart from it.
-    """
-    points = pybullet.getClosestPoints(first, second, float(to_m(within_mm)), physicsClientId=client)
-    return min((float(to_mm(point[8])) for point in points), default=float("inf"))

@@ -3,7 +3,3 @@
 An entry is trusted only if its digest, the hashes of its inputs and the source of the code that made it all fit. What
 an entry means is the business of the workcell that makes it.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

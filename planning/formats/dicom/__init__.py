@@ -1,5 +1,1 @@
 """DICOM: CT series with their true geometry, segmentations and structure sets, read strictly."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,7 +2,3 @@
 
 It reads a direction and the markers, and decides nothing.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,7 +2,3 @@
 
 The bound is kept as clearance beside every margin; the path and the force of one direction are for people to read.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,7 +2,3 @@
 
 It only takes away: no direction that is rejected where the CT shows the body becomes safe at another phase.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,10 +7,10 @@ from scipy.spatial import cKDTree
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.jobs.experiment.scan_beside import parse_beside
-from puncture_twin.twin.phantoms.drawn.trunk import draw_trunk
 from puncture_twin.twin.plant.beside.beside import Beside, lay_beside
 from puncture_twin.twin.plant.beside.outline import Outline
 from puncture_twin.twin.plant.beside.tubes import drawn, tube
+from tools.phantoms.drawn.trunk import draw_trunk
 
 SEEDS = range(4)
 

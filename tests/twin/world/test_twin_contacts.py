@@ -22,8 +22,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.twin.world.bodies import load_surface, remove
 from puncture_twin.twin.world.client import physics_client
-from puncture_twin.twin.world.contacts import gap_mm
-from puncture_twin.twin.world.units import pose_to_m, to_m
+from puncture_twin.twin.world.units import pose_to_m, to_m, to_mm
 
 CARDS = TESTS / "collision"
 
@@ -73,6 +72,15 @@ def card(request: pytest.FixtureRequest) -> Card:
     context = prepare(path.parent / checks.case, arm=False)
     theta, beta = np.radians([[check.theta_deg, check.beta_deg] for check in checks.check]).T
     return Card(context, outward(theta, beta) @ context.case.T_ct_entry[:3, :3].T)
+
+
+def gap_mm(client, first, second, within_mm):
+    """How far two bodies are apart, mm; negative where they overlap, infinite beyond ``within_mm``.
+
+    Of a surface triangle by triangle: a body wholly inside a closed one is apart from it.
+    """
+    points = pybullet.getClosestPoints(first, second, float(to_m(within_mm)), physicsClientId=client)
+    return min((float(to_mm(point[8])) for point in points), default=float("inf"))
 
 
 def pose(target: np.ndarray, direction: np.ndarray, length: float) -> np.ndarray:

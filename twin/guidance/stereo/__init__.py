@@ -2,7 +2,3 @@
 
 The session draws its own room with ground truth, an exception from `guidance` never importing `plant`.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,7 +2,3 @@
 
 Here are the case, the poses, the recording in the twin and the puncture after it; the equation is solved in `axp_ybq`.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

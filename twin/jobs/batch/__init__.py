@@ -1,5 +1,1 @@
 """The commands ``batch``: a cohort planned, run, looked at, merged and compared; its texts and its page."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,5 +1,1 @@
 """The command ``reproduce``: a paper's printed numbers beside ours."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

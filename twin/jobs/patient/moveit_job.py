@@ -8,7 +8,7 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.export.exporter import Exported
-from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
+from puncture_twin.planning.export.moveit.moveit_files import MOVEIT, moveit_files, moveit_names
 from puncture_twin.planning.plan.plan_check import with_case_arm
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.recheck import check_plan, with_case_warnings

@@ -2,7 +2,3 @@
 
 It knows the ground truth. What it writes (DICOM, NIfTI) and `readings` are all that guidance sees of it.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

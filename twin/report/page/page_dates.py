@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from puncture_twin.planning.base.files import is_plain_file
-from puncture_twin.planning.formats.dicom import is_dicom
+from puncture_twin.planning.formats.dicom.storage import is_dicom
 
 EPOCH = "SOURCE_DATE_EPOCH"
 """Seconds since 1970 that stand for "now", as tools take them that make the same bytes on every day."""
@@ -33,7 +33,7 @@ def scan_date(case: Any) -> str:
     for one in case.inputs:
         path = case.path.parent / one.path
         if is_plain_file(path) and _begins_as_dicom(path):
-            from puncture_twin.planning.formats.dicom import recognise  # with pydicom, which few cases need
+            from puncture_twin.planning.formats.dicom.recognise import recognise  # with pydicom, which few cases need
 
             found = recognise(path)
             if found is not None and found.is_slice:

@@ -1,5 +1,1 @@
 """Cameras: pinhole with lens distortion, calibration from known points, bundle adjustment, triangulation."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

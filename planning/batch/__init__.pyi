@@ -1,1 +1,0 @@
-from .run import run_cohort as run_cohort

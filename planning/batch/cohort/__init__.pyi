@@ -1,1 +1,0 @@
-from .cohort_case import CohortCase as CohortCase

@@ -1,2 +1,0 @@
-from .breathing import Breathing as Breathing
-from .lujan import fraction_within as fraction_within, positions as positions

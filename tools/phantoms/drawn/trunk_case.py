@@ -1,0 +1,59 @@
+"""A drawn trunk as the folder of a case: ``case.toml`` and a mesh for each structure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from puncture_twin.planning.formats.meshes.ply import ply_bytes
+from tools.phantoms.drawn.trunk import Trunk
+
+HU = {"spine": 350.0, "rib": 500.0}
+"""Of what is not made of what its name says: half of a drawn bone is denser than any organ."""
+
+CUT = 'cut = ["feet", "head"]\n'
+"""Of the skin: there a drawn trunk goes on beyond its mesh."""
+
+CASE = """schema = 1
+name = "{name}"
+space = "LPS"
+
+[target]
+position_mm = [{target}]
+structure = "lesion"
+
+[needle]
+length_mm = 210.0
+shaft_mm = 180.0
+diameter_mm = 1.2
+
+[search]
+theta_deg = [0, 180]
+step_deg = 6.0
+max_skin_angle_deg = 75
+"""
+
+
+def write_trunk_case(folder: Path, trunk: Trunk, name: str) -> Path:
+    """Write ``case.toml`` and the meshes.
+
+    Args:
+        folder: Made if it is not there; files of these names are replaced.
+        trunk: What to write.
+        name: Of the case.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    text = CASE.format(name=name, target=", ".join(f"{one:.3f}" for one in trunk.target))
+    text += _structure("skin", "skin", 0.0, trunk.skin_hu) + CUT
+    (folder / "skin.ply").write_bytes(ply_bytes(trunk.skin))
+    for one, organ in trunk.organs.items():
+        (folder / f"{one}.ply").write_bytes(ply_bytes(organ.mesh))
+        text += _structure(one, organ.role, organ.margin_mm, HU.get(one.split("_")[0]))
+    (folder / "case.toml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def _structure(name: str, role: str, margin_mm: float, hu: float | None) -> str:
+    lines = ["", "[[structure]]", f'name = "{name}"', f'mesh = "{name}.ply"', 'unit = "mm"', f'role = "{role}"']
+    lines += [f"margin_mm = {margin_mm:g}"] if margin_mm else []
+    lines += [] if hu is None else [f"hu = {hu:g}"]
+    return "\n".join([*lines, ""])

@@ -1,1 +1,0 @@
-from .comparison import Comparison as Comparison, Side as Side

@@ -1,1 +1,0 @@
-from .papers import PAPERS as PAPERS

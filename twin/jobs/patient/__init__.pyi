@@ -1,1 +1,0 @@
-from .place_job import place_case as place_case

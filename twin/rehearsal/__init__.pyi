@@ -1,2 +1,0 @@
-from .rehearsal import rehearse as rehearse
-from .result import Rehearsal as Rehearsal
