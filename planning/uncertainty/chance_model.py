@@ -7,6 +7,7 @@ the target. Line sampling refines them where it is wanted (`refined_chances`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngi
 from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.uncertainty.chances import Chances
-from puncture_twin.planning.uncertainty.hit import HitModel, hit_model
+from puncture_twin.planning.uncertainty.hit import HitModel, hit_model, mean_over_faces
 from puncture_twin.planning.uncertainty.limits import demanding, touch_limit
 from puncture_twin.planning.uncertainty.lines.refined_touch import Needles
 from puncture_twin.planning.uncertainty.pose_error import PoseError
@@ -66,6 +67,20 @@ class ChanceModel:
         """The greatest chance to touch each of them that the case allows, shape (k,)."""
         return np.array([touch_limit(self.case, name) for name in self.structures])
 
+    @cached_property
+    def surfaces(self) -> Floats:
+        """By what each one's surface may lie off as a whole, `PoseError.surface_cov_ct`, shape (k, 3, 3), CT axes."""
+        voxels = [self.anatomy.checked[column].voxel_ct for column in self.columns]
+        return np.array([self.error.surface_cov_ct(voxel_ct) for voxel_ct in voxels]).reshape(-1, 3, 3)
+
+    @cached_property
+    def target_surface_mm(self) -> float:
+        """By what the target's may, the mean over its faces; nothing where a radius says what is hit."""
+        if self.hit.radius_mm is not None:
+            return 0.0
+        target = self.anatomy.structure(self.case.target_structure)
+        return mean_over_faces(target.mesh, self.error.surface_cov_ct(target.voxel_ct))
+
     @property
     def touching(self) -> Floats:
         """How near a needle's axis touches each of them, shape (k,), mm."""
@@ -84,9 +99,14 @@ class ChanceModel:
             axes = self.engine.measure(target, outward_ct, axis_lengths(self.case, self.anatomy.checked), shown=False)
         normal = normals_of(self.engine.triangles, target, outward_ct, axes)[:, columns]
         distance, depth = axes.distance[:, columns], axes.depth[:, columns]
-        cov_ct, surface_mm = self.error.covariance_ct(q), self.error.surface_mm
+        cov_ct = self.error.covariance_ct(q)
+        surface_mm = np.sqrt(np.einsum("nka,kab,nkb->nk", normal, self.surfaces, normal))
         near = proximity(distance, depth, normal, outward_ct, cov_ct, surface_mm)
         return Needles(outward_ct, cov_ct, near, surface_mm, self.error.freedom)
+
+    def hit_chance(self, cov_ct: Floats) -> Floats:
+        """The chance to hit of needles with these Sigma6, shape (n, 6, 6), CT axes: shape (n,)."""
+        return self.hit.chance(self.error, cov_ct, self.target_surface_mm)
 
     def chances(self, outward_ct: Floats, q: Floats, axes: AxisDistances | None = None) -> Chances:
         """The chances of some needles to first order, the joint one unknown.
@@ -105,13 +125,14 @@ class ChanceModel:
         along = np.einsum("na,nab,nb->n", outward_ct, tip, outward_ct)
         return Chances(
             structures=self.structures,
-            hit=self.hit.chance(self.error, needles.cov_ct),
+            hit=self.hit_chance(needles.cov_ct),
             touch=touch,
             margin=margin,
             touch_any=touch_any,
             touch_joint=np.full(len(q), np.nan),
             lateral_mm=np.sqrt(np.maximum(np.trace(tip, axis1=1, axis2=2) - along, 0.0)),
             depth_mm=np.sqrt(along),
+            refined=np.zeros(len(q), bool),
         )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +22,8 @@ class Chances:
         touch_joint: Shape (n,), that it touches any, all linearised together; of the best candidates alone.
         lateral_mm: Shape (n,), expected (rms) error of the tip across the needle, target reading included.
         depth_mm: Shape (n,), along it.
+        refined: Shape (n,), whether touch and margin are line-sampled, as `check` has them; else they are of first
+            order.
     """
 
     structures: tuple[str, ...]
@@ -32,6 +34,7 @@ class Chances:
     touch_joint: Floats
     lateral_mm: Floats
     depth_mm: Floats
+    refined: Bools
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -42,9 +45,10 @@ class Chances:
     @classmethod
     def unknown(cls, structures: tuple[str, ...], count: int) -> Chances:
         """Of candidates for which nothing was computed."""
-        blank = [np.full(count, np.nan) for _ in range(5)]
-        wide = [np.full((count, len(structures)), np.nan) for _ in range(2)]
-        return cls(structures, blank[0], wide[0], wide[1], *blank[1:])
+        shapes = {"touch": (count, len(structures)), "margin": (count, len(structures))}
+        names = {field.name for field in fields(cls)} - {"structures", "refined"}
+        blank = {name: np.full(shapes.get(name, (count,)), np.nan) for name in names}
+        return cls(structures, refined=np.zeros(count, bool), **blank)
 
     def put(self, rows: Ints, known: Chances) -> Chances:
         """With those of some candidates replaced."""

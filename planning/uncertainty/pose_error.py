@@ -85,10 +85,9 @@ class PoseError:
         R = self.fit.R_base_ct
         return np.asarray(R.T @ self.tip_covariance(q) @ R)
 
-    @property
-    def surface_mm(self) -> float:
-        """By which a structure's surface may lie off as a whole, scaled as all that is declared."""
-        return self.fit.test.scale * self.errors.surface_mm
+    def surface_cov_ct(self, voxel_ct: Floats | None) -> Floats:
+        """`ErrorModel.surface_cov_ct`, scaled as all that is declared."""
+        return np.asarray(self.fit.test.scale**2 * self.errors.surface_cov_ct(voxel_ct))
 
     @property
     def target_covariance_ct(self) -> Floats:

@@ -31,7 +31,8 @@ def refined_chances(
     needles = model.needles(outward_ct, q)
     touch = refined(around, needles, model.touching, first.touch, every if wanted is None else wanted)
     margin = first.margin if wanted is not None else refined(around, needles, model.breaking, first.margin, every)
-    return replace(first, touch=touch, margin=margin, touch_any=touching_any(touch))
+    whole = np.full(len(q), wanted is None)
+    return replace(first, touch=touch, margin=margin, touch_any=touching_any(touch), refined=whole)
 
 
 def keeps_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
@@ -44,7 +45,7 @@ def keeps_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
     """
     kept, least, limits = np.ones(len(q), bool), model.case.search.min_hit, model.limits
     if least is not None:
-        kept &= model.hit.chance(model.error, model.error.covariance_ct(q)) >= least
+        kept &= model.hit_chance(model.error.covariance_ct(q)) >= least
     if not np.isfinite(limits).any():
         return kept
     first = model.chances(outward_ct, q)

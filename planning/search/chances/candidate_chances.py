@@ -1,6 +1,6 @@
 """Chances of a search's candidates, and their refusal where a chance breaks the case's limit.
 
-To first order for all; by line sampling where that may decide: near a limit, and for the best candidates.
+To first order for all; by line sampling where that may decide: from near a limit on, and for what people are shown.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.chances.limited import limited
-from puncture_twin.planning.search.chances.near_limits import ROWS_AT_ONCE, refined_near_limits
+from puncture_twin.planning.search.chances.refined import ROWS_AT_ONCE, refined_near_limits
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.chances import Chances
 from puncture_twin.planning.uncertainty.limits import check_limits, demanding
@@ -42,10 +42,9 @@ def with_chances(
     if case.errors is None:
         return found
     check_limits(case, anatomy, model is not None)
-    limits = None if model is None else model.limits
     names = tuple(anatomy.checked[column].name for column in demanding(anatomy.checked))
     rows = np.flatnonzero(found.safe & np.isfinite(found.arm.q_insertion).all(axis=1))
-    if model is None or limits is None or not len(rows):
+    if model is None or not len(rows):
         return replace(found, chances=Chances.unknown(names, len(found)))
     parts = [rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)]
     computed = [
@@ -55,4 +54,4 @@ def with_chances(
     chances = Chances.unknown(names, len(found))
     for part, of_part in zip(parts, computed, strict=True):
         chances = chances.put(part, of_part)
-    return limited(case, refined_near_limits(replace(found, chances=chances), model, limits))
+    return limited(case, refined_near_limits(replace(found, chances=chances), model))

@@ -33,7 +33,7 @@ class NeedleDoubt:
         origin: Shape (3,), the tip's own place, where the axis starts.
         outward: Shape (3,), unit.
         root: Shape (6, 5), B: shift and lean of each of five standard normals.
-        surface_mm: Standard deviation of a structure's surface as a whole.
+        surface_mm: Standard deviation of the surface, as a whole, of the structure that is asked about.
         freedom: Degrees of the errors' size where the residuals gave it.
     """
 

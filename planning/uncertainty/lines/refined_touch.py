@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,14 +37,14 @@ class Needles:
         outward_ct: Shape (n, 3), unit.
         cov_ct: Shape (n, 6, 6), Sigma6, CT axes.
         near: How they pass the k structures, to first order.
-        surface_mm: By which a structure's surface may lie off as a whole.
+        surface_mm: Shape (n, k), by which each structure's surface may lie off as a whole where the needle passes it.
         freedom: Degrees of the errors' size where the residuals gave it.
     """
 
     outward_ct: Floats
     cov_ct: Floats
     near: Proximity
-    surface_mm: float
+    surface_mm: Floats
     freedom: int | None
 
 
@@ -68,8 +68,10 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
     rows = np.flatnonzero((wanted & np.isfinite(first)).any(axis=1))
     for row in rows:
         outward = needles.outward_ct[row]
-        doubt = needle_doubt(around.target_ct, outward, needles.cov_ct[row], needles.surface_mm, needles.freedom)
+        pose = needle_doubt(around.target_ct, outward, needles.cov_ct[row], 0.0, needles.freedom)
         for column in np.flatnonzero(wanted[row] & np.isfinite(first[row])):
+            surface_mm = float(needles.surface_mm[row, column])
+            doubt = replace(pose, surface_mm=surface_mm) if surface_mm > 0 else pose
             length, threshold = float(around.length[column]), float(threshold_mm[column])
             reach = doubt.reach(length, threshold)
             if needles.near.distance[row, column] > max(reach):

@@ -18,7 +18,7 @@ from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.reached_insertion import reached_insertion
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
+from puncture_twin.planning.uncertainty.sources import SOURCES, not_modelled
 
 POLE = 1e-6
 """Puncture angle below which an azimuth says nothing, rad."""
@@ -63,7 +63,7 @@ def budget_facts(
         ],
         "changes": [_change(case, one) for one in found],
         "best": _change(case, best),
-        "not_modelled": _not_modelled(chain),
+        "not_modelled": not_modelled(case, counted=_counted(chain)),
     }
 
 
@@ -76,11 +76,9 @@ def _across_and_along(chain: Chain) -> dict[str, float]:
     return {"expected_lateral_mm": float(np.sqrt(lateral)), "expected_depth_mm": float(np.sqrt(depth))}
 
 
-def _not_modelled(chain: Chain) -> str:
-    """What no source of this budget stands for."""
-    counted = (chain.breath is not None, chain.path is not None)
-    breath, bend, *others = NOT_MODELLED.split(", ")
-    return ", ".join([*(text for text, in_it in zip((breath, bend), counted, strict=True) if not in_it), *others])
+def _counted(chain: Chain) -> list[str]:
+    """What a budget counts beside the declared errors."""
+    return [name for name, one in (("breathing", chain.breath), ("bending", chain.path)) if one is not None]
 
 
 def _insertion(case: Case, registration: Registration) -> Floats | None:

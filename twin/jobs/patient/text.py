@@ -11,7 +11,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.explain import deep_text, needle_warnings, reason_text
-from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
+from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.jobs.patient.budget import budget_lines
 from puncture_twin.twin.jobs.patient.correction import correction_lines
 from puncture_twin.twin.jobs.patient.run import Run
@@ -164,7 +164,7 @@ def distribution_lines(rooms: dict[str, Any]) -> list[str]:
         *(missed if rooms["unreached"] else []),
         *(guessed if rooms["guessed_touches"] else []),
         *_physics(rooms.get("physics")),
-        f"  not modelled: {rooms.get('not_modelled', NOT_MODELLED)}",
+        f"  not modelled: {rooms['not_modelled']}",
     ]
 
 
