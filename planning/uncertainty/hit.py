@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import chdtri, erf, fdtr, ndtri
 
 from puncture_twin.planning.base.arrays import Floats, Ints
@@ -192,6 +193,25 @@ def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Fl
     parts = (np.arange(QUANTILES) + 0.5) / QUANTILES
     radii = radius_mm * np.sqrt(chdtri(freedom, parts) / freedom)
     return np.asarray(chance_within(values, np.broadcast_to(radii, (len(cov), QUANTILES))).mean(axis=1))
+
+
+def radius_that_holds(cov: Floats, chance: float, freedom: int | None = None) -> float:
+    """Within which of the point that was meant the tip ends with a chance, mm: `hit_in_ball` the other way round.
+
+    Args:
+        cov: Shape (3, 3), mm^2, of tip against that point, any frame.
+        chance: Below 1.
+        freedom: Degrees of the errors' size, where the residuals gave it.
+    """
+    size = float(np.sqrt(np.trace(cov)))
+    if size == 0.0:
+        return 0.0
+    high = size
+    while hit_in_ball(cov[None], high, freedom)[0] < chance:
+        high *= 2.0
+    return float(
+        brentq(lambda radius: hit_in_ball(cov[None], radius, freedom)[0] - chance, 0.0, high, xtol=1e-4 * size)
+    )
 
 
 def _fibonacci(count: int) -> Floats:
