@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances
+from puncture_twin.planning.uncertainty.chances import touch_limit
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh
-from puncture_twin.planning.uncertainty.limits import touch_limit
-from puncture_twin.planning.uncertainty.lines.refined_touch import Needles
+from puncture_twin.planning.uncertainty.lines.line_sampling import Needles
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, error_budget
-from puncture_twin.planning.uncertainty.refined_chances import refined_chances
 from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, not_modelled, reading_parts
 from puncture_twin.planning.uncertainty.touch import Proximity, touch_chance
 

@@ -27,7 +27,62 @@ from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.planning.uncertainty.quadratic_form import chance_within
+
+SERIES_END = 1e-8
+"""The series stops where what is left of its weights, which add up to 1, is smaller."""
+
+MOST_TERMS = 20_000
+"""Enough for standard deviations of a ratio of 30; what is left then is not counted, so that P is never too large."""
+
+
+def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
+    """The chance that a normal error stays within a radius, by Ruben's series (Ann. Math. Stat. 33, 1962).
+
+    With beta the least eigenvalue and gamma_i = 1 - beta / lambda_i, P = sum_k c_k F_{3+2k}(x / beta), F the
+    chi-squared distribution; one gamma is 0, and (k+1) c_{k+1} = e1 (k + 1/2) c_k - e2 k c_{k-1} with e1 and e2 the sum
+    and product of the other two.
+
+    Args:
+        eigenvalues: Shape (n, 3), of the covariance, mm^2, all above 0.
+        radii: Shape (n, m), mm.
+
+    Returns:
+        Shape (n, m).
+    """
+    chances = np.empty(radii.shape)
+    _ruben(np.sort(eigenvalues, axis=1), np.ascontiguousarray(radii, dtype=np.float64) ** 2, chances)
+    return chances
+
+
+@nb.njit(cache=True)
+def _ruben(values, squares, chances):  # type: ignore[no-untyped-def]  # numba infers
+    for row in range(len(values)):
+        beta, mid, high = values[row]
+        g1, g2 = 1.0 - beta / mid, 1.0 - beta / high
+        start = math.sqrt(beta / mid * beta / high)
+        for column in range(squares.shape[1]):
+            chances[row, column] = _series(start, g1 + g2, g1 * g2, squares[row, column] / beta)
+
+
+@nb.njit(cache=True)
+def _series(weight, e1, e2, x):  # type: ignore[no-untyped-def]
+    """Sum c_k F_{3+2k}(x), with F_{nu+2}(x) = F_nu(x) - (x/2)^(nu/2) exp(-x/2) / Gamma(nu/2 + 1)."""
+    half = 0.5 * x
+    if half <= 0.0:
+        return 0.0
+    before, left, total = 0.0, 1.0, 0.0
+    F = math.erf(math.sqrt(half)) - math.sqrt(4.0 * half / math.pi) * math.exp(-half)
+    log_step = 1.5 * math.log(half) - half - math.lgamma(2.5)
+    for k in range(MOST_TERMS):
+        total += weight * F
+        left -= weight
+        if left < SERIES_END or F <= 0.0:
+            break
+        F = max(F - math.exp(log_step), 0.0)
+        log_step += math.log(half) - math.log(k + 2.5)
+        weight, before = (e1 * (k + 0.5) * weight - e2 * k * before) / (k + 1.0), weight
+    return min(max(total, 0.0), 1.0)
+
 
 DIRECTIONS = 512
 """Of a mesh, spread evenly: against a million draws P errs by .001, for axis ratios of 10 by .004."""
@@ -41,10 +96,8 @@ TABLE_STEPS = 256
 ROOT_HALF = math.sqrt(0.5)
 ROOT_TWO_OVER_PI = math.sqrt(2.0 / math.pi)
 
-TINY = np.finfo(float).tiny
-
 LEAST_VARIANCE = 1e-12
-"""mm^2, added to every axis: an error that cannot happen must not divide by zero."""
+"""mm^2, added to every axis, and to areas: what cannot happen must not divide by zero."""
 
 SURFACES = 32
 """Of a surface that lies off, at the middles of equal chances: however sharply it decides, P errs by half of one."""
@@ -82,7 +135,9 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     from_last = (found.first + found.count - 1)[found.ray] - np.arange(len(found.ray))
     sign = np.where(from_last % 2 == 0, 1.0, -1.0)
     area = _areas(mesh)[found.face]
-    facing = np.abs(np.einsum("ca,ca->c", area, directions[found.ray])) / (np.linalg.norm(area, axis=1) + TINY)
+    facing = np.abs(np.einsum("ca,ca->c", area, directions[found.ray])) / (
+        np.linalg.norm(area, axis=1) + LEAST_VARIANCE
+    )
     return TargetRays(directions, found.ray, found.depth, sign, sign / np.maximum(facing, GRAZING))
 
 
@@ -96,7 +151,7 @@ def mean_over_faces(mesh: TriangleMesh, cov: Floats) -> float:
     """Sqrt of the mean of n' S n over a surface, for S of shape (3, 3)."""
     area = _areas(mesh)
     size = np.linalg.norm(area, axis=1)
-    return float(np.sqrt(np.einsum("ma,ab,mb->", area / (size[:, None] + TINY), cov, area) / size.sum()))
+    return float(np.sqrt(np.einsum("ma,ab,mb->", area / (size[:, None] + LEAST_VARIANCE), cov, area) / size.sum()))
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within, mean_square_within
-from puncture_twin.planning.budget.bent_path import other_gauges
-from puncture_twin.planning.budget.chain import Breath, chain_of
+from puncture_twin.planning.budget.chain import Breath, chain_of, other_gauges
 from puncture_twin.planning.budget.what_if import changes, source_costs
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.labels.by_name import ByName

@@ -13,7 +13,7 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.doubt import WISHED_HIT, chance_text, goals_of, shrinkable
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball
-from puncture_twin.planning.uncertainty.lines.refined_touch import Needles
+from puncture_twin.planning.uncertainty.lines.line_sampling import Needles
 from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, reading_parts
 from puncture_twin.planning.uncertainty.touch import proximity
 

@@ -6,8 +6,14 @@ import trimesh
 from scipy.special import chdtr
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh, mean_over_faces, rays_to_ball, target_rays
-from puncture_twin.planning.uncertainty.quadratic_form import chance_within
+from puncture_twin.planning.uncertainty.hit import (
+    chance_within,
+    hit_in_ball,
+    hit_in_mesh,
+    mean_over_faces,
+    rays_to_ball,
+    target_rays,
+)
 
 DRAWS = np.random.default_rng(3).normal(size=(1_000_000, 3))
 

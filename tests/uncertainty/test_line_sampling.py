@@ -13,7 +13,7 @@ from puncture_twin.planning.clearance.near_faces import near_faces
 from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.uncertainty.lines.refined_touch import Needles, Surroundings, refined
+from puncture_twin.planning.uncertainty.lines.line_sampling import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
 
 LENGTH, RADIUS = 150.0, 0.6

@@ -10,7 +10,7 @@ from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.search.chances.joint import joint_touch_chance
+from puncture_twin.planning.search.candidate_chances import joint_touch_chance
 from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
 
 LENGTH, RADIUS = 150.0, 0.6

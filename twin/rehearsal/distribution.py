@@ -9,9 +9,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.clearance.normals import normals_of
@@ -21,14 +21,12 @@ from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.touch_noise import reading_noise
-from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, refined_chances
+from puncture_twin.planning.uncertainty.chances import demanding
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
-from puncture_twin.planning.uncertainty.limits import demanding
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
-from puncture_twin.planning.uncertainty.refined_chances import refined_chances
 from puncture_twin.planning.uncertainty.sources import not_modelled
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
@@ -222,15 +220,8 @@ def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
         context: Of a case.
         outward_ct: Shape (3,), unit, from the target along the needle.
     """
-    case, anatomy = context.case, context.anatomy
-    if case.bending is None:
-        return None
-    paths = skin_paths(anatomy.skin, case.target_ct, outward_ct[None], case.needle.length_mm)
-    length = float(paths.path_length[0])
-    if not np.isfinite(length):
-        return None
-    insertion = insertion_along(case.bending, anatomy, case.target_ct, outward_ct, length)
-    return Bend(insertion.tip_mm, case.bending.shaft.length_mm)
+    path = bent_path(context.case, context.anatomy, outward_ct)
+    return None if path is None else path.bend
 
 
 def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:

@@ -157,13 +157,12 @@ def one_insertion(registration: Registration, target_ct: Floats, read_cov_ct: Fl
         read_cov_ct: Of the target's reading, as declared; None where it is read as a marker is, in both lists.
     """
     cov, R = registration.tre_covariance(target_ct), registration.T_base_ct[:3, :3]
-    scale = 1.0 if registration.uncertainty is None else registration.uncertainty.test.scale
-    both = read_cov_ct is None
-    read = registration.fle_mm**2 / 3.0 * np.eye(3) if read_cov_ct is None else scale**2 * R @ read_cov_ct @ R.T
-    return {
-        "one_insertion_95_mm": radius_that_holds(cov + read, INTERVAL, registration.freedom),
-        "target_read": "like a marker, in both lists" if both else "as declared (target_mm)",
-    }
+    read, how = registration.fle_mm**2 / 3.0 * np.eye(3), "like a marker, in both lists"
+    if read_cov_ct is not None:
+        scale = 1.0 if registration.uncertainty is None else registration.uncertainty.test.scale
+        read, how = scale**2 * R @ read_cov_ct @ R.T, "as declared (target_mm)"
+    limit = radius_that_holds(cov + read, INTERVAL, registration.freedom)
+    return {"one_insertion_95_mm": limit, "target_read": how}
 
 
 def noise_of_lists(pairs: MarkerPairs, fle_mm: float | None) -> ReadingNoise | None:

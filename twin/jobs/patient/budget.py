@@ -10,8 +10,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.budget.bent_path import bent_path
-from puncture_twin.planning.budget.chain import Chain, chain_of
+from puncture_twin.planning.budget.chain import Chain, bent_path, chain_of
 from puncture_twin.planning.budget.what_if import Change, best_change, changes, source_costs
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
