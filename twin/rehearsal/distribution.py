@@ -20,6 +20,7 @@ from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.noise_test import NoiseTest
+from puncture_twin.planning.registration.residual_test import INTERVAL
 from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
@@ -29,8 +30,6 @@ from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_fac
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
-
-REGION = 0.95
 
 MET_MM = 1e-6
 """Of an axis from a surface that it meets."""
@@ -251,7 +250,7 @@ def _measured(context: CaseContext, query: _Query, rooms: Rooms, off: Floats, se
         puncture=puncture,
         rooms=rooms,
         cov_ct=cov_ct,
-        in_region=square <= chdtri(3, 1 - REGION),
+        in_region=square <= chdtri(3, 1 - INTERVAL),
         hit=_hits(context, rooms, off_mm),
         p_hit=float(chances.hit[0]),
         structures=chances.structures,
