@@ -120,6 +120,17 @@ def test_a_surface_that_lies_off_takes_from_the_chance_to_hit(tmp_path):
     assert chances[0] > 0.999 and chances[1] == pytest.approx(ndtr(6.0 / 5.0), abs=0.06)
 
 
+@pytest.mark.parametrize(("errors", "told"), [("", True), ("surface_mm = 0", False), ("surface_mm = 0.5", False)])
+def test_meshes_of_which_nobody_knows_how_far_they_lie_off_are_named(tmp_path, errors, told):
+    """In the text and in the values; a 0 that is written is an answer."""
+    context = prepare(ball(tmp_path, errors=errors))
+    found = context.search()
+    row = found.ranked[0]
+    said = context.explain(found.theta[row], found.beta[row])
+    for text in (said.text(), said.summary()["chances"]["not_modelled"]):
+        assert ("how far meshes lie off (organ, rib: errors.surface_mm)" in text) == told
+
+
 def test_an_open_target_has_no_chance_to_be_hit(tmp_path):
     """A sheet holds no tip; a radius says what a hit is."""
     sheet = trimesh.Trimesh([[-8, -8, -6], [8, -8, -6], [8, 8, -6], [-8, 8, -6]], [[0, 1, 2], [0, 2, 3]])
