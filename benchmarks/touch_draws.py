@@ -27,7 +27,7 @@ from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
 from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
-from puncture_twin.planning.uncertainty.limits import demanding
+from puncture_twin.planning.uncertainty.chances import demanding
 from puncture_twin.planning.uncertainty.lines.line_sampling import line_chance
 from puncture_twin.planning.uncertainty.lines.needle_doubt import NeedleDoubt, needle_doubt
 from puncture_twin.planning.uncertainty.lines.walks import walked

@@ -10,7 +10,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.case.tables.errors_section import RehearsalSection
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.sweep.sweep_planner import plan_sweep
-from puncture_twin.twin.rehearsal.sweeping import execute_sweep
+from puncture_twin.twin.rehearsal.executed import execute_sweep
 
 START, END, REJECTED = (tuple(np.radians(pair)) for pair in ((22.0, 208.0), (40.0, 224.0), (22.0, 260.0)))
 

@@ -140,7 +140,7 @@ def _outside(case: Case, scan: Scan, outside: Outside, warnings: list[str]) -> t
     warnings.extend(support_warnings(outside.supported, outside.open_faces))
     found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
     return tuple(
-        Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", True, scan.source.voxel_mm)
+        Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", True, scan.source.voxel_ct)
         for name, mesh in found
         if mesh is not None
     )
@@ -154,8 +154,8 @@ def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterato
     unnamed = scan.unnamed(named, case.ct.dense_hu)
     for name, mesh in ((UNNAMED_DENSE, unnamed.dense), (UNNAMED_GAS, unnamed.gas)):
         if mesh is not None:
-            source, voxel_mm = f"{scan.name}: {name}", scan.source.voxel_mm
-            yield Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, source, voxel_mm=voxel_mm)
+            source, voxel_ct = f"{scan.name}: {name}", scan.source.voxel_ct
+            yield Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, source, voxel_ct=voxel_ct)
 
 
 def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
@@ -217,7 +217,7 @@ def own_target(case: Case) -> Iterator[Structure]:
     """The target as a structure of its own, where the case names none that holds it."""
     if case.own_target and case.hit_radius_mm is not None:
         mesh = ball(case.target_ct, case.hit_radius_mm)
-        yield Structure(case.target_structure, Role.TARGET, 0.0, mesh, OWN_TARGET)
+        yield Structure(case.target_structure, Role.TARGET, 0.0, mesh, OWN_TARGET, voxel_ct=np.zeros((3, 3)))
 
 
 def ball(middle_ct: Floats, radius_mm: float) -> TriangleMesh:

@@ -58,7 +58,8 @@ class Beyond(NamedTuple):
         """The one of role ``unknown`` that it is, or none."""
         if self.mesh is None:
             return ()
-        return (Structure(BEYOND_LABELS, Role.UNKNOWN, self.margin_mm, self.mesh, BEYOND_LABELS),)
+        at_map = np.zeros((3, 3))  # where the map ends is known; the margin has half a voxel
+        return (Structure(BEYOND_LABELS, Role.UNKNOWN, self.margin_mm, self.mesh, BEYOND_LABELS, voxel_ct=at_map),)
 
 
 @dataclass(frozen=True, eq=False)

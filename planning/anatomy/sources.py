@@ -11,6 +11,7 @@ from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin, flat_ends
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_skin
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names
@@ -45,12 +46,12 @@ class StructureSources:
         """One structure from a mesh or a label."""
         self._progress(section.name)
         if section.mesh is not None:
-            mesh, source, voxel_mm = self._mesh(section), section.mesh, 0.0
+            mesh, source, voxel_ct = self._mesh(section), section.mesh, None
         else:
             mesh, source = self._label(section), f"{section.labelmap}:{section.label}"
-            voxel_mm = self._labels(str(section.labelmap)).voxel_mm
+            voxel_ct = self._labels(str(section.labelmap)).voxel_ct
         role, margin_mm = Role(section.role), section.margin_mm or 0.0
-        return Structure(section.name, role, margin_mm, mesh, source, voxel_mm=voxel_mm)
+        return Structure(section.name, role, margin_mm, mesh, source, voxel_ct=voxel_ct)
 
     def many(self, section: StructuresSection) -> list[Structure]:
         """All labels of one map, or masks of one folder, that the rules do not ignore."""
@@ -63,7 +64,7 @@ class StructureSources:
         for rule in self._kept_rules(section, names, volume.labels_present()):
             self._progress(rule.name)
             mesh = volume.label(rule.label)
-            structures.append(_ruled(rule, mesh, f"{name}:{rule.label}", volume.voxel_mm))
+            structures.append(_ruled(rule, mesh, f"{name}:{rule.label}", volume.voxel_ct))
         return structures
 
     def _masks(self, section: StructuresSection, folder: str) -> list[Structure]:
@@ -82,7 +83,7 @@ class StructureSources:
             self._progress(rule.name)
             label = labels[rule.label] or 0
             volume = self._open(files[rule.name])
-            structures.append(_ruled(rule, volume.label(label), f"{files[rule.name]}:{label}", volume.voxel_mm))
+            structures.append(_ruled(rule, volume.label(label), f"{files[rule.name]}:{label}", volume.voxel_ct))
         return structures
 
     def _kept_rules(
@@ -215,8 +216,8 @@ def _no_bytes(ends: tuple[str, ...]) -> int:
     return 100 * len(ends)
 
 
-def _ruled(rule: LabelRule, mesh: TriangleMesh, source: str, voxel_mm: float) -> Structure:
-    return Structure(rule.name, Role(rule.kind.value), rule.margin_mm, mesh, source, voxel_mm=voxel_mm)
+def _ruled(rule: LabelRule, mesh: TriangleMesh, source: str, voxel_ct: Floats) -> Structure:
+    return Structure(rule.name, Role(rule.kind.value), rule.margin_mm, mesh, source, voxel_ct=voxel_ct)
 
 
 def _shown(names: Sequence[str]) -> str:

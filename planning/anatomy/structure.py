@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
@@ -30,7 +33,8 @@ class Structure:
         source: The file it comes from, and the label in it.
         outside: Whether it is outside of the body, where the needle waits at its standoff: it is then checked
             against the needle's axis up to where the flange waits, not only to where the flange ends.
-        voxel_mm: The longest side of the voxels that it was made of, mm; 0 for one that no volume shows.
+        voxel_ct: Shape (3, 3), the edges of the voxels that it was made of as columns, mm; None for one that no volume
+            shows, such as a mesh: nobody knows then how far its surface may lie off.
     """
 
     name: str
@@ -39,7 +43,12 @@ class Structure:
     mesh: TriangleMesh
     source: str
     outside: bool = False
-    voxel_mm: float = 0.0
+    voxel_ct: Floats | None = None
+
+    @property
+    def voxel_mm(self) -> float:
+        """The longest edge of its voxels, mm; 0 without any."""
+        return 0.0 if self.voxel_ct is None else float(np.linalg.norm(self.voxel_ct, axis=0).max())
 
     @property
     def demands_margin(self) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_ct, skin_from_label, skin_from_mesh
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
@@ -49,9 +50,9 @@ class VolumeSurfaces:
         return self.source.path
 
     @property
-    def voxel_mm(self) -> float:
-        """The longest side of its voxels, mm."""
-        return float(self.source.grid.spacing_mm.max())
+    def voxel_ct(self) -> Floats:
+        """The edges of a voxel as columns, shape (3, 3), mm."""
+        return self.source.grid.T_ct_index[:3, :3]
 
     @cached_property
     def volume(self) -> Volume:

@@ -16,6 +16,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.tables.errors_section import ErrorsSection, RehearsalSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
@@ -31,6 +33,13 @@ DEFAULT_DRIFT_DEG = 0.02
 
 UNIFORM = 1.0 / np.sqrt(12.0)
 """Standard deviation of an error that is uniform over one cell, over the cell."""
+
+THICK_MM = 3.0
+"""Slices up to this let a contour err by its own cell alone, in every direction."""
+
+SIDEWAYS = 0.5
+"""Of what slices exceed that by: between them a contour that leans is a stair, which errs sideways too. Balls of 8 mm
+and more, averaged over slices of up to 10 mm, err by that at most (docs/concepts/uncertainty.md)."""
 
 
 class ArmKind(NamedTuple):
@@ -83,7 +92,8 @@ class ErrorModel:
         touch_mm: Of one touch, per axis of the base frame, besides the arm.
         target_cov_ct: Shape (3, 3), mm^2: of the target read in the CT.
         arm: Of the arm and its needle.
-        surface_mm: By which a whole structure's surface may lie off, along its normal.
+        surface_mm: By which a whole structure's surface may lie off, along its normal; None where every structure's own
+            voxels say it.
         found: Whether the markers' residuals give the size of all errors, and the declaration their shape.
     """
 
@@ -91,8 +101,10 @@ class ErrorModel:
     touch_mm: float
     target_cov_ct: Floats
     arm: ArmUncertainty
-    surface_mm: float
+    surface_mm: float | None
     found: bool = False
+    size: float = 1.0
+    """By which factor all that was declared has been scaled."""
 
     def __post_init__(self) -> None:
         for name in ("marker_cov_ct", "target_cov_ct"):
@@ -114,8 +126,23 @@ class ErrorModel:
             touch_mm=factor * self.touch_mm,
             target_cov_ct=factor**2 * self.target_cov_ct,
             arm=self.arm.scaled(factor),
-            surface_mm=factor * self.surface_mm,
+            surface_mm=None if self.surface_mm is None else factor * self.surface_mm,
+            size=factor * self.size,
         )
+
+    def surface_cov_ct(self, voxel_ct: Floats | None) -> Floats:
+        """S, shape (3, 3), mm^2: a surface of unit normal n may lie off by sqrt(n' S n), a structure's as a whole.
+
+        Args:
+            voxel_ct: Edges of the structure's voxels as columns, shape (3, 3), mm; None for a mesh, of which nobody
+                knows it: 0, and `not_modelled` says so.
+        """
+        if self.surface_mm is not None:
+            return np.asarray(self.surface_mm**2 * np.eye(3))
+        if voxel_ct is None:
+            return np.zeros((3, 3))
+        stairs = SIDEWAYS * max(float(np.linalg.norm(voxel_ct, axis=0).max()) - THICK_MM, 0.0)
+        return np.asarray((self.size * UNIFORM) ** 2 * (voxel_ct @ voxel_ct.T + stairs**2 * np.eye(3)))
 
 
 class Cells(NamedTuple):
@@ -239,3 +266,29 @@ def _with_older_names(section: ErrorsSection, rehearsal: RehearsalSection | None
 
 def _or(value: float | None, default: float) -> float:
     return default if value is None else value
+
+
+def errors_of(
+    content: CaseFile, section: ErrorsSection | None, case_volumes: CaseVolumes, path: Path, *, truth: bool = False
+) -> ErrorModel | None:
+    """The declared errors, or the truth's own, which know no short form and no older names."""
+    if section is None:
+        return None
+    return error_model(
+        section,
+        space=Space(content.space),
+        cells=_ct_cells(content, case_volumes),
+        fle_mm=None if truth or content.registration is None else content.registration.fle_mm,
+        rehearsal=None if truth else content.rehearsal,
+        where=f"{path}: {'rehearsal.errors' if truth else 'errors'}",
+    )
+
+
+def _ct_cells(content: CaseFile, case_volumes: CaseVolumes) -> Cells | None:
+    """Pixel, slice spacing and slice normal of the case's CT; None without one."""
+    name = content.ct_name
+    if name is None:
+        return None
+    grid = case_volumes.source(name).grid
+    spacing = grid.spacing_mm
+    return Cells(float(spacing[:2].max()), float(spacing[2]), grid.T_ct_index[:3, 2] / spacing[2])

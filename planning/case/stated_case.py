@@ -14,10 +14,10 @@ from puncture_twin.planning.case.case import Case, view_frame
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import entry_frame
+from puncture_twin.planning.case.errors import errors_of
 from puncture_twin.planning.case.sections.bend import bending_of
 from puncture_twin.planning.case.sections.breath import breathing_of
 from puncture_twin.planning.case.sections.robot import robot_of
-from puncture_twin.planning.case.sections.stated_errors import errors_of
 from puncture_twin.planning.case.sections.tool_section import tool_of
 from puncture_twin.planning.case.settings import (
     CtSettings,

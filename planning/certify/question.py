@@ -120,5 +120,6 @@ def _margins(case: Case, demanding: list[Structure], touch: float | None, error:
         raise InputError(message, where=case.path, allowed="[registration] with markers, and [errors]; or no chance")
     farthest = np.array([np.linalg.norm(s.mesh.vertices - case.target_ct, axis=1).max() for s in demanding])
     lengths = axis_lengths(case, demanding)
-    kept = any_pose(error).margin(touch, error.freedom, farthest, lengths, case.needle.radius_mm)
+    surface_mm = np.sqrt([np.linalg.eigvalsh(error.surface_cov_ct(s.voxel_ct))[-1] for s in demanding])
+    kept = any_pose(error).margin(touch, error.freedom, farthest, lengths, case.needle.radius_mm, surface_mm)
     return np.asarray(np.maximum(margins, kept))

@@ -149,7 +149,7 @@ def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
 
 
 def _structure(name: str, mesh: TriangleMesh) -> Structure:
-    return Structure(name, Role.AVOID, 0.0, mesh, OF_CASE_FILE, outside=True)
+    return Structure(name, Role.AVOID, 0.0, mesh, OF_CASE_FILE, True, np.zeros((3, 3)))  # as stated
 
 
 def _mesh(box: Box, T_ct_base: Floats) -> TriangleMesh:

@@ -7,7 +7,11 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.errors import error_model
+from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.finder import Markers
 from puncture_twin.planning.init.segmentation import Assigned, Segmentation, quoted
@@ -47,6 +51,13 @@ REGISTRATION = """
 # markers_ct = {ct}  # {space}
 # markers_base = {base}
 """
+ERRORS = """
+# Errors, for the chances to hit and to touch, which need the arm's markers too: docs/reference/case.md
+# [errors]
+# surface_mm = {known}  # by which contours may lie off; {reason}
+"""
+OF_VOXELS = "of {sources} by the voxels, at most; left out, every direction has its own"
+OF_MESHES = "of {sources} nobody knows it who did not draw them: left out it counts as 0, and every result says so"
 END = """
 [end]
 structures = {count}  # the last line: a file that was cut lacks it
@@ -99,7 +110,18 @@ def case_text(parts: CaseParts) -> str:
     skin = "" if parts.ct is None else SKIN_OF_CT.format(ct=quoted(parts.ct))
     count = sum(row.kind != "ignore" for row in parts.rows) + (parts.ct is not None)
     sections = "\n".join(segmentation.section(rows) for segmentation, rows in parts.sources)
-    return head + skin + sections + _markers_text(parts.markers, parts.space) + END.format(count=count)
+    errors = _errors_text([segmentation for segmentation, _ in parts.sources])
+    return head + skin + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
+
+
+def _errors_text(sources: Sequence[Segmentation]) -> str:
+    """What may be taken for declared of contours: of voxels their own, of meshes a question."""
+    voxels, meshes = ([one for one in sources if (one.voxel_ct is None) == mesh] for mesh in (False, True))
+    model = error_model(ErrorsSection(), space=Space.LPS)
+    off = [np.sqrt(np.linalg.eigvalsh(model.surface_cov_ct(one.voxel_ct))[-1]) for one in voxels]
+    parts = ((OF_VOXELS, voxels), (OF_MESHES, meshes))
+    reasons = [text.format(sources=", ".join(one.source for one in some)) for text, some in parts if some]
+    return ERRORS.format(known=f"{max(off):.2f}" if off else "0.5", reason="; ".join(reasons))
 
 
 def case_name(folder: str) -> str:

@@ -44,6 +44,11 @@ class FileMasks:
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", dict(enumerate(self.parts, start=1)))
 
+    @property
+    def voxel_ct(self) -> Floats:
+        """The edges of its voxels as columns, shape (3, 3), mm."""
+        return next(iter(self.parts.values()))[0].voxel_ct
+
     def near(self, point_ct: Floats) -> tuple[int, ...]:
         """The structures whose box holds a point (3,), LPS mm."""
         boxes = {label: self.surface(label).bounds for label in self.names}

@@ -46,6 +46,11 @@ class LabelFile:
     notes: tuple[str, ...]
     surfaces: VolumeSurfaces
 
+    @property
+    def voxel_ct(self) -> Floats:
+        """The edges of its voxels as columns, shape (3, 3), mm."""
+        return self.surfaces.voxel_ct
+
     def near(self, point_ct: Floats) -> tuple[int, ...]:
         """The labels whose box holds a point (3,), LPS mm."""
         labels = self.surfaces.labelmap
@@ -99,6 +104,11 @@ class Masks:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", {number: structure_name(one.file) for number, one in self.masks.items()})
+
+    @property
+    def voxel_ct(self) -> Floats:
+        """The edges of its voxels as columns, shape (3, 3), mm."""
+        return next(iter(self.masks.values())).T_ct_index[:3, :3]
 
     def near(self, point_ct: Floats) -> tuple[int, ...]:
         """The masks whose box holds a point (3,), LPS mm."""

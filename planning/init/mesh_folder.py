@@ -35,6 +35,7 @@ class MeshFolder:
         files: By number, relative to the case's folder.
         unit: Of all of them.
         space: Of all of them that do not state one.
+        voxel_ct: None: meshes do not tell what they were made of.
     """
 
     place: Place
@@ -43,6 +44,7 @@ class MeshFolder:
     unit: Unit
     space: Space
     notes: tuple[str, ...] = ()
+    voxel_ct: Floats | None = None
     names: Mapping[int, str] = field(init=False)
 
     def __post_init__(self) -> None:

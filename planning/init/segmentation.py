@@ -51,6 +51,7 @@ class Segmentation(Protocol):
         source: The file or folder, relative to the case's.
         names: Label to name, of the structures that are there.
         notes: What a person should be told, one sentence each.
+        voxel_ct: Shape (3, 3), the edges of its voxels as columns, mm; None of meshes.
     """
 
     @property
@@ -59,6 +60,8 @@ class Segmentation(Protocol):
     def names(self) -> Mapping[int, str]: ...  # noqa: D102
     @property
     def notes(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def voxel_ct(self) -> Floats | None: ...  # noqa: D102
 
     def near(self, point_ct: Floats) -> tuple[int, ...]:
         """The labels whose box holds a point (3,), LPS mm."""

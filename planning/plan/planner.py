@@ -23,8 +23,8 @@ from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
+from puncture_twin.planning.uncertainty.chance_model import keeps_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
-from puncture_twin.planning.uncertainty.refined_chances import keeps_limits
 
 MAX_TRIES = 20
 """Candidates to which an approach is sought; what none of the best twenty allows is a matter of the workcell."""

@@ -18,8 +18,8 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
+from puncture_twin.planning.uncertainty.chance_model import keeps_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
-from puncture_twin.planning.uncertainty.refined_chances import keeps_limits
 
 SAME_DIRECTION = 1e-6
 """Largest difference of two unit vectors that name one direction: degrees in the file are rounded to 1e-15."""

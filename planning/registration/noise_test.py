@@ -9,12 +9,10 @@ from scipy.special import chdtrc, chdtri, fdtri
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.registration.fits.fit_map import least_squares_map
-from puncture_twin.planning.registration.residual_test import DOUBT, Interval
+from puncture_twin.planning.registration.residual_test import DOUBT, INTERVAL, Interval
 
 WARNED = 0.01
 """Residuals that the declared errors exceed once in 100 registrations: it is warned, and the errors are scaled."""
-
-REGION = 0.95
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class NoiseTest:
     @property
     def interval(self) -> Interval:
         """The 95 % interval of the true size over the declared one: nu s^2 over chi-squared."""
-        tail = (1 - REGION) / 2
+        tail = (1 - INTERVAL) / 2
         low, high = (float(np.sqrt(self.chi_squared / chdtri(self.freedom, p))) for p in (tail, 1 - tail))
         return Interval(low, high)
 
@@ -77,8 +75,8 @@ class NoiseTest:
     def region_factor(self) -> float:
         """The k of the 95 % region d' Sigma^-1 d <= k^2 in three dimensions, Sigma scaled: sqrt(chi2) or sqrt(3 F)."""
         if self.scaled:
-            return float(np.sqrt(3 * fdtri(3, self.freedom, REGION)))
-        return float(np.sqrt(chdtri(3, 1 - REGION)))
+            return float(np.sqrt(3 * fdtri(3, self.freedom, INTERVAL)))
+        return float(np.sqrt(chdtri(3, 1 - INTERVAL)))
 
     def text(self) -> str:
         """What the test found, in one sentence."""

@@ -12,9 +12,10 @@ from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import Aim
-from puncture_twin.planning.registration.conditioning import Conditioning, conditioning, leverage
+from puncture_twin.planning.registration.conditioning import Conditioning, conditioning
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
 from puncture_twin.planning.registration.fits.better_names import better_names
+from puncture_twin.planning.registration.fits.fit_map import carried, design, least_squares_map
 from puncture_twin.planning.registration.fits.least_squares import rigid_fre_mm
 from puncture_twin.planning.registration.fits.method import Method, checked_fit
 from puncture_twin.planning.registration.fits.residual_checks import check_residuals
@@ -108,16 +109,28 @@ class Registration:
         By the declared errors of the readings where there are any, else by Fitzpatrick's formula. The arm's own errors,
         which partly cancel between touch and insertion, are not in it.
         """
-        if self.uncertainty is None:
-            return self.fle_mm * leverage(self.markers.points_ct, points_ct)
-        points_base = apply(self.T_base_ct, points_ct)
-        return np.sqrt([np.trace(self.uncertainty.cov_at(point)[:3, :3]) for point in points_base])
+        return np.sqrt([np.trace(self.tre_covariance(point)) for point in points_ct])
+
+    def tre_covariance(self, point_ct: Floats) -> Floats:
+        """Of that error at one point (3,), shape (3, 3), mm^2, base axes."""
+        point_base = apply(self.T_base_ct, point_ct)
+        if self.uncertainty is not None:
+            return self.uncertainty.cov_at(point_base)[:3, :3]
+        fitted = apply(self.T_base_ct, self.markers.points_ct)
+        center = fitted.mean(axis=0)
+        at = carried(center, point_base)[:3] @ least_squares_map(design(fitted, center))
+        return np.asarray(self.fle_mm**2 / 3.0 * at @ at.T)
+
+    @property
+    def freedom(self) -> int | None:
+        """Degrees of freedom of the errors' size where the residuals gave it; None where it is declared, and agrees."""
+        if self.uncertainty is not None:
+            return self.uncertainty.test.freedom if self.uncertainty.test.scaled else None
+        declared = self.residual_test.declared_fle_mm is not None and self.residual_test.explained
+        return None if declared else self.residual_test.freedom
 
     def expected_tre_interval_mm(self, point_ct: Floats) -> Interval:
         """Expected target registration error (rms) at one point (3,), at both ends of the noise's 95 % interval, mm."""
-        if self.uncertainty is None:
-            lever = float(leverage(self.markers.points_ct, point_ct[None])[0])
-            return Interval(*(fle * lever for fle in self.fle_interval_mm))
         expected = float(self.expected_tre_mm(point_ct[None])[0])
         return Interval(*(expected * fle / self.fle_mm for fle in self.fle_interval_mm))
 

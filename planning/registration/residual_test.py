@@ -30,7 +30,7 @@ ALIKE_MM = 1.0
 """Without a declared noise: a permuted fit with a smaller FRE is always as good as the given one."""
 
 INTERVAL = 0.95
-"""Of the noise that is estimated."""
+"""Of every interval and region that is printed."""
 
 
 FALSE_ALARM = 0.01

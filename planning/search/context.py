@@ -114,7 +114,8 @@ class CaseContext:
     def explain(self, theta: float, beta: float) -> Explanation:
         """Check a single direction (rad), and say what it was checked against and how sure it is."""
         found = self.check(theta, beta)
-        doubt = self._doubt(found)
+        known = found.chances is not None and np.isfinite(found.chances.hit[0])
+        doubt = self.doubt_at(found.outward_ct[0], found.arm.q_insertion[0]) if known else None
         facts = self.entry_facts(found.path.entry_ct[0], found.outward_ct[0])
         return Explanation(self.case, self.anatomy, found, facts, doubt)
 
@@ -127,18 +128,9 @@ class CaseContext:
         markers = tuple(Landmark(f"marker {name}", point) for name, point in named)
         return entry_facts(self.case, markers, entry_ct, outward_ct)
 
-    def _doubt(self, found: Candidates) -> Doubt | None:
-        if self.chance is None or found.chances is None or not np.isfinite(found.chances.hit[0]):
-            return None
-        q, outward = found.arm.q_insertion, found.outward_ct
-        return doubt_of(self.chance, found.chances, outward[0], q[0])
-
     def doubt_at(self, outward_ct: Floats, q: Floats) -> Doubt | None:
         """How sure one direction (3,) is in one configuration (6,), rad, as of a plan; None without declared errors."""
-        model = self.chance
-        if model is None:
-            return None
-        return doubt_of(model, model.chances(outward_ct[None], q[None]), outward_ct, q)
+        return None if self.chance is None else doubt_of(self.chance, outward_ct, q)
 
     def region_ct(self, q: Floats) -> Floats | None:
         """Within x' inv(region) x <= 1 about the target the tip is expected in 95 of 100, shape (3, 3), mm^2, CT axes.

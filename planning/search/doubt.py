@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel
-from puncture_twin.planning.uncertainty.chances import Chances
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances
+from puncture_twin.planning.uncertainty.chances import touch_limit
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh
-from puncture_twin.planning.uncertainty.limits import touch_limit
+from puncture_twin.planning.uncertainty.lines.line_sampling import Needles
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, error_budget
-from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES, deviation, not_modelled, reading_parts
+from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, not_modelled, reading_parts
 from puncture_twin.planning.uncertainty.touch import Proximity, touch_chance
 
 WISHED_HIT = 0.99
@@ -108,7 +108,7 @@ class Doubt:
     budget: ErrorBudget
     declaration: str
     goals: tuple[Goal, ...]
-    not_modelled: str = NOT_MODELLED
+    not_modelled: str
 
     @property
     def likeliest(self) -> tuple[str, float]:
@@ -141,7 +141,7 @@ class Doubt:
             f"half axes of the 95 % ellipsoid {axes} mm",
             f"  of its variance: {fractions}",
             f"  {self.declaration}",
-            f"  touches anything: {chance_text(self.p_touch_any)} at most, to first order",
+            f"  touches anything: {chance_text(self.p_touch_any)} at most, the sum of all",
             f"  not modelled: {self.not_modelled}",
         ]
 
@@ -179,35 +179,34 @@ def chance_text(chance: float) -> str:
     return f"{chance:.{digits}f}"
 
 
-def doubt_of(model: ChanceModel, chances: Chances, outward_ct: Floats, q: Floats) -> Doubt:
-    """The doubt of one candidate.
+def doubt_of(model: ChanceModel, outward_ct: Floats, q: Floats) -> Doubt:
+    """The doubt of one candidate, its chances line-sampled as those of the table's best are.
 
     Args:
         model: Of the case.
-        chances: Of it alone, all finite.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
     """
+    needle = (outward_ct[None], q[None])
+    chances = refined_chances(model, *needle, model.chances(*needle))
     touch = dict(zip(chances.structures, map(float, chances.touch[0]), strict=True))
-    near = model.needles(outward_ct[None], q[None]).near
-    needle = shrinkable(model, near, q)
+    sources = shrinkable(model, model.needles(*needle), q)
     return Doubt(
         float(chances.hit[0]),
         MappingProxyType(touch),
         float(chances.touch_any[0]),
         error_budget(model.error, q, model.error.fit.R_base_ct @ outward_ct),
         model.error.fit.test.text(),
-        tuple(goals_of(needle, float(chances.hit[0]), touch)),
+        tuple(goals_of(sources, float(chances.hit[0]), touch)),
         not_modelled(model.case),
     )
 
 
 class _Part(NamedTuple):
-    """What one source adds: to Sigma6, shape (6, 6), CT axes; to the reading of the target, (3, 3); to surfaces."""
+    """What one source adds: to Sigma6, shape (6, 6), CT axes; to the reading of the target, (3, 3)."""
 
     cov6: Floats
     target: Floats
-    surface: float
 
 
 def _parts(model: ChanceModel, q: Floats) -> dict[str, _Part]:
@@ -217,13 +216,13 @@ def _parts(model: ChanceModel, q: Floats) -> dict[str, _Part]:
     none = np.zeros((3, 3))
     whole = {source: turn.T @ cov[0] @ turn for source, cov in error.parts(q[None]).items()}
     whole["repeatability"] = whole["repeatability"] + whole.pop("arrival")
-    parts = {source: _Part(cov, none, 0.0) for source, cov in whole.items()}
+    parts = {source: _Part(cov, none) for source, cov in whole.items()}
     if np.array_equal(error.errors.target_cov_ct, error.errors.marker_cov_ct):
         for source, cov in reading_parts(error.errors.target_cov_ct).items():
             parts[source] = parts[source]._replace(target=scale * cov)
     else:
-        parts["target"] = _Part(np.zeros((6, 6)), scale * error.errors.target_cov_ct, 0.0)
-    parts["surface"] = _Part(np.zeros((6, 6)), none, error.surface_mm**2)
+        parts["target"] = _Part(np.zeros((6, 6)), scale * error.errors.target_cov_ct)
+    parts["surface"] = _Part(np.zeros((6, 6)), none)  # moves no needle
     return parts
 
 
@@ -231,43 +230,49 @@ class ShrinkableNeedle(NamedTuple):
     """One candidate whose sources can be shrunk: `shrinkable` makes one."""
 
     model: ChanceModel
-    near: Proximity
+    needles: Needles
     parts: Mapping[str, _Part]
 
     def chance(self, structure: str, factors: Mapping[str, float]) -> float:
         """To touch a structure, or where it is "" to hit, with some deviations times factors."""
         squares = {source: factors.get(source, 1.0) ** 2 for source in self.parts}
         cov6 = np.asarray(sum(squares[source] * part.cov6 for source, part in self.parts.items()))
+        surface_mm = factors.get("surface", 1.0) * self.surface_mm(structure)
         if structure:
-            surface = sum(squares[source] * part.surface for source, part in self.parts.items())
-            return self._touch(structure, cov6, surface)
+            return self._touch(structure, cov6, surface_mm)
         target = np.asarray(sum(squares[source] * part.target for source, part in self.parts.items()))
-        return self._hit(cov6[:3, :3], target)
+        return self._hit(cov6[:3, :3], target, surface_mm)
 
-    def _hit(self, cov: Floats, target: Floats) -> float:
+    def surface_mm(self, structure: str) -> float:
+        """By which the surface of a structure, or where it is "" of the target, may lie off as a whole."""
+        if not structure:
+            return self.model.target_surface_mm
+        return float(self.needles.surface_mm[0, self.model.structures.index(structure)])
+
+    def _hit(self, cov: Floats, target: Floats, surface_mm: float) -> float:
         hit, freedom = self.model.hit, self.model.error.freedom
         if hit.radius_mm is not None:
             return float(hit_in_ball((cov + target)[None], hit.radius_mm, freedom)[0])
         assert hit.rays is not None
-        return float(hit_in_mesh(hit.rays, cov[None], freedom)[0])
+        return float(hit_in_mesh(hit.rays, cov[None], freedom, surface_mm)[0])
 
-    def _touch(self, structure: str, cov6: Floats, surface: float) -> float:
+    def _touch(self, structure: str, cov6: Floats, surface_mm: float) -> float:
         at = [self.model.structures.index(structure)]
-        gradient = self.near.gradient[:, at]
-        variance = np.einsum("nka,ab,nkb->nk", gradient, cov6, gradient) + surface
-        near = Proximity(self.near.distance[:, at], gradient, np.sqrt(np.maximum(variance, 0.0)))
+        gradient = self.needles.near.gradient[:, at]
+        variance = np.einsum("nka,ab,nkb->nk", gradient, cov6, gradient) + surface_mm**2
+        near = Proximity(self.needles.near.distance[:, at], gradient, np.sqrt(np.maximum(variance, 0.0)))
         return float(touch_chance(near, self.model.case.needle.radius_mm, self.model.error.freedom)[0, 0])
 
 
-def shrinkable(model: ChanceModel, near: Proximity, q: Floats) -> ShrinkableNeedle:
+def shrinkable(model: ChanceModel, needles: Needles, q: Floats) -> ShrinkableNeedle:
     """One candidate whose sources can be shrunk.
 
     Args:
         model: Of the case.
-        near: How the candidate passes its k structures.
+        needles: The candidate alone.
         q: Shape (6,), rad, the tip on the target.
     """
-    return ShrinkableNeedle(model, near, _parts(model, q))
+    return ShrinkableNeedle(model, needles, _parts(model, q))
 
 
 def goals_of(needle: ShrinkableNeedle, p_hit: float, p_touch: Mapping[str, float]) -> list[Goal]:
@@ -291,7 +296,7 @@ def _goal(needle: ShrinkableNeedle, structure: str, limit: float, *, stated: boo
     for source in needle.parts:
         factor = _greatest(lambda f, source=source: passes({source: f}))  # type: ignore[misc]
         if factor is not None:
-            declared = deviation(errors, source)
+            declared = needle.surface_mm(structure) if source == "surface" else deviation(errors, source)
             remedies.append((factor, Remedy(source, declared, factor * declared)))
     together = _greatest(lambda f: passes(dict.fromkeys(needle.parts, f)))
     ordered = tuple(remedy for _, remedy in sorted(remedies, key=lambda one: -one[0]))

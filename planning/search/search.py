@@ -9,10 +9,8 @@ from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
+from puncture_twin.planning.search.candidate_chances import with_best_refined, with_chances, with_joint_chances
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.chances.candidate_chances import with_chances
-from puncture_twin.planning.search.chances.joint import with_joint_chances
-from puncture_twin.planning.search.chances.refined import with_best_refined
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
 from puncture_twin.planning.search.ranking import ranked

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.search.candidates import ANGLE_DIGITS, Candidates
 from puncture_twin.planning.search.selection.windows import find_windows
@@ -80,7 +80,7 @@ def _choice_columns(candidates: Candidates) -> dict[str, Any]:
     }
 
 
-def chance_columns(chances: Chances) -> dict[str, Floats]:
+def chance_columns(chances: Chances) -> dict[str, NDArray[Any]]:
     """The columns of a case that declares errors, after all others."""
     wide = {
         f"p_{kind}_{name}": getattr(chances, kind)[:, at]
@@ -92,6 +92,7 @@ def chance_columns(chances: Chances) -> dict[str, Floats]:
         **wide,
         "p_touch_any": chances.touch_any,
         "p_touch_joint": chances.touch_joint,
+        "touch_refined": chances.refined,
         "sigma_lateral_mm": chances.lateral_mm,
         "sigma_depth_mm": chances.depth_mm,
     }

@@ -35,15 +35,19 @@ class AnyPose(NamedTuple):
 
     deviation_mm: float
     deviation_rad: float
-    surface_mm: float
-    """By which a structure's surface may lie off as a whole."""
 
-    def of_distance(self, depth_mm: Floats) -> Floats:
+    def of_distance(self, depth_mm: Floats, surface_mm: Floats) -> Floats:
         """Bound of the standard deviation of distances whose nearest axis points lie no deeper than this, (k,), mm."""
-        return np.hypot(self.deviation_mm + depth_mm * self.deviation_rad, self.surface_mm)
+        return np.hypot(self.deviation_mm + depth_mm * self.deviation_rad, surface_mm)
 
     def margin(
-        self, chance: float, freedom: int | None, farthest_mm: Floats, lengths_mm: Floats, radius_mm: float
+        self,
+        chance: float,
+        freedom: int | None,
+        farthest_mm: Floats,
+        lengths_mm: Floats,
+        radius_mm: float,
+        surface_mm: Floats,
     ) -> Floats:
         """Clearance at which no needle touches a structure more often than ``chance``, whatever its shape, (k,), mm.
 
@@ -56,16 +60,17 @@ class AnyPose(NamedTuple):
             farthest_mm: Shape (k,), the structures' greatest distances from the target.
             lengths_mm: Shape (k,), how long the axis is.
             radius_mm: The needle's.
+            surface_mm: Shape (k,), by which each structure's surface may lie off as a whole, at most.
         """
-        count = 5 + (self.surface_mm > 0)
+        count = 5 + int((surface_mm > 0).any())
         square = chdtri(count, chance) if freedom is None else count * fdtri(count, freedom, 1.0 - chance)
         z = np.sqrt(square)
         kept, deepest = 1.0 - z * self.deviation_rad, np.asarray(lengths_mm, dtype=np.float64)
         if kept > 0.0:
-            straight = self.deviation_mm + self.surface_mm + farthest_mm * self.deviation_rad
+            straight = self.deviation_mm + surface_mm + farthest_mm * self.deviation_rad
             beyond = (radius_mm + z * straight) / kept
             deepest = np.minimum(farthest_mm + beyond, deepest)
-        return np.asarray(z * self.of_distance(deepest))
+        return np.asarray(z * self.of_distance(deepest, surface_mm))
 
 
 def any_pose(error: PoseError) -> AnyPose:
@@ -89,7 +94,7 @@ def any_pose(error: PoseError) -> AnyPose:
             lasting = np.sqrt(2.0) * own
         largest = np.linalg.eigvalsh(readings[rows, rows])[-1]
         bounds.append(float(np.sqrt(largest + scale**2 * (lasting**2 + arrival**2))))
-    return AnyPose(bounds[0], bounds[1], error.surface_mm)
+    return AnyPose(bounds[0], bounds[1])
 
 
 def _levers_mm(error: PoseError) -> Floats:

@@ -6,21 +6,21 @@ the target. Line sampling refines them where it is wanted (`refined_chances`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
-from puncture_twin.planning.uncertainty.chances import Chances
-from puncture_twin.planning.uncertainty.hit import HitModel, hit_model
-from puncture_twin.planning.uncertainty.limits import demanding, touch_limit
-from puncture_twin.planning.uncertainty.lines.refined_touch import Needles
+from puncture_twin.planning.uncertainty.chances import Chances, demanding, touch_limit
+from puncture_twin.planning.uncertainty.hit import HitModel, hit_model, mean_over_faces
+from puncture_twin.planning.uncertainty.lines.line_sampling import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.planning.uncertainty.touch import proximity, touch_chance, touching_any
 
@@ -66,6 +66,20 @@ class ChanceModel:
         """The greatest chance to touch each of them that the case allows, shape (k,)."""
         return np.array([touch_limit(self.case, name) for name in self.structures])
 
+    @cached_property
+    def surfaces(self) -> Floats:
+        """By what each one's surface may lie off as a whole, `PoseError.surface_cov_ct`, shape (k, 3, 3), CT axes."""
+        voxels = [self.anatomy.checked[column].voxel_ct for column in self.columns]
+        return np.array([self.error.surface_cov_ct(voxel_ct) for voxel_ct in voxels]).reshape(-1, 3, 3)
+
+    @cached_property
+    def target_surface_mm(self) -> float:
+        """By what the target's may, the mean over its faces; nothing where a radius says what is hit."""
+        if self.hit.radius_mm is not None:
+            return 0.0
+        target = self.anatomy.structure(self.case.target_structure)
+        return mean_over_faces(target.mesh, self.error.surface_cov_ct(target.voxel_ct))
+
     @property
     def touching(self) -> Floats:
         """How near a needle's axis touches each of them, shape (k,), mm."""
@@ -84,9 +98,14 @@ class ChanceModel:
             axes = self.engine.measure(target, outward_ct, axis_lengths(self.case, self.anatomy.checked), shown=False)
         normal = normals_of(self.engine.triangles, target, outward_ct, axes)[:, columns]
         distance, depth = axes.distance[:, columns], axes.depth[:, columns]
-        cov_ct, surface_mm = self.error.covariance_ct(q), self.error.surface_mm
+        cov_ct = self.error.covariance_ct(q)
+        surface_mm = np.sqrt(np.einsum("nka,kab,nkb->nk", normal, self.surfaces, normal))
         near = proximity(distance, depth, normal, outward_ct, cov_ct, surface_mm)
         return Needles(outward_ct, cov_ct, near, surface_mm, self.error.freedom)
+
+    def hit_chance(self, cov_ct: Floats) -> Floats:
+        """The chance to hit of needles with these Sigma6, shape (n, 6, 6), CT axes: shape (n,)."""
+        return self.hit.chance(self.error, cov_ct, self.target_surface_mm)
 
     def chances(self, outward_ct: Floats, q: Floats, axes: AxisDistances | None = None) -> Chances:
         """The chances of some needles to first order, the joint one unknown.
@@ -105,13 +124,14 @@ class ChanceModel:
         along = np.einsum("na,nab,nb->n", outward_ct, tip, outward_ct)
         return Chances(
             structures=self.structures,
-            hit=self.hit.chance(self.error, needles.cov_ct),
+            hit=self.hit_chance(needles.cov_ct),
             touch=touch,
             margin=margin,
             touch_any=touch_any,
             touch_joint=np.full(len(q), np.nan),
             lateral_mm=np.sqrt(np.maximum(np.trace(tip, axis1=1, axis2=2) - along, 0.0)),
             depth_mm=np.sqrt(along),
+            refined=np.zeros(len(q), bool),
         )
 
 
@@ -133,3 +153,43 @@ def chance_model(case: Case, anatomy: Anatomy, engine: ClearanceEngine, error: P
         message = f"the mesh of '{case.target_structure}' is open: what lies in it, and is hit, is not known"
         raise InputError(message, where=case.path, allowed="target.hit_radius_mm, or a closed mesh")
     return ChanceModel(case, anatomy, engine, error, hit_model(case.hit_radius_mm, mesh, case.target_ct))
+
+
+def refined_chances(
+    model: ChanceModel, outward_ct: Floats, q: Floats, first: Chances, wanted: Bools | None = None
+) -> Chances:
+    """Chances to touch, to break a margin and to touch any, by line sampling; the others as they are.
+
+    Args:
+        model: Of the case.
+        outward_ct: Shape (n, 3), as in `ChanceModel.chances`.
+        q: Shape (n, 6).
+        first: Of these needles, to first order.
+        wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
+    """
+    every = np.ones(first.touch.shape, bool)
+    blocks = model.engine.blocks
+    around = Surroundings(tuple(blocks[column] for column in model.columns), model.lengths, model.case.target_ct)
+    needles = model.needles(outward_ct, q)
+    touch = refined(around, needles, model.touching, first.touch, every if wanted is None else wanted)
+    margin = first.margin if wanted is not None else refined(around, needles, model.breaking, first.margin, every)
+    whole = np.full(len(q), wanted is None)
+    return replace(first, touch=touch, margin=margin, touch_any=touching_any(touch), refined=whole)
+
+
+def keeps_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
+    """Whether needles keep the case's limits, shape (n,), in any configurations that reach the target.
+
+    Args:
+        model: Of the case.
+        outward_ct: Shape (n, 3), unit.
+        q: Shape (n, 6), rad, the tip on the target.
+    """
+    kept, least, limits = np.ones(len(q), bool), model.case.search.min_hit, model.limits
+    if least is not None:
+        kept &= model.hit_chance(model.error.covariance_ct(q)) >= least
+    if not np.isfinite(limits).any():
+        return kept
+    first = model.chances(outward_ct, q)
+    touch = refined_chances(model, outward_ct, q, first, np.broadcast_to(np.isfinite(limits), first.touch.shape)).touch
+    return np.asarray(kept & (np.where(np.isnan(touch), np.inf, touch) <= limits).all(axis=1))

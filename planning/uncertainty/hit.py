@@ -6,25 +6,83 @@ surface is crossed at distances rho_ij, and with m_i^2 = u_i' Sigma^-1 u_i
     P = sum_i m_i^-3 sum_j s_ij F3(rho_ij m_i) / sum_i m_i^-3,   F3 the distribution of the length of three normals
 
 where s_ij is +1 for the last crossing and alternates inwards, which is right for a target outside or on the surface
-too. Where the residuals gave the errors' size, that size is uncertain too: F3 becomes Fisher's F(3, nu), and within a
-radius the chance is averaged over chi-squared.
+too. A surface that lies off as a whole by z standard deviations s moves a crossing by z s / (n . u), n its face's
+normal; F3 is odd, so that this is right where it moves past the target, and P is the mean over z. Where the residuals
+gave the errors' size, that size is uncertain too: F3 becomes Fisher's F(3, nu), and within a radius the chance is
+averaged over chi-squared.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from scipy.special import chdtri, erf, fdtr
+from scipy.optimize import brentq
+from scipy.special import chdtri, erf, fdtr, ndtri
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.planning.uncertainty.quadratic_form import chance_within
+
+SERIES_END = 1e-8
+"""The series stops where what is left of its weights, which add up to 1, is smaller."""
+
+MOST_TERMS = 20_000
+"""Enough for standard deviations of a ratio of 30; what is left then is not counted, so that P is never too large."""
+
+
+def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
+    """The chance that a normal error stays within a radius, by Ruben's series (Ann. Math. Stat. 33, 1962).
+
+    With beta the least eigenvalue and gamma_i = 1 - beta / lambda_i, P = sum_k c_k F_{3+2k}(x / beta), F the
+    chi-squared distribution; one gamma is 0, and (k+1) c_{k+1} = e1 (k + 1/2) c_k - e2 k c_{k-1} with e1 and e2 the sum
+    and product of the other two.
+
+    Args:
+        eigenvalues: Shape (n, 3), of the covariance, mm^2, all above 0.
+        radii: Shape (n, m), mm.
+
+    Returns:
+        Shape (n, m).
+    """
+    chances = np.empty(radii.shape)
+    _ruben(np.sort(eigenvalues, axis=1), np.ascontiguousarray(radii, dtype=np.float64) ** 2, chances)
+    return chances
+
+
+@nb.njit(cache=True)
+def _ruben(values, squares, chances):  # type: ignore[no-untyped-def]  # numba infers
+    for row in range(len(values)):
+        beta, mid, high = values[row]
+        g1, g2 = 1.0 - beta / mid, 1.0 - beta / high
+        start = math.sqrt(beta / mid * beta / high)
+        for column in range(squares.shape[1]):
+            chances[row, column] = _series(start, g1 + g2, g1 * g2, squares[row, column] / beta)
+
+
+@nb.njit(cache=True)
+def _series(weight, e1, e2, x):  # type: ignore[no-untyped-def]
+    """Sum c_k F_{3+2k}(x), with F_{nu+2}(x) = F_nu(x) - (x/2)^(nu/2) exp(-x/2) / Gamma(nu/2 + 1)."""
+    half = 0.5 * x
+    if half <= 0.0:
+        return 0.0
+    before, left, total = 0.0, 1.0, 0.0
+    F = math.erf(math.sqrt(half)) - math.sqrt(4.0 * half / math.pi) * math.exp(-half)
+    log_step = 1.5 * math.log(half) - half - math.lgamma(2.5)
+    for k in range(MOST_TERMS):
+        total += weight * F
+        left -= weight
+        if left < SERIES_END or F <= 0.0:
+            break
+        F = max(F - math.exp(log_step), 0.0)
+        log_step += math.log(half) - math.log(k + 2.5)
+        weight, before = (e1 * (k + 0.5) * weight - e2 * k * before) / (k + 1.0), weight
+    return min(max(total, 0.0), 1.0)
+
 
 DIRECTIONS = 512
 """Of a mesh, spread evenly: against a million draws P errs by .001, for axis ratios of 10 by .004."""
@@ -39,7 +97,13 @@ ROOT_HALF = math.sqrt(0.5)
 ROOT_TWO_OVER_PI = math.sqrt(2.0 / math.pi)
 
 LEAST_VARIANCE = 1e-12
-"""mm^2, added to every axis: an error that cannot happen must not divide by zero."""
+"""mm^2, added to every axis, and to areas: what cannot happen must not divide by zero."""
+
+SURFACES = 32
+"""Of a surface that lies off, at the middles of equal chances: however sharply it decides, P errs by half of one."""
+
+GRAZING = 0.2
+"""Least cosine between ray and normal: a crossing that a surface moves farther than this says is not moved by it."""
 
 ROWS_AT_ONCE = 512
 """Of covariances, so that a table of rows times crossings stays below some MB."""
@@ -54,12 +118,14 @@ class TargetRays:
         ray: Shape (c,), row of each crossing's direction.
         depth: Shape (c,), mm from the target.
         sign: Shape (c,), +1 for a direction's last crossing, alternating inwards.
+        moved: Shape (c,), by which a crossing's depth grows where the surface lies farther out by 1; None for a ball.
     """
 
     directions: Floats
     ray: Ints
     depth: Floats
     sign: Floats
+    moved: Floats | None = None
 
 
 def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
@@ -67,7 +133,25 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     directions = _fibonacci(DIRECTIONS)
     found = crossings(mesh, target_ct, directions)
     from_last = (found.first + found.count - 1)[found.ray] - np.arange(len(found.ray))
-    return TargetRays(directions, found.ray, found.depth, np.where(from_last % 2 == 0, 1.0, -1.0))
+    sign = np.where(from_last % 2 == 0, 1.0, -1.0)
+    area = _areas(mesh)[found.face]
+    facing = np.abs(np.einsum("ca,ca->c", area, directions[found.ray])) / (
+        np.linalg.norm(area, axis=1) + LEAST_VARIANCE
+    )
+    return TargetRays(directions, found.ray, found.depth, sign, sign / np.maximum(facing, GRAZING))
+
+
+def _areas(mesh: TriangleMesh) -> Floats:
+    """Normals of the faces as long as twice their areas, shape (m, 3)."""
+    a, b, c = np.moveaxis(mesh.triangles.reshape(-1, 3, 3), 1, 0)
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def mean_over_faces(mesh: TriangleMesh, cov: Floats) -> float:
+    """Sqrt of the mean of n' S n over a surface, for S of shape (3, 3)."""
+    area = _areas(mesh)
+    size = np.linalg.norm(area, axis=1)
+    return float(np.sqrt(np.einsum("ma,ab,mb->", area / (size[:, None] + LEAST_VARIANCE), cov, area) / size.sum()))
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
@@ -87,17 +171,22 @@ def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
     return TargetRays(directions, ray[ahead], depth[ahead], sign[ahead])
 
 
-def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None) -> Floats:
+def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, surface_mm: float = 0.0) -> Floats:
     """The chance that the tip is within a mesh.
 
     Args:
         rays: Of the target.
         cov_ct: Shape (n, 3, 3), mm^2, of tip against mesh, CT frame.
         freedom: Degrees of the errors' size, where the residuals gave it.
+        surface_mm: By which the mesh may lie off as a whole.
 
     Returns:
         Shape (n,).
     """
+    if surface_mm > 0 and rays.moved is not None:
+        z = ndtri((np.arange(SURFACES) + 0.5) / SURFACES)
+        lying = [replace(rays, depth=rays.depth + off * rays.moved) for off in surface_mm * z]
+        return np.asarray(np.mean([hit_in_mesh(one, cov_ct, freedom) for one in lying], axis=0))
     inverse = np.asarray(np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3)), dtype=np.float64)
     if freedom is None:
         found = np.empty(len(inverse))
@@ -121,9 +210,9 @@ def _directional(x, y, z, ray, depth, sign, table, inverse, chances):  # type: i
             weights[i] = 1.0 / (square * lengths[i])
         within = 0.0
         for c in range(len(ray)):
-            t = min(depth[c] * lengths[ray[c]] * TABLE_STEPS, last - 1e-6)
-            k = int(t)
-            within += sign[c] * weights[ray[c]] * (table[k] + (t - k) * (table[k + 1] - table[k]))
+            t = min(abs(depth[c]) * lengths[ray[c]] * TABLE_STEPS, last - 1e-6)
+            k, odd = int(t), math.copysign(sign[c], sign[c] * depth[c])
+            within += odd * weights[ray[c]] * (table[k] + (t - k) * (table[k + 1] - table[k]))
         chances[row] = min(max(within / weights.sum(), 0.0), 1.0)
 
 
@@ -138,7 +227,7 @@ def _with_unknown_size(rays: TargetRays, inverse: Floats, freedom: int) -> Float
     squares = np.einsum("ia,nab,ib->ni", rays.directions, inverse, rays.directions)
     weights = squares**-1.5
     within = fdtr(3, freedom, rays.depth**2 * squares[:, rays.ray] / 3)
-    found = (rays.sign * within * weights[:, rays.ray]).sum(axis=1) / weights.sum(axis=1)
+    found = (rays.sign * np.sign(rays.depth) * within * weights[:, rays.ray]).sum(axis=1) / weights.sum(axis=1)
     return np.asarray(np.clip(found, 0.0, 1.0))
 
 
@@ -159,6 +248,25 @@ def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Fl
     parts = (np.arange(QUANTILES) + 0.5) / QUANTILES
     radii = radius_mm * np.sqrt(chdtri(freedom, parts) / freedom)
     return np.asarray(chance_within(values, np.broadcast_to(radii, (len(cov), QUANTILES))).mean(axis=1))
+
+
+def radius_that_holds(cov: Floats, chance: float, freedom: int | None = None) -> float:
+    """Within which of the point that was meant the tip ends with a chance, mm: `hit_in_ball` the other way round.
+
+    Args:
+        cov: Shape (3, 3), mm^2, of tip against that point, any frame.
+        chance: Below 1.
+        freedom: Degrees of the errors' size, where the residuals gave it.
+    """
+    size = float(np.sqrt(np.trace(cov)))
+    if size == 0.0:
+        return 0.0
+    high = size
+    while hit_in_ball(cov[None], high, freedom)[0] < chance:
+        high *= 2.0
+    return float(
+        brentq(lambda radius: hit_in_ball(cov[None], radius, freedom)[0] - chance, 0.0, high, xtol=1e-4 * size)
+    )
 
 
 def _fibonacci(count: int) -> Floats:
@@ -182,14 +290,12 @@ class HitModel:
     radius_mm: float | None
     rays: TargetRays | None
 
-    def chance(self, error: PoseError, cov_ct: Floats) -> Floats:
-        """The chance of needles with these Sigma6, shape (n, 6, 6), CT axes: shape (n,)."""
+    def chance(self, error: PoseError, cov_ct: Floats, surface_mm: float = 0.0) -> Floats:
+        """The chance of needles with these Sigma6, shape (n, 6, 6), CT axes, in a mesh that may lie off: shape (n,)."""
         if self.rays is None or self.radius_mm is not None:
             assert self.radius_mm is not None
             return hit_in_ball(cov_ct[:, :3, :3] + error.target_covariance_ct, self.radius_mm, error.freedom)
-        # a surface that lies off takes from the target as a tip would that errs so
-        cov = cov_ct[:, :3, :3] + error.surface_mm**2 * np.eye(3)
-        return hit_in_mesh(self.rays, np.ascontiguousarray(cov), error.freedom)
+        return hit_in_mesh(self.rays, np.ascontiguousarray(cov_ct[:, :3, :3]), error.freedom, surface_mm)
 
 
 def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:

@@ -5,7 +5,7 @@ transport to the target, Omega what errs anew at each marker:
 
     Sigma6 = G Sigma_eta G' + X L Omega L' X' + (rep^2 + drift^2) Jq_f Jq_f',   G = J_f - X L J
 
-The minus sign is the cancellation: what the arm does wrong at the markers it does again at the target (`cancellation`).
+The minus sign is the cancellation: what the arm does wrong at the markers it does again at the target.
 """
 
 from __future__ import annotations
@@ -25,8 +25,26 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.uncertainty.cancellation import not_cancelled
 from puncture_twin.planning.uncertainty.sources import reading_parts
+
+
+def not_cancelled(fit: FitUncertainty, J: Floats, target_base: Floats) -> Floats:
+    """G = J_f - X L J: the arm's error Jacobian, the part that the registration takes off taken off.
+
+    Where nobody says how the arm touched the markers, sqrt(2) J_f stands for it: errors of equal size at the markers
+    and at the target, independent.
+
+    Args:
+        fit: What the registration makes of the declared errors: its map L and the arm's Jacobian J at the touches.
+        J: Shape (n, 6, 28), J_f, of configurations with the tip on the target; tip (mm) then rotation (rad), base axes.
+        target_base: Shape (3,), mm, to which X carries the registration's shift and rotation.
+
+    Returns:
+        Shape (n, 6, 28).
+    """
+    if not fit.noise.touches_known:
+        return np.asarray(np.sqrt(2.0) * J)
+    return np.asarray(J - fit.map_at(target_base) @ fit.noise.arm_jacobian)
 
 
 class Bend(NamedTuple):
@@ -85,10 +103,9 @@ class PoseError:
         R = self.fit.R_base_ct
         return np.asarray(R.T @ self.tip_covariance(q) @ R)
 
-    @property
-    def surface_mm(self) -> float:
-        """By which a structure's surface may lie off as a whole, scaled as all that is declared."""
-        return self.fit.test.scale * self.errors.surface_mm
+    def surface_cov_ct(self, voxel_ct: Floats | None) -> Floats:
+        """`ErrorModel.surface_cov_ct`, scaled as all that is declared."""
+        return np.asarray(self.fit.test.scale**2 * self.errors.surface_cov_ct(voxel_ct))
 
     @property
     def target_covariance_ct(self) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -12,28 +12,42 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 
-NOT_MODELLED = "breathing, a needle that bends, tissue that moves"
-"""What no source stands for: it is not known, which is something else than 0."""
-
-NOT_IN_CHANCES = (
-    "breathing in the chances (they are of the body as the CT shows it)",
-    "a needle that bends in the chances (its greatest deflection is kept as clearance)",
+NOT_MODELLED: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "breathing": ("breathing", "breathing in the chances (they are of the body as the CT shows it)"),
+        "bending": (
+            "a needle that bends",
+            "a needle that bends in the chances (its greatest deflection is kept as clearance)",
+        ),
+    }
 )
-"""The first two of them where the case declares them: what is done with them instead."""
+"""What no source stands for, which is something else than 0; and where the case declares it, what is done instead."""
+
+NAMED = 3
+"""Meshes that are named; of more their number is told."""
 
 
-def not_modelled(case: Case, *, bent: bool = False) -> str:
+def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
     """What the chances of a case leave out: what it does not declare, and what is declared but counted elsewhere.
 
     Args:
         case: The case.
-        bent: Whether the chances count a needle that bends.
+        counted: Of breathing and bending, what these chances count.
     """
-    left_out = NOT_MODELLED.split(", ")
-    for at, declared in enumerate((case.breathing, case.bending)):
-        if declared is not None:
-            left_out[at] = NOT_IN_CHANCES[at]
-    return ", ".join(left_out[:1] + left_out[2:] if bent else left_out)
+    declared = {"breathing": case.breathing, "bending": case.bending}
+    left_out = [texts[declared[name] is not None] for name, texts in NOT_MODELLED.items() if name not in counted]
+    return ", ".join([*left_out, "tissue that moves", *_unknown_contours(case)])
+
+
+def _unknown_contours(case: Case) -> list[str]:
+    """Of meshes, of which nobody says how far they may lie off: those to avoid, and the one that is to be hit."""
+    if case.errors is None or case.errors.surface_mm is not None:
+        return []
+    hit = case.target_structure if case.hit_radius_mm is None else None
+    meshes = [one for one in case.structure if one.mesh is not None]
+    names = [one.name for one in meshes if one.role in {"avoid", "unknown"} or one.name == hit]
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return [f"how far meshes lie off ({', '.join(names[:NAMED])}{more}: errors.surface_mm)"] if names else []
 
 
 ISOTROPIC = 1e-9

@@ -37,7 +37,7 @@ class Proximity:
 
 
 def proximity(
-    distance: Floats, depth: Floats, normal: Floats, outward_ct: Floats, cov_ct: Floats, surface_mm: float
+    distance: Floats, depth: Floats, normal: Floats, outward_ct: Floats, cov_ct: Floats, surface_mm: Floats | float
 ) -> Proximity:
     """The first-order model of every needle and structure.
 
@@ -47,16 +47,17 @@ def proximity(
         normal: Shape (n, k, 3), unit, from the structure to that point.
         outward_ct: Shape (n, 3), unit.
         cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
-        surface_mm: By which a structure's surface may lie off as a whole, along the normal.
+        surface_mm: By which each structure's surface may lie off as a whole along that normal: one number or (n, k).
     """
     gradient, deviation = np.empty((*distance.shape, 6)), np.empty(distance.shape)
     near = (np.ascontiguousarray(depth), np.ascontiguousarray(normal), np.array(outward_ct, order="C"))
-    _first_order(*near, cov_ct, float(surface_mm), gradient, deviation)
+    surfaces = np.ascontiguousarray(np.broadcast_to(surface_mm, distance.shape), dtype=np.float64)
+    _first_order(*near, cov_ct, surfaces, gradient, deviation)
     return Proximity(distance, gradient, deviation)
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _first_order(depth, normal, outward, cov, surface_mm, gradient, deviation):  # type: ignore[no-untyped-def]  # numba infers
+def _first_order(depth, normal, outward, cov, surface, gradient, deviation):  # type: ignore[no-untyped-def]  # numba infers
     """Fill g = (n; s u x n) and sigma of every pair."""
     for i in range(len(outward)):
         ux, uy, uz = outward[i]
@@ -65,7 +66,7 @@ def _first_order(depth, normal, outward, cov, surface_mm, gradient, deviation): 
             nx, ny, nz = normal[i, j]
             g[0], g[1], g[2] = nx, ny, nz
             g[3], g[4], g[5] = s * (uy * nz - uz * ny), s * (uz * nx - ux * nz), s * (ux * ny - uy * nx)
-            variance = surface_mm * surface_mm
+            variance = surface[i, j] * surface[i, j]
             for a in range(6):
                 for b in range(6):
                     variance += g[a] * cov[i, a, b] * g[b]
@@ -97,7 +98,7 @@ def touch_bound(
     outward_ct: Floats,
     cov_ct: Floats,
     length_mm: float,
-    surface_mm: float,
+    surface_mm: Floats | float,
     freedom: int | None = None,
 ) -> Floats:
     """What the chance would be if the nearest point were the axis' most doubtful one, to first order, shape (n, k).
@@ -110,11 +111,11 @@ def touch_bound(
         outward_ct: Shape (n, 3), unit.
         cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
         length_mm: Of the axis.
-        surface_mm: As in `proximity`.
+        surface_mm: The most that each structure's surface may lie off by along any normal: one number or (k,).
         freedom: As in `touch_chance`.
     """
     lever = np.concatenate([np.broadcast_to(np.eye(3), (len(cov_ct), 3, 3)), -length_mm * skew(outward_ct)], axis=-1)
     ends = np.stack([cov_ct[:, :3, :3], lever @ cov_ct @ np.swapaxes(lever, -1, -2)])
-    variance = np.maximum(np.linalg.eigvalsh(ends)[..., -1].max(axis=0), 0.0) + surface_mm**2
-    quantile = -slack_mm / np.sqrt(variance + np.finfo(float).tiny)[:, None]
+    variance = np.maximum(np.linalg.eigvalsh(ends)[..., -1].max(axis=0), 0.0)[:, None] + np.square(surface_mm)
+    quantile = -slack_mm / np.sqrt(variance + np.finfo(float).tiny)
     return np.asarray(ndtr(quantile) if freedom is None else stdtr(freedom, quantile))

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within, mean_square_within
-from puncture_twin.planning.budget.bent_path import other_gauges
-from puncture_twin.planning.budget.chain import Breath, chain_of
+from puncture_twin.planning.budget.chain import Breath, chain_of, other_gauges
 from puncture_twin.planning.budget.what_if import changes, source_costs
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.labels.by_name import ByName
@@ -156,4 +155,4 @@ def test_register_shows_them_where_they_are_declared(tmp_path):
     assert 0.1 < costs["bending of the needle"] < 10
     assert costs["breathing while it is inserted"] == pytest.approx(12 * mean_square_within(0.25, 2, 0.0) ** 0.5)
     assert {one["group"] for one in budget["changes"]} > {"needle", "breath"}
-    assert budget["not_modelled"] == "tissue that moves"
+    assert budget["not_modelled"] == "tissue that moves, how far meshes lie off (organ, rib: errors.surface_mm)"

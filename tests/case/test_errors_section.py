@@ -80,6 +80,18 @@ def test_a_nominal_arm_errs_ten_times_as_much():
     assert model().arm.link_mm == 0.05
 
 
+def test_a_surface_is_known_by_its_own_voxels():
+    """Uniform in its cell along every axis of an oblique map; of what slices exceed 3 mm by half, to all sides."""
+    R = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    for sizes, off in (((0.7, 0.9, 3.0), (0.7, 0.9, 3.0)), ((0.7, 0.7, 5.0), np.hypot((0.7, 0.7, 5.0), 1.0))):
+        S = model().surface_cov_ct(R * sizes)
+        np.testing.assert_allclose(np.sqrt(np.diag(R.T @ S @ R)), np.array(off) / np.sqrt(12))
+        np.testing.assert_allclose(model().scaled(3.0).surface_cov_ct(R * sizes), 9 * S)
+    assert not model().surface_cov_ct(None).any()
+    for voxel in (None, R):
+        np.testing.assert_array_equal(model(surface_mm=0.4).surface_cov_ct(voxel), 0.4**2 * np.eye(3))
+
+
 def test_scaling_scales_every_deviation():
     """Twice all errors: covariances by four."""
     one, two = model(surface_mm=0.3), model(surface_mm=0.3).scaled(2.0)

@@ -13,6 +13,8 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.errors import error_model
+from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 
@@ -141,6 +143,12 @@ def test_every_kind_of_segmentation_becomes_the_same_case(tmp_path, capfd, kind)
     assert "next: run-twin search" in out
     assert ".case-" not in out + " ".join(said)
     assert list(tmp_path.glob(".case*")) == []
+    off = SPACING[0] / np.sqrt(12) * np.hypot(1.0, (SPACING[0] - 3.0) / 2 / SPACING[0])
+    assert f"# surface_mm = {off:.2f}  # " in (tmp_path / "case.toml").read_text()
+    context = prepare(tmp_path, arm=False)
+    model = error_model(ErrorsSection(), space=context.case.space)
+    for one in context.anatomy.structures:
+        np.testing.assert_allclose(model.surface_cov_ct(one.voxel_ct), off**2 * np.eye(3), atol=1e-5)
 
 
 def write_series(folder, number):

@@ -20,9 +20,9 @@ from puncture_twin.planning.case.tables.registration_section import MarkerSectio
 from puncture_twin.planning.case.tables.search_section import RankingSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.conditioning import leverage
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.registration.registration import leverage
 from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
 
 MESHES = ROOT / "meshes"

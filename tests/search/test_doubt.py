@@ -13,6 +13,7 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.doubt import WISHED_HIT, chance_text, goals_of, shrinkable
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball
+from puncture_twin.planning.uncertainty.lines.line_sampling import Needles
 from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, reading_parts
 from puncture_twin.planning.uncertainty.touch import proximity
 
@@ -28,10 +29,9 @@ def asked(radius_mm, **keys):
     outward = made.puncture.outward_ct[None]
     normal = np.cross(outward, [0.0, 0.0, 1.0])
     normal /= np.linalg.norm(normal)
-    near = proximity(
-        np.array([[2.0]]), np.array([[30.0]]), normal[:, None], outward, made.error.covariance_ct(q[None]), 0.0
-    )
-    return made, shrinkable(model, near, q)
+    cov_ct, off = made.error.covariance_ct(q[None]), np.full((1, 1), keys.get("surface_mm", 0.0))
+    near = proximity(np.array([[2.0]]), np.array([[30.0]]), normal[:, None], outward, cov_ct, off)
+    return made, shrinkable(model, Needles(outward, cov_ct, near, off, None), q)
 
 
 def test_parts_add_up_to_the_chance_of_the_table():

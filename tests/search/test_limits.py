@@ -6,80 +6,23 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 import trimesh
-from case_world import points_file
+from scipy.special import ndtr
+from uncertainty_world import MOUNT, ball
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.search.chances import joint, refined
-from puncture_twin.planning.search.chances.limited import limited
+from puncture_twin.planning.search import candidate_chances
+from puncture_twin.planning.search.candidate_chances import limited
 from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.selection.windows import find_windows
+from puncture_twin.planning.uncertainty.chance_model import keeps_limits, refined_chances
 from puncture_twin.planning.uncertainty.chances import Chances
-from puncture_twin.planning.uncertainty.refined_chances import keeps_limits, refined_chances
 from puncture_twin.planning.uncertainty.touch import proximity, touch_bound, touch_chance
 
-CASE = """schema = 2
-region = "phantom"
-name = "ball"
-space = "local"
-[target]
-position_mm = [0.0, 0.0, 0.0]
-structure = "organ"
-[needle]
-length_mm = 210.0
-shaft_mm = 150.0
-diameter_mm = 1.2
-[search]
-theta_deg = [20, 20]
-beta_deg = [0, 80]
-step_deg = 20.0
-{search}
-[errors]
-{errors}
-[robot]
-model = "ur3"
-{base}
-[[structure]]
-name = "skin"
-mesh = "skin.ply"
-unit = "mm"
-role = "skin"
-[[structure]]
-name = "organ"
-mesh = "organ.ply"
-unit = "mm"
-role = "target"
-[[structure]]
-name = "rib"
-mesh = "rib.ply"
-unit = "mm"
-role = "avoid"
-margin_mm = 2.0
-[end]
-structures = 3
-"""
-MARKERS = '[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"\n'
-MOUNT = "[robot.mount]\nposition_mm = [0.0, 380.0, -60.0]\nx_axis = [1.0, 0.0, 0.0]\nz_axis = [0.0, 0.0, 1.0]\n"
 LIMITS = "min_hit = 0.999\nmax_touch = 0.0001"
-TO_BASE = np.array([0.0, -380.0, 60.0])
-SIDES = np.array([[0.3, 0.2, 1], [-0.5, 0.3, 0.9], [0.1, -0.7, 0.8], [0.8, 0.1, 0.6], [-0.3, -0.5, 1], [0.2, 0.9, 0.5]])
 NO_READING = (
     "ct_in_plane_mm = 0\nct_slice_mm = {across}\nbed_axis = [1.0, 2.0, 3.0]\ntouch_mm = 0\nrepeatability_deg = 0\n"
 )
 NO_ARM = "link_mm = 0\ntwist_deg = 0\njoint_deg = 0\ntip_offset_mm = 0\n"
-
-
-def ball(folder, *, search="", errors="", base=MARKERS, noise=0.3, organ=None):
-    """A round patient in front of a UR3, with six markers on its skin; returns the case's file."""
-    meshes = {"skin": (75.0, (0, 0, 0)), "organ": (6.0, (0, 0, 0)), "rib": (5.0, (20, 0, 40))}
-    for name, (radius, center) in meshes.items():
-        mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-        mesh.apply_translation(center)
-        (organ if name == "organ" and organ is not None else mesh).export(folder / f"{name}.ply")
-    points = 75.0 * SIDES / np.linalg.norm(SIDES, axis=1)[:, None]
-    off = noise * np.random.default_rng(1).normal(size=points.shape)
-    (folder / "markers_ct.csv").write_text(points_file(points))
-    (folder / "touch.csv").write_text(points_file(points + TO_BASE + off))
-    (folder / "case.toml").write_text(CASE.format(search=search, errors=errors, base=base))
-    return folder / "case.toml"
 
 
 def test_limits_without_the_arm_are_refused(tmp_path):
@@ -174,7 +117,18 @@ def test_a_surface_that_lies_off_takes_from_the_chance_to_hit(tmp_path):
         folder.mkdir()
         found = prepare(ball(folder, errors=f"surface_mm = {surface}")).search()
         chances.append(np.nanmax(found.chances.hit))
-    assert chances[1] < 0.7 < chances[0]
+    assert chances[0] > 0.999 and chances[1] == pytest.approx(ndtr(6.0 / 5.0), abs=0.06)
+
+
+@pytest.mark.parametrize(("errors", "told"), [("", True), ("surface_mm = 0", False), ("surface_mm = 0.5", False)])
+def test_meshes_of_which_nobody_knows_how_far_they_lie_off_are_named(tmp_path, errors, told):
+    """In the text and in the values; a 0 that is written is an answer."""
+    context = prepare(ball(tmp_path, errors=errors))
+    found = context.search()
+    row = found.ranked[0]
+    said = context.explain(found.theta[row], found.beta[row])
+    for text in (said.text(), said.summary()["chances"]["not_modelled"]):
+        assert ("how far meshes lie off (organ, rib: errors.surface_mm)" in text) == told
 
 
 def test_an_open_target_has_no_chance_to_be_hit(tmp_path):
@@ -200,37 +154,36 @@ def test_a_needle_that_leans_is_refined_where_it_is_most_doubtful(tmp_path, monk
     trimesh.util.concatenate([slat, ring]).export(tmp_path / "rib.ply")
     path.write_text(path.read_text().replace("theta_deg = [20, 20]", "theta_deg = [0, 0]"))
     context = prepare(path)
-    monkeypatch.setattr(refined, "BEST", 0)  # as of the many candidates that are not among the best
-    monkeypatch.setattr(joint, "BEST", 0)
+    monkeypatch.setattr(candidate_chances, "BEST", 0)  # as of the many candidates that are not among the best
     found = context.search()
     assert (found.verdict.reason == "touch_likely").any() and not found.safe.any()
 
 
-@pytest.mark.parametrize("limited", [True, False])
-def test_what_may_decide_is_line_sampled(tmp_path, monkeypatch, limited):
-    """Every chance within a factor of 3 of the limit, and the best candidates; the rest keeps first order."""
-    limit = 0.05
-    path = ball(tmp_path, search=f"max_touch = {limit}" if limited else "", errors="touch_mm = 2.0\n")
+@pytest.mark.parametrize("limit", [0.05, None])
+def test_what_is_shown_or_may_decide_is_line_sampled_and_the_rest_is_marked(tmp_path, monkeypatch, limit):
+    """Rows from a third of the limit on, the best, and the best of every window: as `check` has them."""
+    path = ball(tmp_path, search=f"max_touch = {limit}" if limit else "", errors="touch_mm = 2.0\nsurface_mm = 0.7\n")
     path.write_text(
         path.read_text().replace("theta_deg = [20, 20]", "theta_deg = [10, 50]").replace("[0, 80]", "[0, 40]")
     )
-    monkeypatch.setattr(refined, "BEST", 2)
-    monkeypatch.setattr(joint, "BEST", 2)
+    monkeypatch.setattr(candidate_chances, "BEST", 2)
     context = prepare(path)
     found = context.search()
     rows = np.flatnonzero(np.isfinite(found.chances.hit))
     outward, q = found.outward_ct[rows], found.arm.q_insertion[rows]
     first = context.chance.chances(outward, q)
-    lines = refined_chances(context.chance, outward, q, first, np.ones(first.touch.shape, bool)).touch
-    table = found.chances.touch[rows]
-    near = (first.touch >= limit / 3) & (first.touch <= 3 * limit)
-    must = near & limited
-    must[np.isin(rows, found.ranked[:2])] = True
-    assert near.any() and must.any() and (lines != first.touch)[must].any()
-    np.testing.assert_array_equal(table[must], lines[must])
-    kept = table != lines
-    np.testing.assert_array_equal(table[kept], first.touch[kept])
-    assert (kept & (lines != first.touch)).any()
+    lines, done = refined_chances(context.chance, outward, q, first), found.chances.refined[rows]
+    shown = {*found.ranked[:2].tolist(), *(window.best for window in find_windows(found).windows)}
+    near = first.touch >= (limit or np.inf) / 3
+    assert done[np.isin(rows, list(shown)) | near.any(axis=1)].all()
+    assert done.any() and not done.all() and (lines.touch != first.touch)[done].any()
+    for name in ("touch", "margin", "touch_any"):
+        table, of_lines, of_first = (getattr(one, name) for one in (found.chances, lines, first))
+        np.testing.assert_array_equal(table[rows][done], of_lines[done])
+        np.testing.assert_array_equal(table[rows][~done], of_first[~done])
+    for row in shown:
+        said = context.explain(found.theta[row], found.beta[row]).doubt
+        assert said.p_touch["rib"] == pytest.approx(found.chances.touch[row, 0], abs=1e-9)
 
 
 def test_the_bound_is_never_below_first_order(rng):

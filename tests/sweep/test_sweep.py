@@ -16,7 +16,7 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.planning.sweep.sweep_planner import plan_sweep
 from puncture_twin.twin.jobs.experiment.sweep_job import parse_angles, sweep_case, sweep_text
-from puncture_twin.twin.rehearsal.sweeping import execute_sweep
+from puncture_twin.twin.rehearsal.executed import execute_sweep
 
 CASE = ROOT / "meshes" / "carton" / "case_m.toml"
 START, END = np.radians([22.0, 212.0]), np.radians([30.0, 222.0])

@@ -6,8 +6,14 @@ import trimesh
 from scipy.special import chdtr
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh, rays_to_ball, target_rays
-from puncture_twin.planning.uncertainty.quadratic_form import chance_within
+from puncture_twin.planning.uncertainty.hit import (
+    chance_within,
+    hit_in_ball,
+    hit_in_mesh,
+    mean_over_faces,
+    rays_to_ball,
+    target_rays,
+)
 
 DRAWS = np.random.default_rng(3).normal(size=(1_000_000, 3))
 
@@ -64,6 +70,28 @@ def test_within_a_ball_of_triangles_from_inside_on_its_face_and_outside(deviatio
     found = hit_in_mesh(target_rays(TriangleMesh(ball.vertices, ball.faces), np.array([off, 0.0, 0.0])), cov[None])[0]
     tips = (DRAWS * deviations) @ axes.T + [off, 0, 0]
     assert found == pytest.approx(np.mean(np.sum(tips**2, axis=1) < 64), abs=0.004)
+
+
+@pytest.mark.parametrize(
+    ("surface", "off"), [(1.0, 0.0), (1.0, 4.0), (1.0, 6.0), (1.0, 8.0), (2.5, 4.0), (2.5, 8.0), (5.0, 0.0)]
+)
+def test_a_surface_that_lies_off_as_a_whole_makes_the_ball_larger_or_smaller(surface, off):
+    """By a normal number; a ball that is less than nothing is never hit."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=8.0)
+    cov, axes = covariance((2.0, 1.0, 1.5), seed=3)
+    rays = target_rays(TriangleMesh(ball.vertices, ball.faces), np.array([off, 0.0, 0.0]))
+    tips = (DRAWS * [2.0, 1.0, 1.5]) @ axes.T + [off, 0, 0]
+    radius = 8.0 + surface * np.random.default_rng(4).normal(size=len(tips))
+    truth = np.mean(np.linalg.norm(tips, axis=1) < radius)
+    assert hit_in_mesh(rays, cov[None], surface_mm=surface)[0] == pytest.approx(truth, abs=0.02)
+
+
+def test_the_mean_over_faces_is_that_of_the_directions_that_they_face():
+    """Of a slab whose large faces look along z, and of a ball: a third of the trace."""
+    S = np.diag([0.04, 0.09, 2.0])
+    slab, ball = trimesh.creation.box((1000.0, 1000.0, 1e-3)), trimesh.creation.icosphere(subdivisions=3)
+    assert mean_over_faces(TriangleMesh(slab.vertices, slab.faces), S) == pytest.approx(np.sqrt(2.0), rel=1e-3)
+    assert mean_over_faces(TriangleMesh(ball.vertices, ball.faces), S) == pytest.approx(np.sqrt(2.13 / 3), rel=1e-3)
 
 
 @pytest.mark.parametrize("deviations", DEVIATIONS)

@@ -13,7 +13,7 @@ from puncture_twin.planning.clearance.near_faces import near_faces
 from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.uncertainty.lines.refined_touch import Needles, Surroundings, refined
+from puncture_twin.planning.uncertainty.lines.line_sampling import Needles, Surroundings, refined
 from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
 
 LENGTH, RADIUS = 150.0, 0.6
@@ -41,7 +41,7 @@ def chances(mesh, cov, surface=0.0, freedom=None, threshold=RADIUS):
     near = proximity(axes.distance, axes.depth, normal, UP[None], cov[None], surface)
     first = touch_chance(near, threshold, freedom)
     around = Surroundings(engine.blocks, np.array([LENGTH]), np.zeros(3))
-    needles = Needles(UP[None], cov[None], near, surface, freedom)
+    needles = Needles(UP[None], cov[None], near, np.full((1, 1), surface), freedom)
     found = refined(around, needles, np.array([threshold]), first, np.ones((1, 1), bool))
     return first[0, 0], found[0, 0]
 

@@ -10,7 +10,7 @@ from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.search.chances.joint import joint_touch_chance
+from puncture_twin.planning.search.candidate_chances import joint_touch_chance
 from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
 
 LENGTH, RADIUS = 150.0, 0.6
@@ -95,6 +95,16 @@ def test_any_is_below_the_sum_and_near_the_draws():
     assert joint_touch_chance(both, cov[None], RADIUS)[0] == pytest.approx(2 * one, abs=0.02)
     assert joint_touch_chance(twice, cov[None], RADIUS)[0] == pytest.approx(one, abs=0.02)
     assert touch_chance(twice, RADIUS).sum() == pytest.approx(2 * one)
+
+
+def test_every_surface_lies_off_by_a_number_of_its_own():
+    """Two slabs at one place: what moves the needle touches both, what moves the slabs one or the other."""
+    cov, surface = np.diag([0.25, 0.25, 0.25, 0.0, 0.0, 0.0]), 1.0
+    twice = near(scene(slab(2.0), slab(2.0)), cov, surface=surface)
+    rng = np.random.default_rng(8)
+    shift, off = rng.normal(0.0, 0.5, 200_000), rng.normal(0.0, surface, (200_000, 2))
+    truth = np.mean((shift[:, None] + off > 2.0 - RADIUS).any(axis=1))
+    assert joint_touch_chance(twice, cov[None], RADIUS, surface_mm=surface)[0] == pytest.approx(truth, abs=0.02)
 
 
 def test_no_error_touches_for_certain_or_never_and_a_met_structure_has_no_first_order():

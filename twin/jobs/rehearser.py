@@ -14,8 +14,7 @@ if TYPE_CHECKING:  # nothing is loaded before it is needed
     from puncture_twin.planning.case.case import Case
     from puncture_twin.planning.plan.plan import Plan
     from puncture_twin.twin.plant.truth import Truth
-    from puncture_twin.twin.rehearsal.result import Rehearsal
-    from puncture_twin.twin.rehearsal.standing import Scale
+    from puncture_twin.twin.rehearsal.result import Rehearsal, Scale
 
 
 def get_ready() -> None:

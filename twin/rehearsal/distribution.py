@@ -8,28 +8,32 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.budget.chain import bent_path
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.axis_lengths import axis_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.marker_noise import touches
 from puncture_twin.planning.registration.noise_test import NoiseTest
+from puncture_twin.planning.registration.residual_test import INTERVAL
 from puncture_twin.planning.registration.touch_noise import reading_noise
-from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
-from puncture_twin.planning.uncertainty.chance_model import chance_model
-from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE
-from puncture_twin.planning.uncertainty.limits import demanding
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, refined_chances
+from puncture_twin.planning.uncertainty.chances import demanding
+from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
-from puncture_twin.planning.uncertainty.refined_chances import refined_chances
-from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, not_modelled
+from puncture_twin.planning.uncertainty.sources import not_modelled
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
-REGION = 0.95
+MET_MM = 1e-6
+"""Of an axis from a surface that it meets."""
+
 ALLOWED = "a case with [errors] and markers, which say what a room may differ by"
 
 
@@ -74,8 +78,8 @@ class Distribution:
         wrong_belief: Whether the truth was drawn from other errors than the belief declares, on purpose.
         budget: Where the predicted error comes from.
         guessed_touches: Whether nobody says how the arm touched the markers, so that a posture was assumed.
-        physics: Some of the rooms in the simulator, where that was wanted.
         not_modelled: What neither the rooms nor the chances hold.
+        physics: Some of the rooms in the simulator, where that was wanted.
     """
 
     seed: int
@@ -92,8 +96,8 @@ class Distribution:
     wrong_belief: bool
     budget: ErrorBudget
     guessed_touches: bool
+    not_modelled: str
     physics: PhysicsRooms | None = None
-    not_modelled: str = NOT_MODELLED
 
     def __len__(self) -> int:
         return len(self.rooms.tip_ct)
@@ -140,7 +144,7 @@ class Distribution:
             "wrong_belief": self.wrong_belief,
             "guessed_touches": self.guessed_touches,
             **({} if self.puncture.bend is None else {"deflection_mm": self.puncture.bend.tip_mm}),
-            **({} if self.not_modelled == NOT_MODELLED else {"not_modelled": self.not_modelled}),
+            "not_modelled": self.not_modelled,
             **({} if self.physics is None else {"physics": self.physics.summary()}),
         }
 
@@ -165,8 +169,10 @@ def rehearse_rooms(
         InputError: The case declares no errors, or has no markers.
     """
     query = _query(context, outward_ct, q_insertion)
-    rooms = draw_rooms(query.puncture, query.truth, count, np.random.default_rng(seed))
-    return _measured(context, query.believed, query.puncture, rooms, seed, query.guessed)
+    rng = np.random.default_rng(seed)
+    rooms = draw_rooms(query.puncture, query.truth, count, rng)
+    off = rng.normal(size=(count, len(context.anatomy.checked)))[rooms.reached]
+    return _measured(context, query, rooms, off, seed)
 
 
 def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: int) -> Floats:
@@ -213,15 +219,8 @@ def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
         context: Of a case.
         outward_ct: Shape (3,), unit, from the target along the needle.
     """
-    case, anatomy = context.case, context.anatomy
-    if case.bending is None:
-        return None
-    paths = skin_paths(anatomy.skin, case.target_ct, outward_ct[None], case.needle.length_mm)
-    length = float(paths.path_length[0])
-    if not np.isfinite(length):
-        return None
-    insertion = insertion_along(case.bending, anatomy, case.target_ct, outward_ct, length)
-    return Bend(insertion.tip_mm, case.bending.shaft.length_mm)
+    path = bent_path(context.case, context.anatomy, outward_ct)
+    return None if path is None else path.bend
 
 
 def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
@@ -232,16 +231,17 @@ def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
     return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
 
 
-def _measured(
-    context: CaseContext, believed: PoseError, puncture: Puncture, rooms: Rooms, seed: int, guessed: bool
-) -> Distribution:
-    case, q = context.case, puncture.q_insertion[None]
+def _measured(context: CaseContext, query: _Query, rooms: Rooms, off: Floats, seed: int) -> Distribution:
+    """What happened; ``off`` has a normal number for the surface of each structure in each room that is reached."""
+    case, believed, puncture = context.case, query.believed, query.puncture
+    q = puncture.q_insertion[None]
     unreached = int((~rooms.reached).sum())
     rooms = rooms.reached_alone()
     cov_ct, error_ct = believed.tip_covariance_ct(q)[0], rooms.tip_ct - rooms.target_ct
     model = chance_model(case, context.anatomy, context.engine, believed)
     assert model is not None
     chances = refined_chances(model, puncture.outward_ct[None], q, model.chances(puncture.outward_ct[None], q))
+    off_mm = off * _surfaces(model, puncture, query.truth)
     inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
     return Distribution(
@@ -250,29 +250,55 @@ def _measured(
         puncture=puncture,
         rooms=rooms,
         cov_ct=cov_ct,
-        in_region=square <= chdtri(3, 1 - REGION),
-        hit=_hits(context, rooms),
+        in_region=square <= chdtri(3, 1 - INTERVAL),
+        hit=_hits(context, rooms, off_mm),
         p_hit=float(chances.hit[0]),
         structures=chances.structures,
-        touched=_touches(context, puncture, rooms),
+        touched=_touches(context, puncture, rooms, off_mm),
         p_touch=chances.touch[0],
         wrong_belief=case.truth_errors is not None,
         budget=error_budget(believed, q[0], puncture.T_base_ct[:3, :3] @ puncture.outward_ct),
-        guessed_touches=guessed,
-        not_modelled=not_modelled(case, bent=puncture.bend is not None),
+        guessed_touches=query.guessed,
+        not_modelled=not_modelled(case, counted=() if puncture.bend is None else ("bending",)),
     )
 
 
-def _hits(context: CaseContext, rooms: Rooms) -> Bools:
-    """Within the radius of the true target, or in the mesh, which comes from the target's own scan."""
+def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:
+    """By what each structure's surface may lie off as a whole where the needle passes it; the target's anywhere; mm."""
+    checked = model.anatomy.checked
+    axes = model.engine.measure(puncture.target_ct, puncture.outward_ct[None], axis_lengths(model.case, checked))
+    normals = normals_of(model.engine.triangles, puncture.target_ct, puncture.outward_ct[None], axes)[0]
+    covs = [truth.surface_cov_ct(one.voxel_ct) for one in checked]
+    passed = np.nan_to_num(np.sqrt(np.einsum("ka,kab,kb->k", normals, np.array(covs), normals)))
+    column = _target_column(model.anatomy, model.case)
+    passed[column] = mean_over_faces(checked[column].mesh, covs[column])
+    return np.asarray(passed)
+
+
+def _hits(context: CaseContext, rooms: Rooms, off_mm: Floats) -> Bools:
+    """Within the radius of the true target, or in the mesh, which comes from the target's own scan and may lie off."""
     case = context.case
     if case.hit_radius_mm is not None:
         return np.asarray(np.linalg.norm(rooms.tip_ct - rooms.target_ct, axis=1) < case.hit_radius_mm)
-    return inside_each(context.anatomy.structure(case.target_structure).mesh, rooms.tip_ct)
+    mesh, off = context.anatomy.structure(case.target_structure).mesh, off_mm[:, _target_column(context.anatomy, case)]
+    hit = inside_each(mesh, rooms.tip_ct)
+    shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1)
+    for row in np.flatnonzero((off != 0) & (surface_distance(mesh, case.target_ct) - shift <= abs(off))):
+        if surface_distance(mesh, rooms.tip_ct[row]) <= abs(off[row]):
+            hit[row] = off[row] > 0
+    return hit
 
 
-def _touches(context: CaseContext, puncture: Puncture, rooms: Rooms) -> Bools:
-    """Which structures each room's needle touches, shape (n, k), by FCL's capsule where a bound does not exclude it."""
+def _target_column(anatomy: Anatomy, case: Case) -> int:
+    return [one.name for one in anatomy.checked].index(case.target_structure)
+
+
+def _touches(context: CaseContext, puncture: Puncture, rooms: Rooms, off_mm: Floats) -> Bools:
+    """Which structures each room's needle touches, shape (n, k), by FCL's capsule where a bound does not exclude it.
+
+    A surface that lies farther out is touched from farther; one that lies deeper than the needle is thick is touched
+    where the axis meets it as it was drawn, as in `line_chance`.
+    """
     case, checked = context.case, context.anatomy.checked
     columns, lengths = demanding(checked), axis_lengths(context.case, checked)
     distance = context.engine.measure(case.target_ct, puncture.outward_ct[None], lengths).distance[0]
@@ -280,9 +306,9 @@ def _touches(context: CaseContext, puncture: Puncture, rooms: Rooms) -> Bools:
     turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1)
     touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):
-        length, radius = float(lengths[column]), case.needle.radius_mm
+        length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], MET_MM)
         for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):
             touched[row, place] = context.engine.collides(
-                int(column), rooms.tip_ct[row], rooms.outward_ct[row], length, radius
+                int(column), rooms.tip_ct[row], rooms.outward_ct[row], length, float(radius[row])
             )
     return touched

@@ -22,6 +22,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.bending.insertion import insertion_along
+from puncture_twin.planning.sweep.sweep_plan import SweepPlan
 from puncture_twin.twin.plant.felt import Felt
 from puncture_twin.twin.plant.true_tissue import StraightPath, TrueTissue
 from puncture_twin.twin.plant.truth import Truth
@@ -31,7 +32,7 @@ from puncture_twin.twin.world.execution import Execution, execute, joined
 from puncture_twin.twin.world.workcell import open_workcell
 
 SETTLE_S = 0.5
-"""Pause between approach and insertion: ten times the time in which a motor's lag dies out."""
+"""Pause between approach and insertion, and about a sweep: ten times the time in which a motor's lag dies out."""
 
 DWELL_S = 1.0
 """Pause at the end, before the tip is measured."""
@@ -107,3 +108,41 @@ def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueT
     path = StraightPath(apply(truth.T_base_ct_true, end_ct + length * outward_ct), into_base)
     along = insertion_along(case.bending, anatomy, end_ct, outward_ct, length)
     return TrueTissue(along, path, truth.bevel_side, case.bending.shaft.length_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """What was measured of the sweep, its approach left out; m records.
+
+    Attributes:
+        times_s: Shape (m,).
+        off_mm: Shape (m,): of the virtual TCP from its point.
+        contacts: Bodies that touched, such as ("forearm", "patient").
+    """
+
+    times_s: Floats
+    off_mm: Floats
+    contacts: tuple[tuple[str, str], ...]
+
+
+def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floats) -> Swept:
+    """Sweep in the workcell as it is believed: what is measured is control, by `[rehearsal] control` of the case.
+
+    Args:
+        plan: The motion.
+        case: For tool, boxes, gravity and control.
+        anatomy: For the skin.
+        T_base_ct: Shape (4, 4), mm: where the patient lies.
+    """
+    tool, down_ct, still = case_tool(case), -bed_frame(case)[:3, 2], np.zeros(6)
+    approach = steps(plan.approach)
+    pause = np.repeat(approach[-1:], round(SETTLE_S / TIME_STEP_S), axis=0)
+    before = np.concatenate([approach, pause])
+    with open_workcell(
+        plan.model, tool, anatomy.skin.mesh, T_base_ct, case_boxes(case, T_base_ct), down_ct=down_ct
+    ) as room:
+        first = execute(room, before, still)
+        motion = Insertion(plan.model, tool, T_base_ct[:3, :3] @ down_ct, plan.sweep, SETTLE_S)
+        done = insert(room, motion, case.rehearsal.control, still, start_s=len(before) * TIME_STEP_S).execution
+    contacts = tuple(dict.fromkeys((one.link, one.body) for one in (*first.touches, *done.touches)))
+    return Swept(done.times_s, plan.off_point_mm(done.T_base_flange), contacts)

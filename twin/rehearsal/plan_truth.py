@@ -25,8 +25,8 @@ from puncture_twin.planning.uncertainty.pose_error import pose_error
 from puncture_twin.twin.plant.true_needle import TrueNeedle
 from puncture_twin.twin.plant.truth import Truth, draw_truth
 from puncture_twin.twin.rehearsal.distribution import Distribution, bend_along, rehearse_rooms
+from puncture_twin.twin.rehearsal.result import PredictedScale, RoomScale, Scale
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, bent
-from puncture_twin.twin.rehearsal.standing import PredictedScale, RoomScale, Scale
 
 TRIED = 16
 """Rooms that are drawn for one: the arm may not reach the pose that a room's registration asks for."""

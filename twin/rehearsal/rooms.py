@@ -88,16 +88,7 @@ class Rooms(NamedTuple):
 
     def of(self, rows: Bools | Ints) -> Rooms:
         """Some of the rooms."""
-        return Rooms(
-            self.tip_ct[rows],
-            self.outward_ct[rows],
-            self.target_ct[rows],
-            self.T_base_ct[rows],
-            self.reached[rows],
-            self.R_ct_needle[rows],
-            self.chi_squared[rows],
-            self.bevel_side[rows],
-        )
+        return Rooms._make(column[rows] for column in self)
 
     def reached_alone(self) -> Rooms:
         """Without the rooms in which the arm did not reach the pose."""

@@ -1,33 +1,324 @@
-"""Planned touches executed in the simulator: marker after marker, and home; one that fails does not end the tour."""
+"""Planned touches executed in the simulator: marker after marker, and home; one that fails does not end the tour.
+
+The declared errors of arm and markers are in where each marker is met: the simulated arm is the nominal one, so a pad
+stands on its line where the erring arm's tip would be on the true marker. At the standoff somebody sets the needle's
+line onto the marker by eye; how deep it is, the arm feels. The tip is a point: the pad is square to the needle.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.surroundings import case_boxes
 from puncture_twin.planning.collision.workcell import case_tool, patient_surface
-from puncture_twin.planning.touch.straight_approach import ApproachCheckers
-from puncture_twin.planning.touch.touch_plan import TouchTour
-from puncture_twin.twin.plant.touch_truth import TouchTruth
-from puncture_twin.twin.rehearsal.one_touch import (
-    FailedTouch,
-    StoppedError,
-    TouchingCell,
-    TouchReading,
-    moved_outside,
-    seconds_of,
-    touch_marker,
+from puncture_twin.planning.geometry.frames import frame_about
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.motion.follow import follow_smoothly
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.touch.straight_approach import (
+    PAST_MM,
+    SLOW_MM,
+    STANDOFF_MM,
+    ApproachCheckers,
+    line_to,
+    why_not,
 )
-from puncture_twin.twin.world.control.rigid_model import rigid_model
-from puncture_twin.twin.world.workcell import open_workcell
+from puncture_twin.planning.touch.touch_plan import Touch, TouchTour
+from puncture_twin.twin.plant.touch_truth import TouchTruth, nominal_tip
+from puncture_twin.twin.world.bodies import load_box, remove, soften
+from puncture_twin.twin.world.contacts import touches
+from puncture_twin.twin.world.control.gains import Stiffness, allowed_step
+from puncture_twin.twin.world.control.impedance import Impedance
+from puncture_twin.twin.world.control.reference import reference_of
+from puncture_twin.twin.world.control.rigid_model import RigidModel, rigid_model
+from puncture_twin.twin.world.control.run import Controller, Measured, Motors, Run, Surroundings, run
+from puncture_twin.twin.world.control.tip import tips
+from puncture_twin.twin.world.units import to_m
+from puncture_twin.twin.world.workcell import SimulatedWorkcell, open_workcell
+
+TOUCH_SPEED_MM_S = 2.0
+"""Of the last millimetres."""
+
+NEAR_SPEED_MM_S = 25.0
+"""Of the straight line before them, and back."""
+
+FELT_N = 0.5
+"""A force along the needle above which the marker is felt."""
+
+FELT_STEPS = 3
+"""In a row: a sensor's noise alone does not reach it so often."""
+
+FORCE_NOISE_N = 0.1
+"""Standard deviation of the force sensor, per reading."""
+
+SPRING = Stiffness(translation_n_m=1e3, rotation_nm_rad=100.0, integral_per_s=5.0)
+"""Of the tip while it feels for a marker. The integral, which stands still in contact, takes away what the arm's masses
+err by: with a tenth of them wrong the tip would come down .6 mm aside."""
+
+PAD_N_M = 1e5
+"""Stiffness of a marker on skin; a rigid one's first peak would be momentum over the time step."""
+
+PAD_MM = (12.0, 12.0, 4.0)
+MOST_ASIDE_MM = 10.0
+"""A marker that lies farther beside its believed place is not the one that was planned to be touched."""
+
+LOOK_EVERY = 8
+"""Steps of the motors between two looks at where the needle is: 30 a second."""
+
+PAUSE_S = 0.25
+"""Before motors and torques take over from one another."""
+
+
+class TouchReading(NamedTuple):
+    """One executed touch."""
+
+    name: str
+    point_base: Floats
+    """Shape (3,), mm: what the controller computes from its joints."""
+    q: Floats
+    """Shape (6,), rad: its joints."""
+    seconds: float
+    """From the last standoff (or home) to this one after the touch."""
+    force_n: float
+    """The largest on the needle."""
+    bias_mm: float
+    """How deep in the marker the tip was when the joints were read."""
+    speed_mm_s: float
+    """Of the tip when it was felt."""
+    aside_mm: float
+    """By how much the line was moved at the standoff."""
+
+
+class FailedTouch(NamedTuple):
+    """A marker that was not read, the arm back at its standoff: why, and what it took."""
+
+    why: str
+    seconds: float
+
+
+class StoppedError(Exception):
+    """The arm stopped where no plan led it on: something is not where it is believed to be."""
+
+
+@dataclass(frozen=True, eq=False)
+class TouchingCell:
+    """What every touch uses.
+
+    Attributes:
+        room: The simulated workcell.
+        rigid: The arm's masses as its controller knows them.
+        tour: The touches.
+        truth: Where everything truly is.
+        checkers: Of the workcell as it is believed.
+        true: Of the needle against the patient where they truly lie.
+        rng: Of the force sensor's noise.
+    """
+
+    room: SimulatedWorkcell
+    rigid: RigidModel
+    tour: TouchTour
+    truth: TouchTruth
+    checkers: ApproachCheckers
+    true: CellChecker
+    rng: np.random.Generator
+
+
+class _Line(NamedTuple):
+    """The straight line to a marker as it was set at the standoff."""
+
+    far: Floats
+    """Shape (m, 6), rad: from the standoff to where the slow part begins."""
+    near: Floats
+    """Shape (k, 6): from there past the believed marker."""
+    face_base: Floats
+    """Shape (3,), mm: where the simulated tip meets the marker."""
+    axis_base: Floats
+    """Shape (3,), unit, toward the tip."""
+    aside_mm: float
+
+
+def _line(cell: TouchingCell, touch: Touch) -> _Line | str:
+    """The line through the true marker, from where it is believed along the needle, or in words why there is none."""
+    model, tip_mm = cell.tour.model, cell.tour.tip_mm
+    q = cell.truth.q_contact(model, tip_mm, touch)
+    axis = flange_pose(model, q)[:3, 2]
+    away = nominal_tip(model, tip_mm, q) - touch.point_base
+    deeper = float(away @ axis)
+    aside = float(np.linalg.norm(away - deeper * axis))
+    if aside > MOST_ASIDE_MM:
+        return f"it lies {aside:.1f} mm beside where it was believed, at most {MOST_ASIDE_MM:g} are allowed"
+    far = line_to(model, tip_mm, q, STANDOFF_MM + deeper, SLOW_MM + deeper)
+    near = line_to(model, tip_mm, q, SLOW_MM + deeper, deeper - PAST_MM)
+    reached = line_to(model, tip_mm, q, deeper, deeper + 1.0)
+    if far is None or near is None or reached is None:
+        return "the arm cannot follow the line that was set at the standoff"
+    refused = why_not(cell.checkers, tip_mm, reached[0])
+    if refused:
+        return f"on the line that was set at the standoff {refused}"
+    face = nominal_tip(model, tip_mm, q + cell.truth.arrival[touch.name])
+    return _Line(far, near, face, flange_pose(model, q + cell.truth.arrival[touch.name])[:3, 2], aside)
+
+
+def touch_marker(cell: TouchingCell, touch: Touch) -> TouchReading | FailedTouch:
+    """One marker: come, set the line, feel, read, go back to the standoff.
+
+    Args:
+        cell: The workcell, the arm at the last standoff or at home.
+        touch: As planned.
+
+    Raises:
+        StoppedError: The arm touched what it should not.
+    """
+    line = _line(cell, touch)
+    if isinstance(line, str):
+        return FailedTouch(line, seconds_of(moved_outside(cell, touch.come, cell.truth.arrival[touch.name])))
+    pad = _pad(cell, line)
+    try:
+        return _felt_and_read(cell, touch, line)
+    finally:
+        remove(cell.room.client, pad)
+
+
+def _felt_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchReading | FailedTouch:
+    arrival = cell.truth.arrival[touch.name]
+    come = moved_outside(cell, touch.come, arrival)
+    to_near = _slow(cell, np.vstack([touch.come.q[-1:], line.far]))
+    there = _run(cell, Motors(), to_near, arrival, _Contact(cell, line), PAUSE_S)
+    if there.stopped:
+        back = _moved(cell, _back(cell, touch, line, there.q[-1]), arrival)
+        why = f"it was felt more than {SLOW_MM:g} mm before where it was believed, and given up"
+        return FailedTouch(why, sum(map(seconds_of, (come, there, back))))
+    felt = _felt(cell, line, arrival)
+    q = felt.q[-1]
+    back = _moved(cell, _back(cell, touch, line, q), arrival)
+    seconds = sum(map(seconds_of, (come, there, felt, back)))
+    if not felt.stopped:
+        return FailedTouch(f"no contact: the tip went {PAST_MM:g} mm past where it was believed and came back", seconds)
+    depth = float((1e3 * felt.tip_m[-1] - line.face_base) @ line.axis_base)
+    moved = 1e3 * np.linalg.norm(felt.tip_m[-1] - felt.tip_m[-2]) / felt.dt if len(felt.tip_m) > 1 else 0.0
+    force = max(float(np.linalg.norm(one.force_n, axis=1).max()) for one in (there, felt, back))
+    point = nominal_tip(cell.tour.model, cell.tour.tip_mm, q)
+    return TouchReading(touch.name, point, q, seconds, force, depth, float(moved), line.aside_mm)
+
+
+def _back(cell: TouchingCell, touch: Touch, line: _Line, q: Floats) -> Trajectory:
+    """From a configuration (6,), rad, on the line, along it, to the standoff."""
+    rows = np.vstack([line.far, line.near])
+    passed = _tip_mm(cell, rows) @ line.axis_base < _tip_mm(cell, q[None])[0] @ line.axis_base - PASSED_MM
+    return _slow(cell, np.vstack([q[None], rows[passed][::-1], touch.come.q[-1:]]))
+
+
+PASSED_MM = 0.1
+"""Rows of the line nearer to the tip than this are not gone back to: where it stands, it stands."""
+
+
+def _pad(cell: TouchingCell, line: _Line) -> int:
+    """The marker's body, its face square to the needle."""
+    centre = line.face_base + PAD_MM[2] / 2 * line.axis_base
+    pad = load_box(cell.room.client, np.array(PAD_MM), pose(frame_about(line.axis_base), centre))
+    soften(cell.room.client, pad, PAD_N_M)
+    return pad
+
+
+def _felt(cell: TouchingCell, line: _Line, arrival: Floats) -> Run:
+    """The last millimetres under a spring at the tip, until contact is felt or the line ends."""
+    J = tips(cell.tour.model, cell.rigid.tip_m, line.near[:1]).J[0]
+    dt = allowed_step(SPRING, J, cell.rigid.mass_matrix(line.near[0]))
+    controller = Impedance(cell.rigid, SPRING, dt)
+    trajectory = _slow(cell, line.near, TOUCH_SPEED_MM_S)
+    return _run(cell, controller, trajectory, arrival, _Contact(cell, line))
+
+
+class _Contact:
+    """Says when the marker is felt: a force along the needle, some readings in a row."""
+
+    def __init__(self, cell: TouchingCell, line: _Line) -> None:
+        self._rng, self._axis, self._in_a_row = cell.rng, line.axis_base, 0
+
+    def __call__(self, measured: Measured) -> bool:
+        pressed = -float(measured.force_n @ self._axis) + self._rng.normal(0.0, FORCE_NOISE_N)
+        self._in_a_row = self._in_a_row + 1 if pressed > FELT_N else 0
+        return self._in_a_row >= FELT_STEPS
+
+
+def _slow(cell: TouchingCell, q: Floats, speed_mm_s: float = NEAR_SPEED_MM_S) -> Trajectory:
+    """A smooth motion through configurations (m, 6), its tip at most so fast."""
+    steps = np.linalg.norm(np.diff(_tip_mm(cell, q), axis=0), axis=1)
+    kept = np.concatenate([[True], steps > SAME_PLACE_MM])
+    depths = np.concatenate([[0.0], np.cumsum(steps[kept[1:]])])
+    return follow_smoothly(cell.tour.model, q[kept], depths, max_tip_speed_mm_s=speed_mm_s)
+
+
+SAME_PLACE_MM = 1e-4
+"""Rows whose tips are nearer to each other are one."""
+
+
+def _tip_mm(cell: TouchingCell, q: Floats) -> Floats:
+    return 1e3 * tips(cell.tour.model, float(to_m(cell.tour.tip_mm)), q).position_m
+
+
+def _moved(cell: TouchingCell, trajectory: Trajectory, arrival: Floats) -> Run:
+    """A motion by the position motors."""
+    return _run(cell, Motors(), trajectory, arrival, None)
+
+
+def moved_outside(cell: TouchingCell, trajectory: Trajectory, arrival: Floats) -> Run:
+    """A motion by the motors on which the needle must stay out of the patient; the physics lets it pass their skin.
+
+    Args:
+        cell: The workcell.
+        trajectory: From where the arm is.
+        arrival: Shape (6,), rad: true joints minus what the encoders say.
+
+    Raises:
+        StoppedError: It did not.
+    """
+    done = _moved(cell, trajectory, arrival)
+    found = cell.true.first_contact(done.q[::LOOK_EVERY] + arrival, needle_may_touch_patient=False)
+    if found is not None:
+        what = f"{found.contact.body} touched {found.contact.other}"
+        raise StoppedError(f"on the way {what}, who does not lie where they are believed to")
+    return done
+
+
+def _run(
+    cell: TouchingCell,
+    controller: Controller,
+    trajectory: Trajectory,
+    arrival: Floats,
+    stop: Callable[[Measured], bool] | None,
+    pause_s: float = 0.0,
+) -> Run:
+    reference = reference_of(cell.tour.model, cell.rigid.tip_m, trajectory, controller.dt, pause_s)
+    around = Surroundings(arrival, stop=stop, watch=lambda row: _refuse_contacts(cell))
+    return run(cell.room.arm, controller, reference, lambda q: tips(cell.tour.model, cell.rigid.tip_m, q[None]), around)
+
+
+def _refuse_contacts(cell: TouchingCell) -> None:
+    """Stop where the arm touches what it should not; the markers' pads have no name.
+
+    Raises:
+        StoppedError: It does.
+    """
+    for one in touches(cell.room.arm):
+        if one.body in cell.room.bodies:
+            raise StoppedError(f"{one.link} touches {cell.room.bodies[one.body]}")
+
+
+def seconds_of(done: Run) -> float:
+    """How long a motion took."""
+    return done.dt * len(done.q)
 
 
 @dataclass(frozen=True, eq=False)

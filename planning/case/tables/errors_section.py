@@ -32,7 +32,7 @@ class ErrorsSection(Section):
     joint_drift_deg: Degrees | None = None
     tip_offset_mm: Millimetres = 0.3
     needle_direction_deg: Degrees = 0.2
-    surface_mm: Millimetres = 0.0
+    surface_mm: Millimetres | None = None
 
     @model_validator(mode="after")
     def _cell_or_deviation(self) -> Self:

@@ -13,10 +13,12 @@ from scipy.special import chdtri
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.frames import frame_about
 from puncture_twin.planning.geometry.rotations import skew
-from puncture_twin.planning.uncertainty.lines.displaced_needle import FARTHEST
 
 Problem = tuple[Floats, Floats, Floats, Floats, Floats, float, float]
 """Faces near a needle and spheres around them, its start and direction, its length and the threshold."""
+
+FARTHEST = 5.0
+"""Standard deviations that a line is walked to either side; a stretch that is open there goes on for ever."""
 
 WIDEST = 4.0
 """Standard deviations across which a line may lie: what lies beyond has a chance of .003 and less to matter."""
@@ -33,7 +35,7 @@ class NeedleDoubt:
         origin: Shape (3,), the tip's own place, where the axis starts.
         outward: Shape (3,), unit.
         root: Shape (6, 5), B: shift and lean of each of five standard normals.
-        surface_mm: Standard deviation of a structure's surface as a whole.
+        surface_mm: Standard deviation of the surface, as a whole, of the structure that is asked about.
         freedom: Degrees of the errors' size where the residuals gave it.
     """
 

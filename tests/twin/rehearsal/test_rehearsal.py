@@ -38,8 +38,8 @@ from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.distribution import bend_along
 from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, plan_truth, spread_rows
 from puncture_twin.twin.rehearsal.rehearsal import rehearse, split_error
+from puncture_twin.twin.rehearsal.result import Standing, ordinal
 from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
-from puncture_twin.twin.rehearsal.standing import Standing, ordinal
 
 UR3 = ur_model("ur3")
 APART_MM = 0.003

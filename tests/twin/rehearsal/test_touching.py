@@ -34,9 +34,8 @@ from puncture_twin.twin.jobs.experiment import touch_job
 from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
 from puncture_twin.twin.plant.touch_truth import TouchTruth, nominal_tip
 from puncture_twin.twin.rehearsal import touching
-from puncture_twin.twin.rehearsal.one_touch import TouchReading
-from puncture_twin.twin.rehearsal.touched_puncture import rehearse_touched
-from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
+from puncture_twin.twin.rehearsal.in_physics import rehearse_touched
+from puncture_twin.twin.rehearsal.touching import Touched, TouchReading, execute_touches
 from puncture_twin.twin.world.engine import pybullet
 from puncture_twin.twin.world.workcell import open_workcell
 

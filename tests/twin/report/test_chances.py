@@ -23,13 +23,13 @@ from puncture_twin.twin.report.rooms_picture import draw_rooms_picture, needle_f
 BUDGET = ErrorBudget(1.0, 0.8, 0.6, np.array([1.9, 1.5, 1.2]), {"touch": 0.75, "ct_slice": 0.25})
 DOUBT = Doubt(
     0.93, {"rib_right_9": 0.02}, 0.02, BUDGET, "residuals agree with the declared errors",
-    (Goal("", 0.99, False, (Remedy("touch", 0.35, 0.1),), 0.6),),
+    (Goal("", 0.99, False, (Remedy("touch", 0.35, 0.1),), 0.6),), "breathing, a needle that bends, tissue that moves",
 )  # fmt: skip
 ROOMS = {
     "rooms": 1000, "seed": 7, "unreached": 3, "realised_rms_mm": 1.01, "predicted_rms_mm": 1.0, "coverage_95": 0.947,
     "hit_share": 0.93, "mean_p_hit": 0.931, "touch_share": 0.02, "mean_p_touch": 0.021, "wrong_belief": True,
     "touch_share_by_structure": {"rib_right_9": 0.02}, "p_touch_by_structure": {"rib_right_9": 0.021},
-    "guessed_touches": True,
+    "guessed_touches": True, "not_modelled": "breathing, a needle that bends, tissue that moves",
 }  # fmt: skip
 
 TOLD = (
@@ -53,7 +53,9 @@ def shown():
     touch = np.where(found.safe, np.exp(-found.clearance.least / 3), np.nan)
     blank = np.where(found.safe, 0.93, np.nan)
     wide = np.stack([touch, np.zeros(len(found))], axis=1)
-    chances = Chances(found.clearance.structures, blank, wide, wide, touch, touch, blank, blank)
+    chances = Chances(
+        found.clearance.structures, blank, wide, wide, touch, touch, blank, blank, np.ones(len(found), bool)
+    )
     return case, replace(found, chances=chances)
 
 

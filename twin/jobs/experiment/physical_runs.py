@@ -22,8 +22,8 @@ from puncture_twin.planning.search.selection.choice import BEST
 from puncture_twin.planning.touch.puncture import plan_puncture
 from puncture_twin.twin.jobs.experiment.drawn_runs import DrawnRuns, drawn_runs
 from puncture_twin.twin.jobs.experiment.touch_job import Tour, plan_tour, touch_once, true_at_target, true_touches
+from puncture_twin.twin.rehearsal.in_physics import rehearse_touched
 from puncture_twin.twin.rehearsal.result import Rehearsal
-from puncture_twin.twin.rehearsal.touched_puncture import rehearse_touched
 
 FOLDER = "runs"
 

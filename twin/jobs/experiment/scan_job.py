@@ -144,11 +144,11 @@ class ScanRun:
 
 
 def theory(settings: ScanSettings) -> dict[str, float]:
-    """Standard deviations of a reading, mm: of the rule uniform in its cell, of the metal's middle the demand."""
+    """Standard deviations of a reading, mm: of the rule uniform in its cell, of the metal's middle as held to."""
     return {
         "rule_along_bed": settings.spacing_mm / np.sqrt(12),
         "rule_in_plane": READING_MM / np.sqrt(12),
-        "along_bed_at_most": SUB_VOXEL_SD * settings.spacing_mm,
+        "middle_along_bed": SUB_VOXEL_SD * settings.spacing_mm,
     }
 
 

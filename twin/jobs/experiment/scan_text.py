@@ -44,7 +44,7 @@ def _marker_lines(facts: dict[str, Any]) -> list[str]:
     return [
         *lines,
         f"  {'rms':<15}{_vector(rms[0])}    {_vector(rms[1])}",
-        f"  expected       {expected}; at most {theory['along_bed_at_most']:.2f} along the bed",
+        f"  standard dev.  {expected}; the middle of the metal is held to {theory['middle_along_bed']:.2f} there",
     ]
 
 

@@ -19,7 +19,7 @@ from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.planning.sweep.sweep_plan import SweepPlan
 from puncture_twin.planning.sweep.sweep_planner import plan_sweep
 from puncture_twin.twin.jobs.experiment.result_file import write_result
-from puncture_twin.twin.rehearsal.sweeping import Swept, execute_sweep
+from puncture_twin.twin.rehearsal.executed import Swept, execute_sweep
 
 SWEEP = "sweep.json"
 

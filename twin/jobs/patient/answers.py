@@ -35,6 +35,7 @@ from puncture_twin.planning.registration.fits.method import LEAST_FOUND_MM
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.registration import Registration, register
+from puncture_twin.planning.registration.residual_test import INTERVAL
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
@@ -45,6 +46,7 @@ from puncture_twin.planning.search.selection.choice import (
     refuse_other_entry,
     with_file_read,
 )
+from puncture_twin.planning.uncertainty.hit import radius_that_holds
 from puncture_twin.twin.jobs.patient.budget import budget_facts
 from puncture_twin.twin.jobs.patient.correction import correction_facts
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
@@ -98,6 +100,8 @@ def registration_report(path: Path) -> dict[str, Any]:
     report["inputs"] = inputs_document(case.inputs)
     report["expected_tre_target_mm"] = placement.target_error_mm
     report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(case.target_ct))
+    read = None if case.errors is None else case.errors.target_cov_ct
+    report |= one_insertion(registration, case.target_ct, read)
     report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
     report["warnings"] = [*case.warnings, *checked.findings.warnings, *_branch_warning(case, registration)]
     report["squareness"] = _squareness(check_squareness(registration, case.target_ct))
@@ -123,7 +127,7 @@ def lists_report(
     target_ct = to_lps(np.array([numbers]), space)[0]
     pairs = match(*read, use=None, where=f"{markers_ct}, {markers_base}")
     stated = {"method": "rigid", "target_ct": target_ct, "where": str(markers_base)}
-    noise = _noise_of_lists(pairs, fle_mm)
+    noise = noise_of_lists(pairs, fle_mm)
     given = {"fle_mm": fle_mm} if noise is None else {"noise": noise, "noise_found": fle_mm is None}
     registration = register(pairs, **stated, **given)
     report = registration_summary(registration)
@@ -135,6 +139,7 @@ def lists_report(
     )
     report["expected_tre_target_mm"] = float(registration.expected_tre_mm(target_ct[None])[0])
     report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(target_ct))
+    report |= one_insertion(registration, target_ct, None)
     report["expected_tre_along_shaft_mm"] = []
     report["squareness"] = _squareness(check_squareness(registration, target_ct))
     report |= _advice_of_lists(registration, target_ct, space)
@@ -143,7 +148,24 @@ def lists_report(
     return report
 
 
-def _noise_of_lists(pairs: MarkerPairs, fle_mm: float | None) -> ReadingNoise | None:
+def one_insertion(registration: Registration, target_ct: Floats, read_cov_ct: Floats | None) -> dict[str, Any]:
+    """Within which of its true place a target is sent to in 95 of 100 registrations, its own reading in it.
+
+    Args:
+        registration: Of the markers.
+        target_ct: Shape (3,), mm.
+        read_cov_ct: Of the target's reading, as declared; None where it is read as a marker is, in both lists.
+    """
+    cov, R = registration.tre_covariance(target_ct), registration.T_base_ct[:3, :3]
+    read, how = registration.fle_mm**2 / 3.0 * np.eye(3), "like a marker, in both lists"
+    if read_cov_ct is not None:
+        scale = 1.0 if registration.uncertainty is None else registration.uncertainty.test.scale
+        read, how = scale**2 * R @ read_cov_ct @ R.T, "as declared (target_mm)"
+    limit = radius_that_holds(cov + read, INTERVAL, registration.freedom)
+    return {"one_insertion_95_mm": limit, "target_read": how}
+
+
+def noise_of_lists(pairs: MarkerPairs, fle_mm: float | None) -> ReadingNoise | None:
     """Equal in all axes, of both lists together, stated or to be found; None where they agree to rounding."""
     if fle_mm is None and rigid_fre_mm(pairs.points_ct, pairs.points_base) < LEAST_FOUND_MM:
         return None

@@ -10,15 +10,16 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.budget.bent_path import bent_path
-from puncture_twin.planning.budget.chain import Chain, chain_of
+from puncture_twin.planning.budget.chain import Chain, bent_path, chain_of
 from puncture_twin.planning.budget.what_if import Change, best_change, changes, source_costs
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.reached_insertion import reached_insertion
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
+from puncture_twin.planning.registration.residual_test import INTERVAL
+from puncture_twin.planning.uncertainty.hit import radius_that_holds
+from puncture_twin.planning.uncertainty.sources import SOURCES, not_modelled
 
 POLE = 1e-6
 """Puncture angle below which an azimuth says nothing, rad."""
@@ -56,6 +57,7 @@ def budget_facts(
     return {
         **needle_angles(case, registration, q),
         "expected_mm": chain.expected_mm(),
+        "limit_95_mm": radius_that_holds(chain.tip_mean_square(), INTERVAL, registration.freedom),
         **_across_and_along(chain),
         "sources": [
             {"text": SOURCES[one.source].text, "alone_mm": one.alone_mm, "without_mm": one.without_mm}
@@ -63,7 +65,7 @@ def budget_facts(
         ],
         "changes": [_change(case, one) for one in found],
         "best": _change(case, best),
-        "not_modelled": _not_modelled(chain),
+        "not_modelled": not_modelled(case, counted=_counted(chain)),
     }
 
 
@@ -76,11 +78,9 @@ def _across_and_along(chain: Chain) -> dict[str, float]:
     return {"expected_lateral_mm": float(np.sqrt(lateral)), "expected_depth_mm": float(np.sqrt(depth))}
 
 
-def _not_modelled(chain: Chain) -> str:
-    """What no source of this budget stands for."""
-    counted = (chain.breath is not None, chain.path is not None)
-    breath, bend, *others = NOT_MODELLED.split(", ")
-    return ", ".join([*(text for text, in_it in zip((breath, bend), counted, strict=True) if not in_it), *others])
+def _counted(chain: Chain) -> list[str]:
+    """What a budget counts beside the declared errors."""
+    return [name for name, one in (("breathing", chain.breath), ("bending", chain.path)) if one is not None]
 
 
 def _insertion(case: Case, registration: Registration) -> Floats | None:
@@ -123,8 +123,8 @@ def budget_lines(facts: dict[str, Any] | None) -> list[str]:
     parts = f"{facts['expected_lateral_mm']:.2f} across it and {facts['expected_depth_mm']:.2f} along it"
     at = f"theta {facts['theta_deg']:.0f}, beta {facts['beta_deg']:.0f}"
     lines = [
-        f"  expected tip error, markers and arm together, inserted at {at}: "
-        f"{now:.2f} mm (rms), {parts}; not modelled: {facts['not_modelled']}",
+        f"  expected tip error, markers and arm together, inserted at {at}: {now:.2f} mm (rms), {parts}; "
+        f"one of 20 insertions ends beyond {facts['limit_95_mm']:.2f} mm; not modelled: {facts['not_modelled']}",
         f"    {'source':34s} {'alone':>7s} {'all but it':>11s}",
     ]
     lines += [

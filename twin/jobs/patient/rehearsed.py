@@ -98,7 +98,7 @@ def _distribution(run: Run, count: RoomCount) -> Distribution:
         found = rehearse_rooms(context, run.plan.outward_ct, q, count.rooms, context.case.rehearsal.seed)
     if not (count.physics and len(found)):
         return found
-    from puncture_twin.twin.rehearsal.physics import physics_rooms
+    from puncture_twin.twin.rehearsal.in_physics import physics_rooms
 
     with context.stages.time("physics"):
         again = partial(context.watcher.count, "rooms in the simulator")

@@ -11,7 +11,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.explain import deep_text, needle_warnings, reason_text
-from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
+from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.jobs.patient.budget import budget_lines
 from puncture_twin.twin.jobs.patient.correction import correction_lines
 from puncture_twin.twin.jobs.patient.run import Run
@@ -164,7 +164,7 @@ def distribution_lines(rooms: dict[str, Any]) -> list[str]:
         *(missed if rooms["unreached"] else []),
         *(guessed if rooms["guessed_touches"] else []),
         *_physics(rooms.get("physics")),
-        f"  not modelled: {rooms.get('not_modelled', NOT_MODELLED)}",
+        f"  not modelled: {rooms['not_modelled']}",
     ]
 
 
@@ -236,7 +236,9 @@ def registration_text(report: dict[str, Any]) -> str:
         "  (the residuals are not the accuracy at the target)",
         f"  FLE {report['fle_mm']:.3f} mm, {report['fle_source']}{_interval(report['fle_interval_mm'])}",
         f"  expected TRE at the target {report['expected_tre_target_mm']:.3f} mm (rms), markers alone"
-        + _interval(report["expected_tre_target_interval_mm"]),
+        + _interval(report["expected_tre_target_interval_mm"], "of that rms, "),
+        f"  one insertion ends within {report['one_insertion_95_mm']:.3f} mm in 95 of 100, by the markers and by the "
+        f"target, read {report['target_read']}; arm, needle and tissue come on top",
         *_along_shaft(report["expected_tre_along_shaft_mm"]),
         f"  spread s2/s1 {report['spread_ratio']:.2f}, altitude {report['altitude_mm']:.0f} mm, "
         f"TRE/FLE {report['leverage']:.2f}",
@@ -274,10 +276,10 @@ def _declared_lines(report: dict[str, Any]) -> list[str]:
     return [*lines, *correction_lines(report.get("correction")), *budget_lines(report["budget"])]
 
 
-def _interval(bounds: Sequence[float]) -> str:
+def _interval(bounds: Sequence[float], of: str = "") -> str:
     """A 95 % interval; nothing where both bounds are one."""
     low, high = bounds
-    return "" if low == high else f" (95 %: {low:.3f} to {high:.3f})"
+    return "" if low == high else f" ({of}95 %: {low:.3f} to {high:.3f})"
 
 
 def _best(run: Run) -> list[str]:

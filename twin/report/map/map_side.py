@@ -197,4 +197,4 @@ def _chances(candidates: Candidates, row: int) -> str:
     if chances is None or not np.isfinite(chances.hit[row]):
         return ""
     hit, touch = chance_text(float(chances.hit[row])), chance_text(float(chances.touch_any[row]))
-    return f"; p(hit) {hit}, p(touch) {touch}"
+    return f"; p(hit) {hit}, p(touch) {touch}{'' if chances.refined[row] else ' to first order'}"

@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from puncture_twin.planning.search.doubt import Doubt, chance_text
-from puncture_twin.planning.uncertainty.sources import NOT_MODELLED, SOURCES
+from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import faint, listed, pairs, table, two
 from puncture_twin.twin.report.page.template import Card, data_address
@@ -89,7 +89,7 @@ def rooms_section(rooms: Mapping[str, Any] | None, picture: Path | None) -> Mark
     if picture is not None:
         form = '<p><img src="{}" style="max-width:100%" alt="Tips of all rooms in the frame of the needle"></p>'
         image = Markup(form).format(data_address(picture))
-    return shown + listed(_reserves(rooms)) + image + faint(f"Not modelled: {rooms.get('not_modelled', NOT_MODELLED)}.")
+    return shown + listed(_reserves(rooms)) + image + faint(f"Not modelled: {rooms['not_modelled']}.")
 
 
 def _reserves(rooms: Mapping[str, Any]) -> list[str]:

@@ -117,7 +117,8 @@ def _chances(candidates: Candidates) -> dict[str, Any]:
     found = candidates.chances
     if found is None:
         return {}
-    return {"p_hit": _rounded(found.hit, 9), "p_touch_any": _rounded(found.touch_any, 9)}
+    chances = {"p_hit": _rounded(found.hit, 9), "p_touch_any": _rounded(found.touch_any, 9)}
+    return {**chances, "touch_refined": found.refined.tolist()}
 
 
 def map_raster_rows(rows: Any) -> list[int]:

@@ -119,7 +119,7 @@
     }
     add("div", `path in the body ${shown(map.path[row], 1, "mm")}; skin angle ${shown(map.skin_angle[row], 0, "°")}`);
     if (map.p_hit && map.p_hit[row] !== null)
-      add("div", `chance to hit ${chanceWords(map.p_hit[row])}, to touch anything forbidden ${chanceWords(map.p_touch_any[row])}`);
+      add("div", `chance to hit ${chanceWords(map.p_hit[row])}, to touch anything forbidden ${chanceWords(map.p_touch_any[row])}${map.touch_refined[row] ? "" : ", to first order"}`);
     add("div", `arm: ${map.reachable[row] === 1 ? "can reach it" : map.reachable[row] === 0 ? "cannot reach it" : map.arm === "checked" ? "not computed, the organs reject it" : map.arm}`);
   }
   const surface = document.getElementById("map");

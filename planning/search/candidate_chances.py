@@ -1,0 +1,202 @@
+"""Chances of a search's candidates, and their refusal where a chance breaks the case's limit.
+
+To first order for all; by line sampling where a limit may decide, and where people are shown them, as `check` has them.
+For the best of them the chance to touch anything too, all structures linearised together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.arrays import Floats, Ints, Texts
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.clearance.engine import AxisDistances
+from puncture_twin.planning.search.candidates import Candidates, Verdict
+from puncture_twin.planning.search.ranking import ranked
+from puncture_twin.planning.search.selection.windows import find_windows
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances
+from puncture_twin.planning.uncertainty.chances import Chances, check_limits, demanding, touch_limit
+from puncture_twin.planning.uncertainty.touch import Proximity, touch_bound
+
+
+def with_chances(
+    case: Case,
+    anatomy: Anatomy,
+    found: Candidates,
+    model: ChanceModel | None,
+    axes: AxisDistances | None = None,
+) -> Candidates:
+    """Compute the chances of all candidates that geometry and reach left, and reject those beyond the case's limits.
+
+    Args:
+        case: Declares errors; else nothing is computed.
+        anatomy: Its structures.
+        found: Checked against organs and arm.
+        model: None where the pose's error is not known: the chances are blank.
+        axes: What the engine measured of the candidates; None measures those that are left again.
+
+    Raises:
+        InputError: A limit that nothing can be compared with.
+    """
+    if case.errors is None:
+        return found
+    check_limits(case, anatomy, model is not None)
+    names = tuple(anatomy.checked[column].name for column in demanding(anatomy.checked))
+    rows = np.flatnonzero(found.safe & np.isfinite(found.arm.q_insertion).all(axis=1))
+    chances = Chances.unknown(names, len(found))
+    if model is None or not len(rows):
+        return replace(found, chances=chances)
+    for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
+        measured = None if axes is None else axes.at(part)
+        chances = chances.put(part, model.chances(found.outward_ct[part], found.arm.q_insertion[part], measured))
+    return limited(case, refined_near_limits(replace(found, chances=chances), model))
+
+
+def limited(case: Case, found: Candidates) -> Candidates:
+    """Reject what is too unlikely to hit, or too likely to touch."""
+    chances, least = found.chances, case.search.min_hit
+    assert chances is not None
+    if least is not None:
+        rows = np.flatnonzero(found.safe & ~(chances.hit >= least))  # what is not known is not enough
+        target = np.full(len(rows), case.target_structure, dtype=object)
+        found = _rejected(found, rows, Reason.HIT_UNLIKELY, target, chances.hit[rows])
+    limits = np.array([touch_limit(case, name) for name in chances.structures])
+    touch = np.where(np.isnan(chances.touch), np.inf, chances.touch)  # nor is it little enough
+    with np.errstate(invalid="ignore"):  # without a limit both may be infinite
+        beyond = np.where(touch > limits, touch - limits, -np.inf)
+    rows = np.flatnonzero(found.safe & (beyond > 0).any(axis=1))
+    worst = beyond[rows].argmax(axis=1) if len(rows) else rows
+    names = np.array(chances.structures, dtype=object)[worst]
+    return _rejected(found, rows, Reason.TOUCH_LIKELY, names, chances.touch[rows, worst])
+
+
+def _rejected(found: Candidates, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Candidates:
+    """With some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
+    arrays = {field.name: getattr(found.verdict, field.name).copy() for field in fields(found.verdict)}
+    arrays["reason"][rows], arrays["structure"][rows], arrays["amount"][rows] = reason.value, structure, amount
+    return replace(found, verdict=Verdict(**arrays))
+
+
+BEST = 200
+"""Of the ranked candidates: how many get the dearer chances."""
+
+
+REFINED_FROM = 1 / 60
+"""Times its limit: what first order, or its bound, puts above is refined. The chance to be displaced so far to any
+side at all is 56 times that to one side at 3.5 standard deviations, and less for less."""
+
+ROWS_AT_ONCE = 4096
+"""Of candidates: a table of gradients of 60 structures stays below 20 MB."""
+
+
+def refined_near_limits(found: Candidates, model: ChanceModel) -> Candidates:
+    """Refine the chances to touch that first order puts near a limit or beyond, or that may be if the needle leans."""
+    chances, limits = found.chances, model.limits
+    assert chances is not None
+    if not np.isfinite(limits).any():
+        return found
+    greatest = np.fmax(chances.touch, _touch_bounds(found, model))
+    rows = np.flatnonzero((greatest >= REFINED_FROM * limits).any(axis=1) & np.isfinite(chances.hit))
+    return with_refined(found, model, rows) if len(rows) else found
+
+
+def _touch_bounds(found: Candidates, model: ChanceModel) -> Floats:
+    """Shape (n, k), of the safe candidates' chances to touch; NaN for others."""
+    error, columns, length = model.error, model.columns, float(model.lengths.max())
+    surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])
+    bounds, rows = np.full((len(found), len(columns)), np.nan), np.flatnonzero(found.safe)
+    for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
+        slack, cov_ct = found.clearance.distance[part][:, columns], error.covariance_ct(found.arm.q_insertion[part])
+        bounds[part] = touch_bound(slack, found.outward_ct[part], cov_ct, length, surface_mm, error.freedom)
+    return bounds
+
+
+def with_refined(found: Candidates, model: ChanceModel, rows: Ints) -> Candidates:
+    """Refine some rows."""
+    chances = found.chances
+    assert chances is not None
+    names = [field.name for field in fields(chances) if field.name != "structures"]
+    first = Chances(chances.structures, **{name: getattr(chances, name)[rows] for name in names})
+    better = refined_chances(model, found.outward_ct[rows], found.arm.q_insertion[rows], first)
+    return replace(found, chances=chances.put(rows, better))
+
+
+def with_best_refined(found: Candidates, model: ChanceModel | None) -> Candidates:
+    """Refine what is shown: the best of all, and the best of every window.
+
+    Those that break a limit then are rejected, and the rest ranked again, until no new one is among them.
+
+    Args:
+        found: Ranked, with chances.
+        model: As in `with_chances`.
+    """
+    if model is None or found.chances is None:
+        return found
+    while len(rows := _shown(found)):
+        found = ranked(model.case, limited(model.case, with_refined(found, model, rows)))
+    return found
+
+
+def _shown(found: Candidates) -> Ints:
+    """Rows that people are shown, and whose chances are of first order yet."""
+    assert found.chances is not None
+    best = [window.best for window in find_windows(found).windows]
+    shown = np.unique(np.append(found.ranked[:BEST], best)).astype(np.int64)
+    return shown[~found.chances.refined[shown] & np.isfinite(found.chances.hit[shown])]
+
+
+NORMALS = 4096
+"""Fixed draws of the jointly linearised chance: its own error is .008 at most."""
+
+DRAWN_WITH = 20191104
+"""Seed of those draws, the same in every run: the table must not depend on chance."""
+
+
+def joint_touch_chance(
+    near: Proximity,
+    cov_ct: Floats,
+    threshold_mm: Floats | float,
+    freedom: int | None = None,
+    surface_mm: Floats | float = 0.0,
+) -> Floats:
+    """P that a needle comes nearer to any structure than its threshold, all linearised together, shape (n,).
+
+    Args:
+        near: Of needles and structures.
+        cov_ct: Shape (n, 6, 6), Sigma6, as there.
+        threshold_mm: One number or shape (k,).
+        freedom: As in `touch_chance`.
+        surface_mm: As in `proximity`: every structure's surface lies off by a normal number of its own.
+    """
+    rng = np.random.default_rng(DRAWN_WITH)
+    draws = rng.normal(size=(NORMALS, 6))
+    sizes = np.ones(NORMALS) if freedom is None else np.sqrt(freedom / rng.chisquare(freedom, NORMALS))
+    surfaces = np.nan_to_num(np.broadcast_to(surface_mm, near.distance.shape))
+    off = rng.normal(size=(NORMALS, near.distance.shape[1])) if surfaces.any() else np.zeros((1, 1))
+    chances = np.empty(len(cov_ct))
+    for row, cov in enumerate(cov_ct):
+        values, axes = np.linalg.eigh(cov)
+        root = axes * np.sqrt(np.maximum(values, 0.0))
+        change = sizes[:, None] * (draws @ (near.gradient[row] @ root).T + off * surfaces[row])
+        chances[row] = np.mean(np.any(change < threshold_mm - near.distance[row], axis=1))
+    return chances
+
+
+def with_joint_chances(found: Candidates, model: ChanceModel | None) -> Candidates:
+    """Add, for the best candidates, the chance to touch anything, all structures linearised together.
+
+    The candidates are ranked; ``model`` as in `with_chances`.
+    """
+    rows = found.ranked[:BEST]
+    if model is None or found.chances is None or not len(rows):
+        return found
+    needles = model.needles(found.outward_ct[rows], found.arm.q_insertion[rows])
+    joint = found.chances.touch_joint.copy()
+    joint[rows] = joint_touch_chance(
+        needles.near, needles.cov_ct, model.case.needle.radius_mm, needles.freedom, needles.surface_mm
+    )
+    return replace(found, chances=replace(found.chances, touch_joint=joint))
