@@ -92,7 +92,7 @@ pictures: demo
 	$(BIN)/python run_twin.py servo meshes/head --out out/servo
 	mkdir -p out/budget
 	$(BIN)/python run_twin.py register meshes/abdomen --picture out/budget/budget.png
-	$(BIN)/python docs/concept_pictures.py $(OUT)/plan.json
+	PYTHONPATH=. $(BIN)/python docs/concept_pictures.py $(OUT)/plan.json
 	$(BIN)/python docs/reliability_picture.py
 	$(BIN)/python docs/copy_pictures.py $(OUT) out/place out/selfcal out/servo out/budget
 

@@ -12,6 +12,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.patches import Circle, Polygon
 
 import puncture_twin as pt
+from benchmarks.placements import meshes_of, phantoms
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.body.body_mask import body_mask
 from puncture_twin.planning.anatomy.body.outside_body import OutsideImage, outside_mask
@@ -21,6 +22,9 @@ from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.tables.structures_section import AIR_HU
 from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
+from puncture_twin.planning.evidence.edges import Placement, compare, edge_image, sample_surfaces
+from puncture_twin.planning.evidence.label_placement import REFUSING_Z
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.reach.skin_gap import skin_gaps
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
@@ -186,6 +190,41 @@ def markers():
     save(figure, "markers.png")
 
 
+def evidence():
+    """Labels 12 mm off on a slice of their CT, and z of every shift: in place, every other is worse."""
+    patient = dict(phantoms())["trunk"]
+    image, meshes = edge_image(patient.hu, patient.T), meshes_of(patient)
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), width_ratios=(1.2, 1))
+    middle, steps = patient.hu.shape[2] // 2, np.arange(-30.0, 31.0, 3.0)
+    x, y = (patient.T[k, 3] + patient.T[k, k] * np.arange(patient.hu.shape[k]) for k in range(2))
+    left.pcolormesh(x, y, patient.hu[:, :, middle].T, cmap="gray", vmin=-200, vmax=400)
+    for colour, off_mm in ((GREEN, 0.0), (RED, 12.0)):
+        for label in range(1, int(patient.labels.max()) + 1):
+            inside = label == patient.labels[:, :, middle].T
+            left.contour(x, y + off_mm, inside, levels=[0.5], colors=colour, linewidths=1.2)
+        slip = pose(np.eye(3), [0.0, off_mm, 0.0])
+        sample = sample_surfaces([mesh.transformed(slip) for mesh in meshes.values()])
+        for axis, style in enumerate(("-", "--", ":")):
+            moves = [Placement("shift", pose(np.eye(3), step * np.eye(3)[axis])) for step in steps]
+            z = [fit.z for fit in compare(image, sample, moves).fits]
+            label = f"{off_mm:g} mm off, moved along {'xyz'[axis]}"
+            right.plot(steps, np.where(steps == 0, 0.0, z), style, color=colour, label=label)
+    left.set(xlabel="x, mm (LPS)", ylabel="y, mm (LPS)", title="green: labels in place; red: 12 mm to the back")
+    left.set_aspect("equal")
+    left.invert_yaxis()
+    right.axhspan(REFUSING_Z, 22, color="#f9e3e0")
+    right.axhline(0, color=GREY, linewidth=0.8)
+    right.annotate("refused", (-29, REFUSING_Z + 0.3), color=RED)
+    right.set(
+        xlabel="moved by, mm",
+        ylabel="z: better elsewhere",
+        ylim=(-15, 22),
+        title="every shift against the place as it is",
+    )
+    right.legend(fontsize=8, loc="upper right")
+    save(figure, "evidence.png")
+
+
 def main() -> None:
     """Draw all."""
     kinematics()
@@ -195,6 +234,7 @@ def main() -> None:
     certificate()
     body_and_air()
     markers()
+    evidence()
 
 
 if __name__ == "__main__":

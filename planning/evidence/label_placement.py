@@ -58,8 +58,8 @@ WARNING_Z = 3.0
 table of `python -m benchmarks.placements`."""
 
 LEAST_SLIP = {"shift": 0.9, "axes": 0.9, "grid": 0.9, "unit": 0.9, "scale": 1.25}
-"""In shifts of the least that counts, by kind of placement: what moves the surfaces by less is never refused. A rib cage
-by itself lies better on the edge of the lungs, 4 % smaller: .96."""
+"""In shifts of the least that counts, by kind of placement: what moves the surfaces by less is never refused. A rib
+cage by itself lies better on the edge of the lungs, 4 % smaller: .96."""
 
 STRUCTURE_Z = 5.0
 STRUCTURE_RATIO = 1.5
