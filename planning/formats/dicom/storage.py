@@ -57,9 +57,12 @@ def is_dicom(start: bytes) -> bool:
 
 def is_series(path: Path) -> bool:
     """Whether a path is to be read as a CT series: a folder, or a DICOM file of any name but a volume's."""
-    if is_folder(path):
-        return True
-    if not is_plain_file(path) or path.name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS):
+    return is_folder(path) or (not path.name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS) and is_dicom_file(path))
+
+
+def is_dicom_file(path: Path) -> bool:
+    """Whether a path leads to a DICOM file that can be opened."""
+    if not is_plain_file(path):
         return False
     try:
         with path.open("rb") as stream:

@@ -6,14 +6,10 @@ import os
 from datetime import UTC, datetime
 from typing import Any
 
-from puncture_twin.planning.base.files import is_plain_file
-from puncture_twin.planning.formats.dicom.storage import is_dicom
+from puncture_twin.planning.formats.dicom.storage import is_dicom_file
 
 EPOCH = "SOURCE_DATE_EPOCH"
 """Seconds since 1970 that stand for "now", as tools take them that make the same bytes on every day."""
-
-HEAD_BYTES = 132
-"""Behind them a file is known to be DICOM or not."""
 
 
 def dates_text(case: Any) -> str:
@@ -32,15 +28,10 @@ def scan_date(case: Any) -> str:
     """The day of the first CT slice among a case's inputs; the empty string where none says so (as in NIfTI)."""
     for one in case.inputs:
         path = case.path.parent / one.path
-        if is_plain_file(path) and _begins_as_dicom(path):
-            from puncture_twin.planning.formats.dicom.recognise import recognise  # with pydicom, which few cases need
+        if is_dicom_file(path):
+            from puncture_twin.planning.formats.dicom.recognise import recognise  # with pydicom: few cases need it
 
             found = recognise(path)
             if found is not None and found.is_slice:
                 return found.date
     return ""
-
-
-def _begins_as_dicom(path: Any) -> bool:
-    with path.open("rb") as stream:
-        return is_dicom(stream.read(HEAD_BYTES))
