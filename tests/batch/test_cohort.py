@@ -24,6 +24,28 @@ def test_a_folder_is_every_case_below_it(tmp_path):
     assert stated(tmp_path / "c") == ["a/deep/case.toml", "b/case.toml", "linked/case.toml"]
 
 
+def test_a_patient_that_cannot_be_looked_up_is_not_left_out(tmp_path, monkeypatch):
+    """Behind a link to an archive that is not mounted, or in a folder that may not be read."""
+    write_patient(tmp_path / "c" / "a")
+    (tmp_path / "c" / "b").symlink_to(tmp_path / "archive" / "b")
+    with pytest.raises(InputError, match="'b' is a link to what is not there") as caught:
+        read_cohort(tmp_path / "c")
+    assert caught.value.code == "cohort_not_whole"
+    (tmp_path / "c" / "b").unlink()
+    write_patient(tmp_path / "c" / "b")
+    listed = os.scandir
+
+    def scandir(folder):
+        if os.fspath(folder).endswith("/b"):
+            raise PermissionError(13, "Permission denied", os.fspath(folder))
+        return listed(folder)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    with pytest.raises(InputError, match="cannot be read .Permission denied") as caught:
+        read_cohort(tmp_path / "c")
+    assert caught.value.where.endswith("/b")
+
+
 def test_a_csv_lists_cases_relative_to_itself_or_absolute(tmp_path):
     """As written, cell for cell, in its order; a folder stands for its case; empty lines and cells say nothing."""
     here = write_patient(tmp_path / "c" / "a")

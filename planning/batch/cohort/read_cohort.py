@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import NoReturn
 
 from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.base.files import is_folder
@@ -59,9 +60,13 @@ def _listed_cases(path: Path) -> tuple[list[CohortCase], tuple[Input, ...]]:
 
 
 def _folder_cases(cohort: Path) -> list[CohortCase]:
-    """Every case file below a folder, also behind links to folders, each folder once."""
+    """Every case file below a folder, also behind links to folders, each folder once; none that cannot be looked into.
+
+    Raises:
+        InputError: A folder that cannot be read, or a link to nothing beside folders: a patient would be lost.
+    """
     found, seen = [], set[str]()
-    for folder, below, files in os.walk(cohort, followlinks=True):
+    for folder, below, files in os.walk(cohort, followlinks=True, onerror=_refuse_unreadable):
         real = os.path.realpath(folder)
         if real in seen:
             below.clear()
@@ -71,4 +76,14 @@ def _folder_cases(cohort: Path) -> list[CohortCase]:
         if CASE_FILE in files:
             path = Path(folder) / CASE_FILE
             found.append(CohortCase(path.relative_to(cohort).as_posix(), path))
+        elif below and (lost := [one for one in files if not (Path(folder) / one).exists()]):
+            _refuse(f"'{one_line(lost[0], 100)}' is a link to what is not there", folder)
     return sorted(found, key=lambda one: one.stated)
+
+
+def _refuse_unreadable(error: OSError) -> NoReturn:
+    _refuse(f"cannot be read ({error.strerror})", str(error.filename))
+
+
+def _refuse(what: str, where: str) -> NoReturn:
+    raise InputError(what, where=where, allowed="folders of patients that can be read", code="cohort_not_whole")
