@@ -35,7 +35,7 @@ TABLE = ["| structures | names | role | margin | reason |", "|---|---|---|---|--
 def row(line):
     """A row of the table."""
     names = " ".join(f"`{pattern}`" for pattern in line.patterns) or "any other"
-    margin = f"{line.margin_mm:g}" if line.kind == "avoid" else ""
+    margin = f"{line.margin_mm:g}" if line.margin_mm else ""
     return f"| {line.group} | {names} | {line.kind} | {margin} | {line.reason} |"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.meshes import folder
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within, positions
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.needle.bevel_path import bevel_path
 from puncture_twin.planning.needle.insertion_force import insertion_force
 from puncture_twin.planning.needle.shaft import GAUGES, Shaft

@@ -12,7 +12,7 @@ from benchmarks.experiment.row import Row
 from puncture_twin.meshes import folder
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 
 from puncture_twin.planning.formats.labels.naming import specificity
 
-Kind = Literal["avoid", "traverse", "ignore"]
+Kind = Literal["avoid", "traverse", "ignore", "unknown"]
 
 
 class DefaultRole(NamedTuple):
@@ -26,7 +26,8 @@ class DefaultRole(NamedTuple):
     Attributes:
         group: What a person reads.
         patterns: Shell patterns of names in lower case with underscores.
-        kind: What it means to a needle: ``ignore`` for outlines of the body, which the skin is.
+        kind: What it means to a needle: ``ignore`` for outlines of the body, which the skin is; ``unknown`` for what
+            nobody looked at.
         margin_mm: The clearance that it demands; 0 where it demands none.
         reason: Why.
     """
@@ -61,6 +62,15 @@ BODY = _line(
 )
 """Structures that are the body itself."""
 
+NOT_ANNOTATED = _line(
+    "not annotated",
+    "ignore ignore_label void not_annotated unannotated",
+    "unknown",
+    2.0,
+    "nobody said what is there: no path through it is known to be free",
+)
+"""Voxels that a segmentation leaves open, as nnU-Net's label ``ignore``."""
+
 LESION = _line(
     "lesion",
     "*lesion* *lasion* *laesion* *tumor* *tumour* *tumeur* *nodule* *metastas* *carcinoma* *neoplas* *cancer* *mass "
@@ -76,6 +86,7 @@ LATERAL_MASS = "lateral_mass"
 
 GENERAL: tuple[DefaultRole, ...] = (
     BODY,
+    NOT_ANNOTATED,
     _line(
         "vertebrae, spine",
         "*vertebra* spine *spinal_column* *intervertebral* *disc *disk *lateral_mass* *massa_lateralis*",
@@ -407,7 +418,7 @@ def default_role(name: str, region: str) -> DefaultRole | None:
     lesion = list(_matching(plain.replace(LATERAL_MASS, ""), (LESION,)))
     found = lesion or own or general
     closest = max(found, key=lambda one: one[0], default=(0.0, None))[1]
-    if closest is None or closest.kind == "avoid":
+    if closest is None or closest.kind in ("avoid", "unknown"):
         return closest
     hurt = [one for one in general if one[1].kind == "avoid" and one[1].group != closest.group]
     return max(hurt, key=lambda one: one[0], default=(0.0, closest))[1]

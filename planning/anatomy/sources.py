@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -15,18 +15,17 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names
+from puncture_twin.planning.base.text_names import first_few
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.tables.structures_section import StructureSection, StructuresSection
 from puncture_twin.planning.formats.labels.mask_folder import check_one_grid
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, RuleKind, names_for, select
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, refuse_lost_grid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, parse_space
 from puncture_twin.planning.geometry.units import Unit, parse_unit
-
-UNNAMED_SHOWN = 8
-"""Labels that a warning lists; a person looks at the map for the rest."""
 
 EMPTY_MASKS = "{folder}: {count} masks are empty, so that nothing is there: {names}"
 
@@ -72,16 +71,19 @@ class StructureSources:
         self._refuse_local(folder, "masks")
         files = self._case.masks(folder)
         self.warnings.extend(self._case.volumes.mask_notes(folder))
-        check_one_grid({one: self._case.volumes.source(one).grid for one in files.values()}, where=self._file(folder))
+        grids = {one: self._case.volumes.source(one).grid for one in files.values()}
+        check_one_grid(grids, where=self._file(folder))
+        self._check_grid(next(iter(grids.values())), folder)
         names = dict(enumerate(files, start=1))
-        labels = {number: self._open(files[name]).mask_label() for number, name in names.items()}
-        present = [number for number, label in labels.items() if label is not None]
+        masks = {number: self._open(files[name]).mask() for number, name in names.items()}
+        present = [number for number, mask in masks.items() if mask.labels]
+        self.warnings.extend(said for number, mask in masks.items() for said in mask.notes(Path(files[names[number]])))
         if empty := [name for number, name in names.items() if number not in present]:
-            self.warnings.append(EMPTY_MASKS.format(folder=folder, count=len(empty), names=_shown(empty)))
+            self.warnings.append(EMPTY_MASKS.format(folder=folder, count=len(empty), names=first_few(empty)))
         structures = []
         for rule in self._kept_rules(section, names, present):
             self._progress(rule.name)
-            label = labels[rule.label] or 0
+            (label,) = masks[rule.label].labels
             volume = self._open(files[rule.name])
             structures.append(_ruled(rule, volume.label(label), f"{files[rule.name]}:{label}", volume.voxel_ct))
         return structures
@@ -120,7 +122,7 @@ class StructureSources:
         if not others:
             return []
         names = (volume.names or {}) if name.lower().endswith(NRRD_ENDINGS) else {}
-        shown = _shown([f"{label} {names[label]}" if label in names else str(label) for label in others])
+        shown = first_few([f"{label} {names[label]}" if label in names else str(label) for label in others])
         return [f"{name} holds labels that the case does not name, and they count as free: {shown}"]
 
     def skin(self, section: StructureSection) -> Skin:
@@ -187,7 +189,17 @@ class StructureSources:
 
     def _labels(self, name: str) -> VolumeSurfaces:
         self._refuse_local(name, "label map")
-        return self._volume(name)
+        known, volume = name in self._volumes, self._volume(name)
+        if not known:
+            self._check_grid(volume.source.grid, name)
+            self.warnings.extend(volume.present().notes(volume.path))
+        return volume
+
+    def _check_grid(self, grid: VolumeGrid, name: str) -> None:
+        """Whether labels kept where their voxels lie."""
+        ct = self._case.skin_section.ct or self._case.ct.file
+        if ct is not None:
+            refuse_lost_grid(grid, self._case.volumes.source(ct).grid, where=self._file(name))
 
     def _refuse_local(self, name: str, kind: str) -> None:
         if self._case.space is Space.LOCAL:
@@ -218,9 +230,3 @@ def _no_bytes(ends: tuple[str, ...]) -> int:
 
 def _ruled(rule: LabelRule, mesh: TriangleMesh, source: str, voxel_ct: Floats) -> Structure:
     return Structure(rule.name, Role(rule.kind.value), rule.margin_mm, mesh, source, voxel_ct=voxel_ct)
-
-
-def _shown(names: Sequence[str]) -> str:
-    """The first few of a list."""
-    more = f" and {len(names) - UNNAMED_SHOWN} more" if len(names) > UNNAMED_SHOWN else ""
-    return ", ".join(names[:UNNAMED_SHOWN]) + more

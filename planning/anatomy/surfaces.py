@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of, segment_names
-from puncture_twin.planning.formats.labels.mask_folder import mask_label
+from puncture_twin.planning.formats.labels.labelmaps import ROUNDED_BY, LabelMap, labelmap_of, segment_names
+from puncture_twin.planning.formats.labels.mask_folder import refuse_label_map
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
@@ -28,6 +28,23 @@ Value = TypeVar("Value")
 READERS = "puncture_twin.planning.case.case_volumes"
 """The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
 them has changed; nothing here imports them, so that a case without DICOM does not load its library."""
+
+
+class Present(NamedTuple):
+    """What a label map or mask holds.
+
+    Attributes:
+        labels: Those that have a voxel, rising.
+        rounded_by: How far its values are off whole numbers.
+    """
+
+    labels: tuple[int, ...]
+    rounded_by: float
+
+    def notes(self, path: Path) -> tuple[str, ...]:
+        """What a person should be told of how a file was read."""
+        said = f"{path.name}: its labels are up to {self.rounded_by:.2g} off whole numbers, and were rounded"
+        return (said,) if self.rounded_by else ()
 
 
 @dataclass(frozen=True)
@@ -71,20 +88,21 @@ class VolumeSurfaces:
 
     def labels_present(self) -> tuple[int, ...]:
         """The labels that have a voxel, ascending."""
+        return self.present().labels
+
+    def present(self) -> Present:
+        """The labels that have a voxel, at least one."""
+        return self._kept("labels present", lambda: _of_present(self.labelmap), _to_labels)
+
+    def mask(self) -> Present:
+        """Of a file that is one structure's mask its voxels' value; none where it is empty."""
 
         def make() -> Arrays:
-            return {"labels": np.array(self.labelmap.labels_present(), np.int64)}
+            labels = labelmap_of(self.volume, may_be_empty=True)
+            refuse_label_map(labels)
+            return _of_present(labels)
 
-        return self._kept("labels present", make, _to_labels)
-
-    def mask_label(self) -> int | None:
-        """Of a file that is one structure's mask, its voxels' value; None where it is empty."""
-
-        def make() -> Arrays:
-            label = mask_label(labelmap_of(self.volume, may_be_empty=True))
-            return {"labels": np.array([] if label is None else [label], np.int64)}
-
-        return self._kept("mask label", make, _to_mask_label)
+        return self._kept("mask label", make, _to_mask)
 
     def label(self, label: int) -> TriangleMesh:
         """The surface of one label, LPS mm."""
@@ -158,22 +176,26 @@ def kept_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
     return guard_mesh(vertices, faces, where="cache").known(closed=bool(facts[0]), wound_alike=bool(facts[1]))
 
 
-def _to_mask_label(stored: Arrays) -> int | None:
-    labels = _listed(stored)
-    if len(labels) > 1:
-        raise ValueError("at most one label")
-    return labels[0] if labels else None
+def _of_present(labels: LabelMap) -> Arrays:
+    return {"labels": np.array(labels.labels_present(), np.int64), "rounded_by": np.array(labels.rounded_by)}
 
 
-def _to_labels(stored: Arrays) -> tuple[int, ...]:
-    labels = _listed(stored)
-    if not labels:
+def _to_labels(stored: Arrays) -> Present:
+    found = _to_present(stored)
+    if not found.labels:
         raise ValueError("no label")
-    return labels
+    return found
 
 
-def _listed(stored: Arrays) -> tuple[int, ...]:
-    labels = stored["labels"]
-    if labels.ndim != 1 or labels.dtype != np.int64:
+def _to_mask(stored: Arrays) -> Present:
+    found = _to_present(stored)
+    if len(found.labels) > 1:
+        raise ValueError("at most one label")
+    return found
+
+
+def _to_present(stored: Arrays) -> Present:
+    labels, rounded_by = stored["labels"], float(stored["rounded_by"])
+    if labels.ndim != 1 or labels.dtype != np.int64 or not 0.0 <= rounded_by <= ROUNDED_BY:
         raise ValueError("no list of labels")
-    return tuple(labels.tolist())
+    return Present(tuple(labels.tolist()), rounded_by)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from puncture_twin.planning.base.errors import InputError
@@ -32,6 +32,16 @@ def check_name(name: str, what: str, *, where: str | Path) -> str:
     if not name.isprintable():
         raise InputError(f"{what} has the name {name!a}", where=where, allowed=ALLOWED_NAME)
     return name
+
+
+def first_few(names: Sequence[str], most: int = 8) -> str:
+    """The first few of a list, and how many more there are.
+
+    >>> first_few(["liver", "colon", "aorta"], 2)
+    'liver, colon and 1 more'
+    """
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def unprintable_texts(document: object) -> Iterator[str]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.breathing.lujan import positions
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from puncture_twin.planning.base.text_names import unprintable_texts
 from puncture_twin.planning.case.sections.tool_section import ToolSection
 from puncture_twin.planning.case.tables.breathing_section import BreathingSection
 from puncture_twin.planning.case.tables.errors_section import ErrorsSection, RehearsalSection
-from puncture_twin.planning.case.tables.needle_section import NeedleSection, TissueSection
+from puncture_twin.planning.case.tables.needle_section import NeedleSection, TargetSection, TissueSection
 from puncture_twin.planning.case.tables.place_section import PlaceSection
 from puncture_twin.planning.case.tables.registration_section import RegistrationSection
 from puncture_twin.planning.case.tables.robot_section import RobotSection
@@ -29,7 +29,6 @@ from puncture_twin.planning.case.tables.structures_section import (
     StructuresSection,
 )
 from puncture_twin.planning.case.tables.surroundings_section import GantrySection, ObstacleSection
-from puncture_twin.planning.case.tables.target_section import TargetSection
 from puncture_twin.planning.case.toml_types import CaseName, CaseSchema, Section, Text
 
 COUNT_KEY = "structures = N"

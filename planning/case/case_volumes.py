@@ -111,8 +111,8 @@ class CaseVolumes:
 
     def _read_series(self, path: Path, name: str, key: str) -> CtSeries:
         """A folder of slices, or the series of one: every slice is a file that decides."""
-        from puncture_twin.planning.formats.dicom.choose_series import choose_series
         from puncture_twin.planning.formats.dicom.ct_series import parse_series
+        from puncture_twin.planning.formats.dicom.recognise import choose_series
 
         chosen = choose_series(path)
         folder = PurePosixPath(name) if chosen.folder == path else PurePosixPath(name).parent

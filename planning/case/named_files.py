@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -10,7 +11,9 @@ from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.case_volumes import VOLUME_ROLES, CaseVolumes
 from puncture_twin.planning.case.tables.structures_section import StructuresSection
+from puncture_twin.planning.case.whole_case import wholeness_warnings
 from puncture_twin.planning.formats import itk_transform
+from puncture_twin.planning.formats.dicom.storage import is_dicom_file
 from puncture_twin.planning.formats.labels import naming
 from puncture_twin.planning.formats.labels.mask_folder import mask_files, structure_name
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
@@ -30,8 +33,8 @@ class NamedFile(NamedTuple):
     max_bytes: int
 
 
-def read_named_files(content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes) -> None:
-    """Read and hash whatever the case names, each file once.
+def read_named_files(content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes) -> tuple[str, ...]:
+    """Read and hash whatever the case names, each file once; what costs little first.
 
     Args:
         content: The case file.
@@ -39,20 +42,29 @@ def read_named_files(content: CaseFile, path: Path, files: InputFiles, case_volu
         files: Takes what is read.
         case_volumes: Takes the volumes.
 
+    Returns:
+        What is left open about being whole, one sentence each.
+
     Raises:
-        InputError: A file that is missing, too large or not what its key says.
+        InputError: A file that is missing, too large or not what its key says, or a list that was cut; what lies among
+            masks and is not read.
     """
-    for one in named_files(content, path):
+    single = list(named_files(content))
+    masks = list(_masks(content, path, single))
+    for one in single:
+        if one.role not in VOLUME_ROLES:
+            files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
+    warnings = wholeness_warnings(content, files, path)
+    for one in (*single, *masks):
         if one.role in VOLUME_ROLES or one.role.startswith(MASK_ROLE):
             case_volumes.read(one.role, one.name, key=one.key)
-        else:
-            files.read(one.role, one.name, max_bytes=one.max_bytes, key=one.key, where=path)
     for many in content.structures:
         case_volumes.read_masks(many, content.ct_name)
+    return warnings
 
 
-def named_files(content: CaseFile, path: Path) -> Iterator[NamedFile]:
-    """Every file that a case names, in the order of its sections; of a folder of masks every mask."""
+def named_files(content: CaseFile) -> Iterator[NamedFile]:
+    """Every file that a case names, and folders with a CT, in the order of its sections; of folders of masks none."""
     if content.target.points is not None:
         yield NamedFile("target", content.target.points, "target.points", points.MAX_FILE_BYTES)
     for one in content.structure:
@@ -64,7 +76,7 @@ def named_files(content: CaseFile, path: Path) -> Iterator[NamedFile]:
         if one.ct is not None:
             yield NamedFile("ct", one.ct, key, volumes.MAX_FILE_BYTES)
     for number, many in enumerate(content.structures, start=1):
-        yield from _many_files(many, f"structures number {number}", path)
+        yield from _many_files(many, f"structures number {number}")
         if many.naming is not None and naming.is_naming_file(many.naming):
             yield NamedFile("naming", many.naming, f"structures number {number}.naming", naming.MAX_CSV_BYTES)
     if content.ct.file is not None:
@@ -78,8 +90,8 @@ def named_files(content: CaseFile, path: Path) -> Iterator[NamedFile]:
         yield NamedFile("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)
 
 
-def _many_files(many: StructuresSection, key: str, path: Path) -> Iterator[NamedFile]:
-    """A label map, or every file of a folder of masks: also empty ones decide what is there."""
+def _many_files(many: StructuresSection, key: str) -> Iterator[NamedFile]:
+    """A label map, or the file that holds masks."""
     if many.labelmap is not None:
         yield NamedFile("labelmap", many.labelmap, f"{key}.labelmap", volumes.MAX_FILE_BYTES)
     for role in ("seg", "rtstruct"):
@@ -87,7 +99,27 @@ def _many_files(many: StructuresSection, key: str, path: Path) -> Iterator[Named
             yield NamedFile(role, file, f"{key}.{role}", volumes.MAX_FILE_BYTES)
     if many.ct is not None:
         yield NamedFile("ct", many.ct, f"{key}.ct", volumes.MAX_FILE_BYTES)
-    if many.masks is not None:
-        for file in mask_files(path.parent / many.masks, where=f"{path}: {key}.masks"):
-            name = str(PurePosixPath(many.masks) / file)
-            yield NamedFile(f"{MASK_ROLE}{structure_name(file)}", name, f"{key}.masks", volumes.MAX_FILE_BYTES)
+
+
+def _masks(content: CaseFile, path: Path, single: Sequence[NamedFile]) -> Iterator[NamedFile]:
+    """Every mask of the folders of masks: also an empty one decides what is there."""
+
+    def place(name: str) -> Path:
+        return Path(os.path.normpath(path.parent / name))
+
+    beside = [*(one.name for one in single), path.name, getattr(content.tool, "mesh", None), content.robot.urdf]
+    folders = [many.masks for many in content.structures if many.masks is not None]
+    named = {place(name) for name in (*beside, *folders) if name is not None}
+    cts = [place(one.name) for one in single if one.role == "ct"]
+    series = {*cts, *(one.parent for one in cts)}
+
+    def known(one: Path) -> bool:
+        here = Path(os.path.normpath(one))
+        return here in named or (here.parent in series and is_dicom_file(one))
+
+    for number, many in enumerate(content.structures, start=1):
+        if many.masks is not None:
+            key = f"structures number {number}.masks"
+            for file in mask_files(path.parent / many.masks, known, where=f"{path}: {key}"):
+                name = str(PurePosixPath(many.masks) / file)
+                yield NamedFile(f"{MASK_ROLE}{structure_name(file)}", name, key, volumes.MAX_FILE_BYTES)

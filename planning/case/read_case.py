@@ -35,5 +35,5 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
         files.state(OPTIONS_ROLE, options.text.encode())
     change = partial(options.applied, where=path)
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md", change=change)
-    read_named_files(content, path, files, case_volumes)
-    return case_of(content, path, files, case_volumes)
+    whole = read_named_files(content, path, files, case_volumes)
+    return case_of(content, path, files, case_volumes, whole)

@@ -27,13 +27,15 @@ from puncture_twin.planning.case.settings import (
     search_of,
 )
 from puncture_twin.planning.case.tables.registration_section import MarkerSection
-from puncture_twin.planning.case.whole_case import robot_warnings, wholeness_warnings
+from puncture_twin.planning.case.whole_case import robot_warnings
 from puncture_twin.planning.formats.points.point_files import parse_points
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 
-def case_of(content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes) -> Case:
-    """What a case file and the files that it names state, in LPS (or local) mm and radians."""
+def case_of(
+    content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes, warnings: tuple[str, ...]
+) -> Case:
+    """What a case file and the files that it names state, in LPS (or local) mm and radians; warnings go in front."""
     space = Space(content.space)
     target = _target_of(content, path, space, files)
     robot = robot_of(content, space, path, files)
@@ -65,7 +67,7 @@ def case_of(content: CaseFile, path: Path, files: InputFiles, case_volumes: Case
         place=content.place,
         stated_structures=content.stated_structures,
         region=content.region,
-        warnings=(*wholeness_warnings(content, files, path), *robot_warnings(content, robot)),
+        warnings=(*warnings, *robot_warnings(content, robot)),
         hit_radius_mm=content.target.hit_radius_mm,
         errors=errors_of(content, content.errors, case_volumes, path),
         truth_errors=errors_of(content, content.rehearsal.errors, case_volumes, path, truth=True),

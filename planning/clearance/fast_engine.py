@@ -7,6 +7,7 @@ from copy import copy
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
@@ -19,9 +20,10 @@ from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
-from puncture_twin.planning.clearance.kernels.tile_search import COUNTED
+from puncture_twin.planning.clearance.kernels.lanes import LANES
+from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
+from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
 from puncture_twin.planning.clearance.near_faces import near_faces
-from puncture_twin.planning.clearance.one_structure import measure_structure
 from puncture_twin.planning.clearance.placed_surface import PlacedSurface, placed_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -171,3 +173,38 @@ def _remembered(meshes: Sequence[TriangleMesh], memory: Memory) -> tuple[Blocks,
     return tuple(
         memory.get((__name__, mesh.digest), partial(pack, mesh), lambda blocks: blocks.nbytes) for mesh in meshes
     )
+
+
+def measure_structure(
+    target: Floats,
+    tiles: Tiles,
+    blocks: Blocks,
+    placed: PlacedSurface,
+    length: float,
+    answer: AxisDistances,
+    counts: NDArray[np.int64],
+) -> None:
+    """Fill one structure's distances from the axes of some directions.
+
+    Args:
+        target: Shape (3,), mm: where every axis starts.
+        tiles: All or some of the n directions.
+        blocks: The structure.
+        placed: Itself as seen from the target.
+        length: Of the axes, mm.
+        answer: Arrays of shape (n,) in the caller's order; rows of ``tiles`` are filled.
+        counts: Shape (7,), added to: see `tile_search.COUNTED`.
+    """
+    distance, depth, nearest = answer.distance, answer.depth, answer.nearest
+    if placed.distance == 0.0:
+        distance[tiles.order], depth[tiles.order], nearest[tiles.order] = 0.0, 0.0, placed.nearest
+        return
+    n = len(tiles.order)
+    found = Found(np.empty(n), np.empty(n), np.empty(n, np.int64), counts)
+    surface = (blocks.triangles, blocks.local, blocks.base)
+    bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
+    search_tiles(
+        surface, placed.nodes, placed.slack, target, float(length), placed.distance, placed.nearest,
+        bundles, scratch_for(len(placed.nodes)), found, LANES,
+    )  # fmt: skip
+    distance[tiles.order], depth[tiles.order], nearest[tiles.order] = np.sqrt(found.square), found.depth, found.triangle

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -10,18 +9,9 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.dicom.ct_series import CtSeries
-from puncture_twin.planning.formats.dicom.named_masks import NamedMasks
-from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
-from puncture_twin.planning.formats.dicom.storage import Kind
-from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
-from puncture_twin.planning.formats.labels.slicer_segments import parse_segments
-from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
+from puncture_twin.planning.case.tables.structures_section import StructuresSection
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.init.segmentation import Assigned, Place, quoted, rules_text
-
-NEEDS_SERIES = "an RTSTRUCT needs the CT on which it was drawn, as a DICOM series"
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,42 +54,20 @@ class FileMasks:
         return f"[[structures]]\n{self.key} = {quoted(self.source)}\n{rules_text(rows)}"
 
 
-def dicom_masks(place: Place, source: str, kind: Kind, ct: VolumeSource | None) -> FileMasks:
-    """The structures of a file, on the slices of the CT.
+def file_masks(place: Place, source: str, key: str, ct: str | None) -> FileMasks:
+    """The structures of a file: of DICOM on the slices of the CT, or segments of Slicer, of which some overlap.
 
     Args:
         place: The case's folder.
         source: The file.
-        kind: What it is.
-        ct: The CT of the case.
+        key: Of the case: ``seg`` or ``rtstruct``.
+        ct: The CT of the case, read before, or None.
 
     Raises:
         InputError: Structures that cannot be trusted, or were drawn on another CT.
     """
-    path, series = place.folder / source, ct if isinstance(ct, CtSeries) else None
-    if kind is Kind.SEGMENTATION:
-        key, found = "seg", parse_segmentation(path, source, place.content, series)
-    elif series is None:
-        raise InputError(NEEDS_SERIES, where=path, allowed="the folder of that series beside it")
-    else:
-        key, found = "rtstruct", parse_structure_set(path, source, place.content, series)
-    return _named(place, source, key, found)
-
-
-def layered_masks(place: Place, source: str) -> FileMasks:
-    """The segments of a segmentation of Slicer, of which some overlap.
-
-    Raises:
-        InputError: Segments that cannot be trusted.
-    """
-    return _named(place, source, "seg", parse_segments(place.folder / source, source, place.content))
-
-
-def _named(place: Place, source: str, key: str, found: NamedMasks) -> FileMasks:
-    parts = {}
-    for name, mask in found.masks.items():
-        hashes = (hashlib.sha256(place.content(file)).hexdigest() for file in mask.files)
-        surfaces = VolumeSurfaces(mask, (*hashes, *mask.part), place.cache)
-        if (value := surfaces.mask_label()) is not None:
-            parts[name] = (surfaces, value)
-    return FileMasks(source, key, parts, found.notes)
+    place.content(source)
+    place.volumes.read_masks(StructuresSection.model_validate({key: source}), ct)
+    read = {name: place.surfaces(volume) for name, volume in place.volumes.masks(source).items()}
+    parts = {name: (surfaces, value) for name, surfaces in read.items() for value in surfaces.mask().labels}
+    return FileMasks(source, key, parts, place.volumes.mask_notes(source))

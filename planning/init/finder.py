@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import is_folder, is_plain_file
+from puncture_twin.planning.base.output.manifest import is_output_folder
 from puncture_twin.planning.formats.dicom.recognise import list_folder
 from puncture_twin.planning.formats.dicom.storage import Kind
-from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
-from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, UNREAD, UNREAD_VOLUMES
+from puncture_twin.planning.formats.folder import FILE, FOLDER, NOT_READ, Entry, entries, unaccounted
+from puncture_twin.planning.formats.labels.labelmaps import labelmap_of, whole_labels
+from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, not_read
+from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS
 from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.geometry.units import Unit
-from puncture_twin.planning.init.file_masks import dicom_masks, layered_masks
+from puncture_twin.planning.init.file_masks import file_masks
 from puncture_twin.planning.init.label_files import Mask, Masks, label_file, mask_of
 from puncture_twin.planning.init.mesh_folder import is_mesh, mesh_folder
 from puncture_twin.planning.init.segmentation import Place, Segmentation
@@ -31,16 +35,26 @@ DEPTH = 2
 """Levels of folders below the one that is given."""
 AIR_HU = -200
 """A CT of a body shows something less dense than fat: air or lung."""
-MOST_LABELS = 1000
-"""A map with more different labels is an image."""
-DRAWN = (Kind.SEGMENTATION, Kind.STRUCTURE_SET)
+MOST_LABELS, FEW_LABELS = 1000, 20
+"""A map with more different labels is an image, and one with fewer is none."""
+MANY_PAIRS, LEAST_ALIKE = 1000, 0.5
+"""Of so many pairs of neighbours more than half are alike in labels (97 to 99 % where it was tried; in a CT 3 %)."""
+MOST_AIR = 200
+"""Up to here the most frequent value of an image without Hounsfield units is taken for air that is stored from 0 on."""
+OTHER = "other"
+BESIDE = {"": NAME_ENDINGS, "meshes": (".mtl", ".png", ".jpg", ".jpeg", ".bmp")}
+"""Endings of what may lie beside meshes alone, or in a folder of several things: materials, and tables of names."""
+STRUCTURE_LIKE = re.compile(
+    r"\.(nii|nrrd|nhdr|mha|mhd|hdr|img|mgz|mgh|mnc|npz|npy|dcm|stl|obj|ply|glb|gltf|vtp|vtk|vtu|3mf|wrl)(\.|$)"
+)
+"""Names of what may be a structure: of volumes and meshes, also those that are not read, packed or cut."""
+DRAWN = {Kind.SEGMENTATION: "seg", Kind.STRUCTURE_SET: "rtstruct"}
+"""DICOM files of structures, and the key of the case for each."""
 POINT_ENDINGS = (".csv", ".mrk.json", ".fcsv")
 MOST_ENTRIES = 5_000
 """Files and folders of a patient's folder; more are a disk, or a DICOM archive."""
 LEAST_MARKERS = 3
 """Fewer register nothing."""
-MANIFEST = "manifest.json"
-"""A folder that holds it was written by this program."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +106,7 @@ class Found:
         segmentations: Label maps, masks, meshes.
         markers: Lists of at least three points.
         problems: What could not be read or told, one line each.
-        notes: What is neither.
+        passed: What was not read, with the reason.
         drawn: DICOM files of structures, which are read once the CT is known.
     """
 
@@ -100,7 +114,7 @@ class Found:
     segmentations: list[Segmentation] = field(default_factory=list)
     markers: list[Markers] = field(default_factory=list)
     problems: list[InputError] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    passed: list[tuple[str, str]] = field(default_factory=list)
     drawn: list[tuple[str, Kind]] = field(default_factory=list)
 
 
@@ -115,85 +129,93 @@ def find(place: Place, wanted: Wanted) -> Found:
         InputError: A folder that cannot be read, or is no patient's.
     """
     found = Found()
-    for folder, files in _folders(place.folder, DEPTH):
-        _Looker(place, wanted, folder, files, found).look()
-    ct = found.cts[0].surfaces.source if found.cts else None
+    for folder, listed, entered in _folders(place.folder, DEPTH):
+        _Looker(place, wanted, folder, listed, found).look(entered)
+    ct = found.cts[0].source if found.cts else None
     for name, kind in found.drawn:
         try:
-            found.segmentations.append(dicom_masks(place, name, kind, ct))
+            found.segmentations.append(file_masks(place, name, DRAWN[kind], ct))
         except InputError as error:
             found.problems.append(error)
     return found
 
 
-def _folders(folder: Path, depth: int) -> Iterator[tuple[Path, list[Path]]]:
-    """A folder with its files, and those below it, but for hidden ones and this program's outputs."""
-    entries = _entries(folder)
-    yield folder, [one for one in entries if is_plain_file(one)]
-    if depth > 0:
-        for one in entries:
-            if is_folder(one) and not is_plain_file(one / MANIFEST):
-                yield from _folders(one, depth - 1)
-
-
-def _entries(folder: Path) -> list[Path]:
-    """What lies in a folder, sorted, but for hidden files.
-
-    Raises:
-        InputError: It cannot be read, or holds too much.
-    """
+def _folders(folder: Path, depth: int) -> Iterator[tuple[Path, tuple[Entry, ...], frozenset[str]]]:
+    """A folder, what lies in it and which folders in it are entered, and those below it; none of this program's."""
     allowed = f"a readable folder of one patient, with up to {MOST_ENTRIES} files"
-    try:
-        found = sorted(one for one in folder.iterdir() if not one.name.startswith("."))
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=folder, allowed=allowed) from error
-    if len(found) > MOST_ENTRIES:
-        raise InputError(f"holds {len(found)} files", where=folder, allowed=allowed)
-    return found
+    listed = entries(folder, most=MOST_ENTRIES, allowed=allowed)
+    below = [folder / one.name for one in listed if one.what == FOLDER] if depth > 0 else []
+    entered = [one for one in below if not is_output_folder(one)]
+    yield folder, listed, frozenset(one.name for one in entered)
+    for one in entered:
+        yield from _folders(one, depth - 1)
 
 
 class _Looker:
     """Asks each kind's recogniser about one folder."""
 
-    def __init__(self, place: Place, wanted: Wanted, folder: Path, files: Sequence[Path], found: Found) -> None:
+    def __init__(self, place: Place, wanted: Wanted, folder: Path, listed: tuple[Entry, ...], found: Found) -> None:
         self._place = place
         self._wanted = wanted
         self._found = found
         self._folder = folder
+        self._listed = listed
         self._source = folder.relative_to(place.folder).as_posix()
-        self._names = [one.relative_to(place.folder).as_posix() for one in files]
+        self._names = [self._name(one.name) for one in listed if one.what == FILE]
+        self._read: set[str] = set()
+        self._only = ""
 
-    def look(self) -> None:
-        """DICOM, volumes, meshes, points."""
+    def _name(self, entry: str) -> str:
+        return (PurePosixPath(self._source) / entry).as_posix()
+
+    def look(self, entered: Collection[str]) -> None:
+        """DICOM, volumes, meshes, points; and what is none of these."""
         self._dicom()
-        labels = [name for name in self._names if self._wanted.takes("labels", name)]
-        unread = [name for name in labels if name.lower().endswith(UNREAD_VOLUMES)]
-        self._found.problems += [InputError(UNREAD, where=self._place.folder / name, allowed="") for name in unread]
-        self._volumes([name for name in self._names if name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS)])
-        self._meshes([name for name in labels if is_mesh(name)])
+        volumes = [name for name in self._names if name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS)]
+        meshes = [name for name in self._names if is_mesh(name)]
+        self._read.update(volumes, meshes, map(self._name, entered))
+        self._volumes(volumes)
+        if meshes and not volumes:
+            self._only = "meshes"
+        self._meshes([name for name in meshes if self._wanted.takes("labels", name)])
         for name in self._names:
             if name.lower().endswith(POINT_ENDINGS):
                 self._points(name)
+        self._account()
+
+    def _account(self) -> None:
+        """What was not read: it is refused where it may be a structure, and else told."""
+
+        def known(path: Path) -> bool:
+            name = path.relative_to(self._place.folder).as_posix()
+            return name in self._read or path.name.lower().endswith(BESIDE.get(self._only, ()))
+
+        left = unaccounted(self._folder, self._listed, known)
+        wanted = [one for one in left if self._wanted.takes("labels", self._name(one.name))]
+        if lost := [one for one in wanted if self._only or STRUCTURE_LIKE.search(one.name.lower())]:
+            self._found.problems.append(not_read(lost, self._only or "files", self._folder))
+        self._found.passed += [(self._name(one.name), one.what or NOT_READ) for one in left if one not in lost]
 
     def _dicom(self) -> None:
         """Each CT series of the folder: it is named by the folder, or where there are several by a file of each."""
         try:
-            files = list_folder(self._folder)
+            files, _ = list_folder(self._folder)
+            self._read.update(self._name(one.name) for one in files)
             series = {one.series_uid: one.name for one in reversed(files) if one.is_slice}
-            names = {uid: (PurePosixPath(self._source) / file).as_posix() for uid, file in series.items()}
+            names = {uid: self._name(file) for uid, file in series.items()}
             for name in sorted(names.values()) if len(names) > 1 else [self._source][: len(names)]:
                 if self._wanted.takes("ct", name):
                     self._found.cts.append(Ct(name, self._place.volume(name)))
         except InputError as error:
             self._found.problems.append(error)
+            self._read.update(self._names)
             return
         for one in files:
-            name = (PurePosixPath(self._source) / one.name).as_posix()
+            name = self._name(one.name)
             if one.kind in DRAWN and self._wanted.takes("labels", name):
                 self._found.drawn.append((name, one.kind))
         others = Counter(one.sop_class for one in files if one.kind not in {Kind.CT, *DRAWN})
-        for kind, count in sorted(others.items()):
-            self._found.notes.append(f"{self._source}: {count} {kind} left out")
+        self._found.passed += [(self._source, f"{count} {kind}") for kind, count in sorted(others.items())]
 
     def _volumes(self, names: Sequence[str]) -> None:
         """CTs and label maps one by one; masks together, as a folder of masks where it holds nothing else."""
@@ -207,6 +229,7 @@ class _Looker:
         if not masks:
             return
         alone = len(masks) + len(empty) == len(names) and all(one.lower().endswith(MASK_ENDINGS) for one in names)
+        self._only = "masks" if alone else ""
         numbered = dict(enumerate(masks, start=1))
         said = () if alone or not empty else (f"empty masks, so that nothing is there: {', '.join(empty)}",)
         self._found.segmentations.append(Masks(self._place, self._source, numbered, said, alone))
@@ -216,11 +239,12 @@ class _Looker:
             return
         if name.lower().endswith(SEGMENT_ENDING) and is_layered(self._place.content(name), self._place.folder / name):
             if self._wanted.takes("labels", name):
-                self._found.segmentations.append(layered_masks(self._place, name))
+                self._found.segmentations.append(file_masks(self._place, name, "seg", None))
             return
         surfaces = self._place.volume(name)
-        kind = volume_kind(surfaces.volume)
-        if kind != "other" and not self._wanted.takes(kind, name):
+        self._read.update(surfaces.source.files)
+        kind, why = volume_kind(surfaces.volume)
+        if kind != OTHER and not self._wanted.takes(kind, name):
             return
         if kind == "ct":
             self._found.cts.append(Ct(name, surfaces))
@@ -236,7 +260,7 @@ class _Looker:
             self._label_file(name, surfaces)
         else:
             self._refuse_spoiled_mask(surfaces.volume, name)
-            self._found.notes.append(f"{name}: neither a CT in Hounsfield units nor labels; left out")
+            self._found.passed.append((name, why))
 
     def _refuse_spoiled_mask(self, volume: Volume, name: str) -> None:
         """A probability, or a mask with -1 or without background: an organ that would be left out."""
@@ -258,25 +282,44 @@ class _Looker:
             self._found.problems.append(error)
 
     def _points(self, name: str) -> None:
-        """Other tables are no lists of points, and no problem."""
+        """Other tables are no lists of points, and no problem; a list of Slicer's is nothing else."""
         try:
             points = read_points(self._place.folder / name, default_space=self._wanted.space, default_unit=Unit.MM)
-        except InputError:
+        except InputError as error:
+            if not name.lower().endswith(".csv"):
+                self._found.passed.append((name, error.what))
             return
         if len(points.names) >= LEAST_MARKERS:
             self._found.markers.append(Markers(name, points))
 
 
-def volume_kind(volume: Volume) -> str:
-    """What a volume shows: ``ct`` (Hounsfield units), ``labels`` (few whole numbers from 0 on), or ``other``."""
-    values = volume.values
-    low, high = float(values.min()), float(values.max())
+def volume_kind(volume: Volume) -> tuple[str, str]:
+    """What a volume shows: ``ct`` (Hounsfield units), ``labels`` (few whole numbers from 0 on), or ``other``, and why.
+
+    Raises:
+        InputError: A label map that was blended by an interpolation.
+    """
+    low, high = float(volume.values.min()), float(volume.values.max())
     if low <= AIR_HU:
-        return "ct" if high > 0 else "other"
-    if low < 0 or high > np.iinfo(np.uint16).max:
-        return "other"
-    whole = values.astype(np.uint16)
-    if values.dtype.kind == "f" and not np.array_equal(whole, values):
-        return "other"
-    counts = np.bincount(whole.ravel(order="K"))
-    return "labels" if counts[0] > 0 and np.count_nonzero(counts) <= MOST_LABELS else "other"
+        return ("ct", "") if high > 0 else (OTHER, f"no CT: nothing is above 0, from {low:g} to {high:g}")
+    try:
+        whole, _ = whole_labels(volume.values, volume.path)
+    except InputError as error:
+        if error.code == "labels_blended":
+            raise
+        return OTHER, f"{error.what}, and for Hounsfield units nothing is below {AIR_HU}"
+    counts = np.bincount(np.asarray(whole).ravel(order="K"))
+    different = np.count_nonzero(counts)
+    if different > MOST_LABELS or (different > FEW_LABELS and _differs_everywhere(whole)):
+        air = int(np.argmax(counts))
+        offset = ": is an offset of -1024 missing, or is it no CT?" if air <= MOST_AIR else ""
+        return OTHER, f"no Hounsfield units, its air is {air}{offset}"
+    return ("labels", "") if counts[0] > 0 else (OTHER, "no voxel is 0, the background of labels")
+
+
+def _differs_everywhere(whole: NDArray[np.integer]) -> bool:
+    """Whether most neighbours differ, as the noise of an image makes them: within labels nearly all are alike."""
+    near, far = whole[:-1], whole[1:]
+    inside = (near > 0) & (far > 0)
+    pairs, alike = np.count_nonzero(inside), np.count_nonzero(inside & (near == far))
+    return bool(pairs > MANY_PAIRS and alike < LEAST_ALIKE * pairs)

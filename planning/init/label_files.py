@@ -12,8 +12,10 @@ from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.formats.folder import entries
 from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
-from puncture_twin.planning.formats.labels.mask_folder import structure_name
+from puncture_twin.planning.formats.labels.mask_folder import MAX_ENTRIES, structure_name
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES, names_for
 from puncture_twin.planning.formats.labels.numbering import label_centres, likely_numbering, plausibility
@@ -23,8 +25,7 @@ from puncture_twin.planning.init.segmentation import Assigned, Place, margin_lin
 
 NUMBERING_FOUND = "{source}: numbered as {naming}, told by where its organs lie"
 NUMBERING_UNSURE = (
-    "whether totalsegmentator-v1 or -v2 numbered its labels is not told by where its organs lie, and no table of names "
-    "is beside it: --naming totalsegmentator-v1, totalsegmentator-v2 or a table (CSV, JSON) decides"
+    "{tables}, and where its organs lie does not tell whether totalsegmentator-v1 or -v2 numbered its labels"
 )
 
 
@@ -177,7 +178,7 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
 
 
 def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence[int]) -> tuple[str, tuple[str, ...]]:
-    table = _one_table(place, source, present)
+    table, others = _one_table(place, source, present)
     if table is not None:
         name, names = table
         if plausibility(names, label_centres(labels)).fails:
@@ -186,31 +187,52 @@ def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence
         return name, (f"{source}: names from {name}",)
     naming = likely_numbering(labels)
     if naming is None:
-        allowed = f"--naming with {', '.join(BUILT_IN)} or a table"
-        raise InputError(NUMBERING_UNSURE, where=place.folder / source, allowed=allowed)
-    return naming, (NUMBERING_FOUND.format(source=source, naming=naming),)
+        passed = f"no table beside it names all of its labels: {first_few(others)}"
+        tables = passed if others else "no table of names is beside it"
+        raise InputError(
+            NUMBERING_UNSURE.format(tables=tables),
+            where=place.folder / source,
+            allowed=f"--naming with {', '.join(BUILT_IN)} or a table (CSV, JSON) that names every label",
+            code="labels_without_names",
+        )
+    return naming, (NUMBERING_FOUND.format(source=source, naming=naming), *(f"{source}: {one}" for one in others))
 
 
-def _one_table(place: Place, source: str, present: Sequence[int]) -> tuple[str, dict[int, str]] | None:
+def _one_table(
+    place: Place, source: str, present: Sequence[int]
+) -> tuple[tuple[str, dict[int, str]] | None, list[str]]:
     """The table beside a map that names all of its labels: the one named like the map, else the only one.
+
+    Returns:
+        The table, and why others are none, a sentence each.
 
     Raises:
         InputError: Several tables name them in other ways.
     """
-    found = []
+    found, others = [], []
     for table in _tables_beside(place.folder, source):
         try:
             names = parse_names(_table(place.folder / table), place.folder / table)
-        except InputError:
+        except InputError as error:
+            others.append(f"{table}: {error.what}")
             continue
-        if set(present) <= names.keys():
+        if missing := [label for label in present if label not in names]:
+            others.append(f"{table} lacks {_ranges(missing)} (it names {_ranges(sorted(names))})")
+        else:
             found.append((table, names))
     if not found or _is_named_like(found[0][0], source):
-        return found[0] if found else None
+        return (found[0] if found else None), others
     if any([other[label] for label in present] != [found[0][1][label] for label in present] for _, other in found[1:]):
         what = f"several tables name its labels in other ways: {', '.join(table for table, _ in found)}"
         raise InputError(what, where=place.folder / source, allowed="--naming with the table that is right")
-    return found[0]
+    return found[0], others
+
+
+def _ranges(labels: Sequence[int]) -> str:
+    """Rising numbers as runs, such as ``1 to 8, 12``."""
+    starts = [one for one in labels if one - 1 not in labels]
+    ends = [one for one in labels if one + 1 not in labels]
+    return first_few([f"{a}" if a == b else f"{a} to {b}" for a, b in zip(starts, ends, strict=True)])
 
 
 def _is_named_like(table: str, source: str) -> bool:
@@ -221,9 +243,9 @@ def _is_named_like(table: str, source: str) -> bool:
 def _tables_beside(folder: Path, source: str) -> Iterator[str]:
     """Files that may be tables of names, those first that are named like the map."""
     parent = (folder / source).parent
-    files = [one for one in parent.iterdir() if one.name.lower().endswith(NAME_ENDINGS) and one.is_file()]
-    for one in sorted(files, key=lambda file: (not _is_named_like(file.name, source), file.name)):
-        yield one.relative_to(folder).as_posix()
+    files = [one.name for one in entries(parent, most=MAX_ENTRIES) if one.name.lower().endswith(NAME_ENDINGS)]
+    for name in sorted(files, key=lambda file: (not _is_named_like(file, source), file)):
+        yield (parent / name).relative_to(folder).as_posix()
 
 
 def _table(path: Path) -> bytes:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.skin import flat_ends
+from puncture_twin.planning.anatomy.skin import Skin, flat_ends, skin_from_mesh
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, mesh_extent, read_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.geometry.units import Unit
-from puncture_twin.planning.init.segmentation import Assigned, Place, margin_line, quoted
+from puncture_twin.planning.init.outlines import named_like_body
+from puncture_twin.planning.init.segmentation import Assigned, Place, Segmentation, margin_line, quoted
 
 LEAST_EXTENT = ((Unit.MM, 130.0), (Unit.CM, 5.0), (Unit.M, 0.0))
 """From which diagonal of all meshes together on a unit is guessed. A body in mm, with its skin, is seldom smaller than
@@ -107,7 +110,8 @@ def mesh_folder(place: Place, source: str, names: Sequence[str], space: Space, s
     """
     if len({mesh_name(one) for one in names}) < len(names):
         raise InputError("two meshes have one name", where=place.folder / source, allowed="one mesh a structure")
-    boxes = np.stack([mesh_extent(place.folder / name) for name in names])
+    extents = [mesh_extent(place.folder / name) for name in names]
+    boxes = np.stack([one.box for one in extents])
     diagonal = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
     if stated is None and BOTH_MM_AND_CM[0] <= diagonal < BOTH_MM_AND_CM[1]:
         what = f"{diagonal:.0f} units from corner to corner: a small body in mm, or a large one in cm"
@@ -115,12 +119,64 @@ def mesh_folder(place: Place, source: str, names: Sequence[str], space: Space, s
     unit = stated or next(one for one, least in LEAST_EXTENT if diagonal >= least)
     guess = "as stated" if stated else "guessed by their extent (--unit says otherwise)"
     said = (
-        f"{source}: {len(names)} meshes in {unit} ({guess}) and {space}, together {diagonal * unit.mm:.0f} mm from "
-        "corner to corner; no mesh file says either"
+        f"{source}: {len(names)} meshes in {unit} ({guess}) and {_spaces([one.space for one in extents], space)}, "
+        f"together {diagonal * unit.mm:.0f} mm from corner to corner; no mesh file says its unit"
     )
     return MeshFolder(place, source, dict(enumerate(sorted(names), start=1)), unit, space, (said,))
+
+
+def _spaces(stated: Sequence[Space | None], space: Space) -> str:
+    """Of what space meshes are: of what their files state, else of what the user does."""
+    counts = Counter(stated)
+    parts = [f"{one}, as {count} of their files state" for one, count in counts.items() if one]
+    return " and ".join([*parts, f"{space}, which {counts[None]} of them do not state"] if counts[None] else parts)
 
 
 def is_mesh(name: str) -> bool:
     """Whether a file's ending is that of a mesh."""
     return name.lower().endswith(MESH_SUFFIXES)
+
+
+LEAST_HELD = 0.9
+"""Of the other meshes, which the skin holds: a line or a bed may have been drawn too, and lies outside."""
+
+SLACK_MM = 2.0
+"""So far a mesh may reach out of the skin's box: both were drawn."""
+
+
+class SkinMesh(NamedTuple):
+    """A mesh that may be the skin."""
+
+    folder: MeshFolder
+    label: int
+
+    @property
+    def name(self) -> str:
+        """Of the structure."""
+        return self.folder.names[self.label]
+
+    @property
+    def mesh(self) -> TriangleMesh:
+        """LPS mm."""
+        return self.folder.surface(self.label)
+
+    def skin(self) -> Skin:
+        """The skin that it is, with flat ends as cuts."""
+        return skin_from_mesh(self.mesh, flat_ends(self.mesh))
+
+
+def skin_mesh(segmentations: Sequence[Segmentation]) -> SkinMesh | None:
+    """The largest mesh that is named like the body, or None."""
+    folders = [one for one in segmentations if isinstance(one, MeshFolder)]
+    named = [SkinMesh(one, label) for one in folders for label, name in one.names.items() if named_like_body(name)]
+    return max(named, key=lambda one: float(np.ptp(one.mesh.bounds, axis=0).prod()), default=None)
+
+
+def skin_problems(found: SkinMesh, segmentations: Sequence[Segmentation]) -> Iterator[str]:
+    """Why it cannot be the skin: what lies outside of a skin counts as air beside the patient."""
+    folders = [one for one in segmentations if isinstance(one, MeshFolder)]
+    others = [one.surface(label) for one in folders for label in one.names if SkinMesh(one, label) != found]
+    low, high = found.mesh.bounds
+    held = [bool(np.all((one.bounds[0] >= low - SLACK_MM) & (one.bounds[1] <= high + SLACK_MM))) for one in others]
+    if sum(held) < LEAST_HELD * len(held):
+        yield f"'{found.name}' is named like the skin, but holds {sum(held)} of the {len(held)} other meshes"

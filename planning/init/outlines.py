@@ -20,7 +20,7 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.init.segmentation import Segmentation
+from puncture_twin.planning.init.segmentation import Assigned, Segmentation
 
 NEAR_MM, NEAR = 8.0, 0.02
 """An outline follows the skin to 8 mm: the coarsest voxels in use are 6 mm wide. In a small body, such as an animal's,
@@ -127,3 +127,36 @@ def _points(mesh: TriangleMesh, faces: Bools, count: int) -> Floats:
     a, b = np.where(a + b > 1.0, 1.0 - a, a), np.where(a + b > 1.0, 1.0 - b, b)
     first, second, third = np.moveaxis(corners[rows], 1, 0)
     return np.asarray(first + a * (second - first) + b * (third - first))
+
+
+BORDER_MM = 2.0
+"""The surfaces of two labels that border on each other are this near: both lie between the same voxels."""
+
+MOST_OF_BORDER = 0.5
+"""Of the target's surface, which an organ about it borders on; one below the organ's surface has more."""
+
+
+def carved_notes(sources: Sequence[tuple[Segmentation, Sequence[Assigned]]]) -> Iterator[str]:
+    """That an avoided structure goes round the target's, one sentence each.
+
+    Args:
+        sources: Each segmentation with what the case says of its structures.
+    """
+    rows = [(segmentation, row) for segmentation, some in sources for row in some]
+    targets = [(one.surface(row.label), row.name) for one, row in rows if row.kind == "target"]
+    for target, name in targets:
+        for segmentation, row in rows:
+            if row.kind == "avoid" and _goes_round(segmentation.surface(row.label), target):
+                yield (
+                    f"'{row.name}' goes round '{name}' without holding it, as if that was carved out of it, and is "
+                    f"avoided by {row.margin_mm:g} mm, so no path through it is safe: if a path may cross it, make it "
+                    "traverse in the case"
+                )
+
+
+def _goes_round(mesh: TriangleMesh, target: TriangleMesh) -> bool:
+    low, high = mesh.bounds
+    below, above = target.bounds
+    if (above < low - BORDER_MM).any() or (below > high + BORDER_MM).any():
+        return False
+    return fraction_near(target, mesh, BORDER_MM) >= MOST_OF_BORDER

@@ -10,12 +10,14 @@ from puncture_twin.planning.anatomy.crossed_names import named_as_crossed, named
 from puncture_twin.planning.anatomy.default_roles import (
     BODY,
     LESION,
+    NOT_ANNOTATED,
     UNKNOWN_NAME,
     DefaultRole,
     default_role,
     never_crossed,
 )
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
+from puncture_twin.planning.formats.labels.naming import DEMANDING
 from puncture_twin.planning.init.segmentation import Assigned
 
 LEAST_SHOWN = 0.3
@@ -76,7 +78,7 @@ def _around_target(label: int, name: str, line: DefaultRole) -> Assigned:
     """Of a structure that holds the target too, and no vessel or the like: crossed only if its name tells it wholly."""
     if named_as_crossed(name):
         return Assigned(label, name, "traverse", 0.0, line)
-    line = line if line.kind == "avoid" else UNKNOWN_NAME
+    line = line if line.kind in DEMANDING else UNKNOWN_NAME
     return Assigned(label, name, "unknown", line.margin_mm, line)
 
 
@@ -85,7 +87,9 @@ def role_notes(rows: Sequence[Assigned], holding: Holding) -> Iterator[str]:
     unknown = [row.name for row in rows if row.line == UNKNOWN_NAME and row.kind == "avoid"]
     if unknown:
         yield f"not in the table of default roles, so avoided by {UNKNOWN_NAME.margin_mm:g} mm: {_list(unknown)}"
-    doubted = [row.name for row in rows if row.kind == "unknown"]
+    if left_open := [row.name for row in rows if row.line == NOT_ANNOTATED and row.kind == "unknown"]:
+        yield f"{NOT_ANNOTATED.group}, so paths through them are unknown_region: {_list(left_open)}"
+    doubted = [row.name for row in rows if row.kind == "unknown" and row.line != NOT_ANNOTATED]
     if doubted:
         yield (
             f"they hold the target too, and are not known as organs that a needle crosses, so paths through them are "

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from puncture_twin.planning.anatomy.default_roles import DefaultRole
+from puncture_twin.planning.anatomy.default_roles import NOT_ANNOTATED, DefaultRole
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.progress import Names, unnamed
-from puncture_twin.planning.formats.dicom.choose_series import choose_series
-from puncture_twin.planning.formats.dicom.ct_series import parse_series
-from puncture_twin.planning.formats.dicom.storage import is_series
-from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, data_file
-from puncture_twin.planning.formats.volumes.volume_source import Content, VolumeFile
+from puncture_twin.planning.base.provenance import InputFiles
+from puncture_twin.planning.case.case_volumes import CaseVolumes
+from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+CASE_FILE = "case.toml"
+"""What the new case will be called."""
 
 HOLDS_TARGET = "it holds the target too, and its name is not known as that of an organ that a needle crosses"
 """Why a structure is unknown."""
@@ -80,6 +79,12 @@ class Place:
     folder: Path
     cache: Cache
     progress: Names = unnamed
+    files: InputFiles = field(init=False)
+    volumes: CaseVolumes = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "files", InputFiles(self.folder))
+        object.__setattr__(self, "volumes", CaseVolumes(self.files, self.folder / CASE_FILE))
 
     def volume(self, name: str) -> VolumeSurfaces:
         """A volume file of the folder, or a DICOM series.
@@ -87,29 +92,20 @@ class Place:
         Raises:
             InputError: It cannot be read.
         """
-        read = self.content
-        if is_series(self.folder / name):
-            return self._series(name, read)
-        content = read(name)
-        beside = data_file(content, self.folder / name)
-        names = (name,) if beside is None else (name, str(PurePosixPath(name).with_name(beside)))
-        hashes = [hashlib.sha256(content).hexdigest(), *(hashlib.sha256(read(one)).hexdigest() for one in names[1:])]
-        source = VolumeFile(self.folder / name, names, read)
-        return VolumeSurfaces(source, (*hashes, *source.part), self.cache)
+        self.progress(name)
+        self.volumes.read("ct", name, key=name)
+        return self.surfaces(name)
 
     def content(self, name: str) -> bytes:
         """The bytes of a file of the folder."""
         self.progress(name)
-        return read_input(self.folder / name, max_bytes=MAX_FILE_BYTES, where=str(self.folder / name))
+        return self.files.read("file", name, max_bytes=MAX_FILE_BYTES, key=name, where=self.folder / CASE_FILE)
 
-    def _series(self, name: str, read: Content) -> VolumeSurfaces:
-        """A folder with one series, or the series of one file."""
-        path = self.folder / name
-        chosen = choose_series(path)
-        inside = PurePosixPath(name) if chosen.folder == path else PurePosixPath(name).parent
-        files = [str(inside / file) for file in chosen.names]
-        hashes = tuple(hashlib.sha256(read(file)).hexdigest() for file in files)
-        return VolumeSurfaces(parse_series(path, files, read, chosen.notes), hashes, self.cache)
+    def surfaces(self, name: str) -> VolumeSurfaces:
+        """The surfaces of a volume that was read, or of one structure of a file of structures."""
+        self.files.release()
+        source = self.volumes.source(name)
+        return VolumeSurfaces(source, (*map(self.files.sha256, source.files), *source.part), self.cache)
 
 
 def quoted(text: str) -> str:
@@ -123,7 +119,7 @@ def margin_line(row: Assigned) -> str:
         return ""
     change = f'# {HOLDS_TARGET}: role = "traverse", without a margin, if a path may cross it\n'
     reason = f"margin_mm = {row.margin_mm:g}  # {row.line.group}: {row.line.reason}\n"
-    return reason + (change if row.kind == "unknown" else "")
+    return reason + (change if row.kind == "unknown" and row.line != NOT_ANNOTATED else "")
 
 
 def rules_text(rows: Sequence[Assigned]) -> str:
@@ -136,6 +132,7 @@ def rules_text(rows: Sequence[Assigned]) -> str:
     for kind, head in (("avoid", ""), ("unknown", f"# {HOLDS_TARGET}: into traverse = [...] if a path may cross it\n")):
         demanding = [row for row in rows if row.kind == kind]
         if demanding:
+            head = "" if all(row.line == NOT_ANNOTATED for row in demanding) else head
             parts.append(f"\n[structures.{kind}]  # margins, mm\n{head}{_grouped(demanding)}")
     return "".join(parts)
 

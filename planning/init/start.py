@@ -14,18 +14,18 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError, InputListError
 from puncture_twin.planning.base.progress import Names
+from puncture_twin.planning.base.text_names import first_few
 from puncture_twin.planning.evidence.target import readings_inside
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, point_text
-from puncture_twin.planning.init.carved import carved_notes
 from puncture_twin.planning.init.case_text import CaseParts, case_text
-from puncture_twin.planning.init.finder import Ct, Found, Markers, Wanted, find
-from puncture_twin.planning.init.outlines import Outlines
+from puncture_twin.planning.init.finder import AIR_HU, Ct, Found, Markers, Wanted, find
+from puncture_twin.planning.init.mesh_folder import SkinMesh, skin_mesh, skin_problems
+from puncture_twin.planning.init.outlines import Outlines, carved_notes
 from puncture_twin.planning.init.roles import assign, likely_region, role_notes
 from puncture_twin.planning.init.segmentation import Assigned, Place, Segmentation
-from puncture_twin.planning.init.skin_mesh import SkinMesh, skin_mesh, skin_problems
 from puncture_twin.planning.init.target import Target, label_target, parse_point, typed_target
 
 ALLOWED = "a folder with a CT (NIfTI, NRRD or a DICOM series) and a segmentation, see docs/how-to/your-own-ct.md"
@@ -124,22 +124,47 @@ def _checked(found: Found, point: Floats | None, request: Request) -> Ct | SkinM
     Raises:
         InputError: Everything that is missing, doubled or could not be read.
     """
-    problems = [f"{_below(error.where, request.folder)}: {error.what}" for error in found.problems]
+    problems = list(found.problems)
     cts = _holding(found.cts, point)
     if len(cts) > 1:
-        problems.append(f"several CTs: {', '.join(one.source for one in cts)} (--ct says which)")
+        problems.append(
+            _problem(f"several CTs: {', '.join(one.source for one in cts)} (--ct says which)", "several_cts")
+        )
     if not found.segmentations and not problems:
-        problems.append("no segmentation: no label map, masks or meshes")
+        problems.append(_problem(f"no segmentation (label map, masks or meshes){_lies(found)}", "no_segmentation"))
     mesh = None if cts else skin_mesh(found.segmentations)
     if mesh is not None:
-        problems += skin_problems(mesh, found.segmentations)
+        problems += [_problem(one, "no_skin") for one in skin_problems(mesh, found.segmentations)]
     elif not cts and not found.problems:
-        problems.append("no CT in Hounsfield units (min below -200), and no mesh named like the skin")
-    problems += _doubled(found.segmentations)
+        what = f"no CT in Hounsfield units (min below {AIR_HU}), and no mesh named like the skin{_lies(found)}"
+        problems.append(_problem(what, "no_ct"))
+    problems += [_problem(one, "doubled") for one in _doubled(found.segmentations)]
     body = cts[0] if cts else mesh
     if problems or body is None:
-        raise InputListError("; ".join(problems), where=request.folder, allowed=ALLOWED)
+        said = [
+            one.what if one.where == HERE else f"{_below(one.where, request.folder)}: {one.what}" for one in problems
+        ]
+        ways = dict.fromkeys(one.allowed for one in problems)
+        code = problems[0].code if problems else ""
+        raise InputListError("; ".join(said), where=request.folder, allowed="; ".join(ways), code=code)
     return body
+
+
+HERE = "folder"
+"""Where a problem of the folder itself is."""
+
+
+def _problem(what: str, code: str) -> InputListError:
+    return InputListError(what, where=HERE, allowed=ALLOWED, code=code)
+
+
+def _lies(found: Found) -> str:
+    """What lies in the folder, and why it is neither."""
+    taken = [(one.source, "a CT") for one in found.cts] + [
+        (one.source, "a segmentation") for one in found.segmentations
+    ]
+    listed = [f"{name} ({why})" for name, why in (*found.passed, *taken)]
+    return f"; here lies: {first_few(listed)}" if listed else "; nothing here is of a kind that is read"
 
 
 def _below(where: str, folder: Path) -> str:
@@ -194,7 +219,8 @@ def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:
 
 
 def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> Iterator[str]:
-    yield from found.notes
+    if found.passed:
+        yield f"left out: {first_few([f'{name} ({why})' for name, why in found.passed])}"
     others = [one.source for one in found.cts if one.source != parts.ct]
     if others and parts.ct is not None:
         yield f"the CT is {parts.ct}, which holds the target; left out: {', '.join(others)}"

@@ -9,7 +9,10 @@ import numpy as np
 import scipy
 
 from puncture_twin.planning.anatomy.default_roles import (
+    BODY,
+    NOT_ANNOTATED,
     DefaultRole,
+    default_role,
     never_crossed,
 )
 from puncture_twin.planning.base.arrays import Floats
@@ -82,7 +85,7 @@ def typed_target(
             numbers does.
     """
     holders = _holders(point_ct, outlines)
-    names = [name for name in holders if not named_like_body(name)]
+    names = [name for name in holders if default_role(name, "other") not in {BODY, NOT_ANNOTATED}]
     if not space_stated:
         _refuse_likelier(point_ct, outlines, space, names)
     if hit_radius_mm is not None:

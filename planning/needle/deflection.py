@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.needle.bevel_path import bevel_path, step_for
 from puncture_twin.planning.needle.shaft import Shaft
 from puncture_twin.planning.needle.tissue import Tissue

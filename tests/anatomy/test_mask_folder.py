@@ -115,6 +115,22 @@ def test_what_is_no_folder_of_masks_is_refused(tmp_path):
         load_case(case_of(tmp_path, 'masks = "seg"\nnaming = "a.csv"'))
 
 
+def test_what_the_case_names_may_lie_among_the_masks(tmp_path):
+    """The case itself, its meshes, another folder of masks in it; not a link to nothing, nor an organ in a folder."""
+    write_masks(tmp_path)
+    path = case_of(tmp_path, 'masks = "."')
+    write_mask(tmp_path / "more" / "rib.nii.gz", labels() == 3)
+    with pytest.raises(InputError, match=r"more \(is a folder\)") as caught:
+        load_case(path)
+    assert caught.value.code == "entries_not_read"
+    more = '[[structures]]\nmasks = "more"\navoid = {"rib" = 1.0}\n'
+    path.write_text(path.read_text().replace("[end]", f"{more}[end]"))
+    assert {one.role for one in load_case(path).inputs} >= {"mask organ", "mask rib", "mesh skin"}
+    (tmp_path / "more" / "vein.nii.gz").symlink_to("../annex/vein.nii.gz")
+    with pytest.raises(InputError, match=r"number 2.masks.*vein.nii.gz \(is a link to a file that is not there\)"):
+        load_case(path)
+
+
 def test_a_name_belongs_to_one_structure(tmp_path):
     """Also where one is a mask and the other a mesh."""
     write_masks(tmp_path / "seg")

@@ -292,7 +292,7 @@ def test_the_libraries_of_every_maker_are_in_the_key(maker):
 def test_the_code_that_makes_a_surface_is_in_its_stamp():
     """From reading a file to the surface: each of these modules decides what is kept."""
     names = closure([f"{PROJECT}/puncture_twin/planning/anatomy/surfaces.py"])
-    volumes = (f"formats/volumes/{name}" for name in ("nifti_header", "inflate", "voxels"))
+    volumes = (f"formats/volumes/{name}" for name in ("nifti_header", "voxels"))
     wanted = ("anatomy/skin", "anatomy/body/body_mask", "formats/labels/label_surface", *volumes)
     assert {f"{PROJECT}/puncture_twin/planning/{name}.py" for name in wanted} <= names
 
@@ -300,7 +300,7 @@ def test_the_code_that_makes_a_surface_is_in_its_stamp():
 def test_the_code_that_reads_a_volume_decides_what_is_kept_of_it(tmp_path, monkeypatch):
     """Readers of DICOM are handed in: the organ of the old one stayed when one was mended."""
     files = closure([f"{PROJECT}/{surfaces.READERS.replace('.', '/')}.py"])
-    dicom = [f"dicom/{name}" for name in ("ct_series", "tilt", "segmentation", "structure_set", "polygon_fill")]
+    dicom = [f"dicom/{name}" for name in ("ct_series", "stack", "segmentation", "structure_set")]
     assert {
         f"{PROJECT}/puncture_twin/planning/formats/{name}.py" for name in (*dicom, "labels/slicer_segments")
     } <= files

@@ -8,7 +8,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.breathing.lujan import fraction_within, positions
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 
 BREATHING = '[breathing]\namplitude_mm = 12.0\ndirection = "feet"\n{keys}\n[breathing.weights]\n"*" = 0.0\n'
 

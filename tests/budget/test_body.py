@@ -18,7 +18,7 @@ from puncture_twin.planning.breathing.lujan import fraction_within, mean_square_
 from puncture_twin.planning.budget.chain import Breath, chain_of, other_gauges
 from puncture_twin.planning.budget.what_if import changes, source_costs
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.needle.shaft import GAUGES, Shaft
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.reached_insertion import reached_insertion

@@ -37,19 +37,19 @@ IN_BASE = "name,x_mm,y_mm,z_mm\nA,0,400,85\nB,50,400,70\nC,0,460,60\nD,-40,370,7
 ROLES = [
     ("case", "case.toml"),
     ("target", "targets.csv"),
-    ("ct", "ct.nhdr"),
-    ("ct data", "ct.raw"),
     ("mesh organ", "organ.stl"),
     ("mesh rib", "rib.stl"),
-    ("labelmap", "bowel.nii.gz"),
-    ("labelmap", "vessels/labels.nhdr"),
-    ("labelmap data", "vessels/labels.raw"),
     ("naming", "names.csv"),
     ("markers_ct", "markers_ct.csv"),
     ("markers_base", "touch.csv"),
     ("truth_base", "truth.csv"),
+    ("ct", "ct.nhdr"),
+    ("ct data", "ct.raw"),
+    ("labelmap", "bowel.nii.gz"),
+    ("labelmap", "vessels/labels.nhdr"),
+    ("labelmap data", "vessels/labels.raw"),
 ]
-"""Of the case below, in the order of its sections."""
+"""Of the case below, in the order of its sections, volumes last."""
 
 CHANGES = {
     "case.toml": (b"# 1", b"# 2"),

@@ -396,11 +396,12 @@ def test_a_mask_in_another_format_is_not_passed_over(tmp_path, capfd, ending):
     assert init(capfd, tmp_path, "--target", TARGET)[0] == 0
     vein = image_of(inside((30, 0, 0), 9.0).astype(np.uint8), SPACING)
     sitk.WriteImage(vein, str(tmp_path / "seg" / f"vein.{ending}"))
-    with pytest.raises(InputError, match=rf"vein.{ending}: is a volume of a kind that is not read"):
+    with pytest.raises(InputError, match=rf"vein.{ending} \(of a kind") as caught:
         prepare(tmp_path, arm=False)
+    assert caught.value.code == "entries_not_read"
     code, _, said = init(capfd, tmp_path, "--target", TARGET, "--force")
     if ending == "mha":
-        assert code == 2 and "seg/vein.mha: is a volume" in said[0]
+        assert code == 2 and "seg: beside the masks lies what is not read" in said[0] and "vein.mha" in said[0]
     else:
         assert code == 0 and roles(tmp_path)["vein.nhdr"] == ("avoid", 3.0)
 

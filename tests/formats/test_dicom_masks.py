@@ -11,9 +11,8 @@ from skimage.draw import polygon2mask
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.dicom.ct_series import parse_series
-from puncture_twin.planning.formats.dicom.polygon_fill import polygon_fill
 from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
-from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set
+from puncture_twin.planning.formats.dicom.structure_set import parse_structure_set, polygon_fill
 
 SHAPE = (19, 15, 8)
 LEAN = np.array([0.0, 0.4, 2.5])

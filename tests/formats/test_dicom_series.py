@@ -8,12 +8,13 @@ import dicom_world as world
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
+from pydicom.encaps import encapsulate
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless
 
 from puncture_twin.planning.anatomy.body.unscanned import UNSCANNED_HU
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.dicom.choose_series import choose_series
-from puncture_twin.planning.formats.dicom.ct_series import UNMEASURED_HU, read_series
+from puncture_twin.planning.formats.dicom.ct_series import UNMEASURED_HU, parse_series, read_series
+from puncture_twin.planning.formats.dicom.recognise import choose_series
 
 HU = world.phantom().astype(np.float32) - 1024
 
@@ -254,7 +255,7 @@ def test_a_folder_without_a_series_says_what_it_holds(tmp_path, what):
         (tmp_path / "series 1").mkdir()
     elif what == "capture alone":
         world.write_series(tmp_path, [capture()])
-    told = {"folders": "were not entered", "capture alone": "1 Secondary Capture"}.get(what, "no DICOM file")
+    told = {"folders": r"series 1 \(is a folder\)", "capture alone": "1 Secondary Capture"}.get(what, "no DICOM file")
     with pytest.raises(InputError, match=f"no CT series here.*{told}"):
         read_series(tmp_path)
 
@@ -380,3 +381,64 @@ def test_other_transfer_syntaxes_are_refused_with_what_to_do(tmp_path, syntax):
         path.write_bytes(content[: at - 2] + len(new).to_bytes(2, "little") + new + content[at + len(old) :])
     with pytest.raises(InputError, match=f"transfer syntax .*{re.escape(syntax)}.*gdcmconv --raw"):
         read_series(folder)
+
+
+def test_a_gap_is_no_reason_to_delete_good_slices(tmp_path):
+    """Beside a gap of twelve steps each true step was less than a tenth of the largest one."""
+    slices = world.series(world.phantom((7, 5, 24)))
+    folder = world.write_series(tmp_path, slices[:10] + slices[22:])
+    with pytest.raises(InputError, match="12 slices are missing"):
+        read_series(folder)
+
+
+def test_a_class_that_only_the_meta_information_states_is_taken(tmp_path):
+    """Of a data set that says nothing of itself; it is told. What says another thing is believed."""
+    slices = world.series()
+    for one in slices:
+        one.SOPClassUID = ""
+    folder = world.write_series(tmp_path / "s", slices)
+    assert by_place(read_series(folder)) == expected(world.affine())
+    chosen = choose_series(folder)
+    series = parse_series(folder, chosen.names, lambda name: (folder / name).read_bytes(), chosen.notes)
+    assert any("4 files do not say what they are" in note for note in series.notes)
+    slices[2].SOPClassUID = world.CAPTURE_CLASS
+    with pytest.raises(InputError, match="uneven steps"):
+        read_series(world.write_series(tmp_path / "t", slices))
+
+
+def big_endian(path):
+    """Give a file the name of a transfer syntax in its meta information, of the same length."""
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"1.2.840.10008.1.2.1\0", b"1.2.840.10008.1.2.2\0", 1))
+
+
+def test_big_endian_is_refused_by_its_name_where_it_may_be_read(tmp_path):
+    """In a folder too, and not as a folder without a CT; what is no CT by its meta information is passed over."""
+    folder = world.write_series(tmp_path / "s", [*world.series(), capture()], [f"{n}" for n in range(5)])
+    big_endian(folder / "4")
+    assert by_place(read_series(folder)) == expected(world.affine())
+    big_endian(folder / "2")
+    with pytest.raises(InputError, match="Big Endian.*gdcmconv --raw") as caught:
+        read_series(folder)
+    assert caught.value.code == "transfer_syntax" and caught.value.where.endswith("2")
+
+
+def test_pixels_that_no_decoder_takes_are_named_by_their_syntax(tmp_path):
+    """A lossy JPEG of 12 bits is a whole file, not a damaged one."""
+    slices = world.series()
+    for one in slices:
+        one.file_meta.TransferSyntaxUID = "1.2.840.10008.1.2.4.51"
+        one.PixelData = encapsulate([b"\xff\xd8\xff\xdb\0\x04\0\0\xff\xd9"])
+        one["PixelData"].VR = "OB"
+        one["PixelData"].is_undefined_length = True
+    folder = world.write_series(tmp_path, slices)
+    with pytest.raises(InputError, match=r"JPEG Extended.*1\.2\.840\.10008\.1\.2\.4\.51") as caught:
+        read_series(folder)
+    assert caught.value.code in {"not_decoded", "no_decoder"} and "damaged" not in str(caught.value)
+
+
+def test_a_missing_rescaling_says_what_to_do(tmp_path):
+    """Nothing tells whether air is 0 or -1000."""
+    with pytest.raises(InputError) as caught:
+        read_series(world.write_series(tmp_path, changed(1, RescaleIntercept=None)))
+    assert caught.value.code == "no_rescale" and "-1024" in caught.value.allowed

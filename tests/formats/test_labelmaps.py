@@ -15,10 +15,13 @@ from places import REAL_CT
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.formats.volumes.volume_source import VolumeFile
 from puncture_twin.planning.geometry.decimation import decimated
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
@@ -192,6 +195,35 @@ def test_values_that_are_no_labels_are_refused(tmp_path: Path, value: float, mat
     values[1, 2, 3] = value
     with pytest.raises(InputError, match=match):
         labelmap_of(read_volume(write(tmp_path, values)))
+
+
+@pytest.mark.parametrize("off", [1e-5, 0.016, -0.016])
+def test_labels_that_are_nearly_whole_are_rounded_and_it_is_known(tmp_path: Path, off: float) -> None:
+    """As a slope leaves them: never cut off, which would make a 3 of 2.99997 a 2."""
+    values = np.zeros((4, 5, 6), dtype=np.float32)
+    values[1], values[2] = 3 + off, 65_535
+    labelmap = labelmap_of(read_volume(write(tmp_path, values)))
+    assert labelmap.labels_present() == (3, 65_535)
+    assert labelmap.rounded_by == pytest.approx(abs(off), rel=0.1)
+    found = VolumeSurfaces(VolumeFile(tmp_path / "a.nii.gz", ("a.nii.gz",), content_of(tmp_path)), (), NO_CACHE)
+    assert "were rounded" in found.present().notes(found.path)[0]
+
+
+def test_labels_that_an_interpolation_blended_are_refused_as_such(tmp_path: Path) -> None:
+    """Most voxels are whole, those at the borders are not; a probability or a dose is none of it."""
+    values = ndimage.zoom(np.pad(np.full((4, 4, 4), 5.0), 3), 2.0, order=1).astype(np.float32)
+    with pytest.raises(InputError, match="nearest") as caught:
+        labelmap_of(read_volume(write(tmp_path, values)))
+    assert caught.value.code == "labels_blended"
+    dose = np.random.default_rng(3).uniform(0.0, 60.0, (4, 5, 6)).astype(np.float32)
+    with pytest.raises(InputError) as caught:
+        labelmap_of(read_volume(write(tmp_path, dose)))
+    assert caught.value.code == "no_labels"
+
+
+def content_of(folder: Path) -> Callable[[str], bytes]:
+    """The bytes of its files."""
+    return lambda name: (folder / name).read_bytes()
 
 
 def segmentation(folder: Path, remarks: str) -> Path:

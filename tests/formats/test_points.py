@@ -60,6 +60,7 @@ def read(folder: Path, ending: str, data: str | bytes, **options: Any) -> NamedP
         pytest.param(".mrk.json", markups(coordinateUnits=["mm", "UCUM", "millimeter"]), id="markups-coded-unit"),
         pytest.param(".fcsv", FCSV, id="fcsv"),
         pytest.param(".fcsv", FCSV.replace("LPS", "1"), id="fcsv-system-1"),
+        pytest.param(".fcsv", FCSV.replace(",,\n", ",,,2,0\n"), id="fcsv-of-slicer-5"),
     ],
 )
 def test_every_form_gives_the_same_points_in_lps(tmp_path: Path, ending: str, text: str) -> None:
@@ -218,6 +219,8 @@ BROKEN: list[tuple[str, str, str | bytes, str]] = [
     ("fcsv-no-columns", ".fcsv", FCSV.replace("# columns", "# c"), r"columns \[\]"),
     ("fcsv-no-point", ".fcsv", "\n".join(FCSV.splitlines()[:3]), r"no point"),
     ("fcsv-line-cut", ".fcsv", FCSV[:-20], r"line 5: \d+ fields instead of 14|unexpected end"),
+    ("fcsv-not-defined", ".fcsv", FCSV.replace(",,\n", ",,,1,0\n"), r"line 4: position status '1'"),
+    ("fcsv-one-more", ".fcsv", FCSV.replace(",,\n", ",,,2\n"), r"line 4: 15 fields instead of 14"),
     ("fcsv-nan", ".fcsv", FCSV.replace("147", "nan"), r"line 4: 'nan' is not finite"),
 ]
 

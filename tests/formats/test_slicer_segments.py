@@ -146,3 +146,15 @@ def test_a_label_map_in_layers_says_how_it_is_read(tmp_path):
     ball(tmp_path / "organ.stl", 10.0)
     with pytest.raises(InputError, match=r'in layers; name such a file in \[\[structures\]\] seg = "FILE"'):
         load_anatomy(load_case(tmp_path))
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_voxels_of_a_segment_that_is_not_listed_are_not_lost(tmp_path, layers):
+    """The rib's remarks are gone, its voxels are there: it would count as free."""
+    data = seg_nrrd(layers=layers)
+    head, _, voxels = data.partition(b"\n\n")
+    lines = [line for line in head.split(b"\n") if not line.startswith(b"Segment2_")]
+    found = read(tmp_path, b"\n".join(lines) + b"\n\n" + voxels)
+    with pytest.raises(InputError) as caught:
+        found.masks["right lung"].volume()
+    assert caught.value.code == "label_without_segment" and "[2]" in caught.value.what

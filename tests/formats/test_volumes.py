@@ -20,6 +20,7 @@ from puncture_twin.planning.formats.volumes.nifti_header import TYPES
 from puncture_twin.planning.formats.volumes.nrrd_header import TYPES as NRRD_TYPES
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, refuse_lost_grid
 from puncture_twin.planning.formats.volumes.volume_source import VolumeFile
 
 SHAPE = (4, 5, 6)
@@ -316,7 +317,8 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
     ),
     "negative size": ("a.nii", nifti_bytes(dim=(3, -4, 5, 6, 1, 1, 1, 1)), "size"),
     "zero size": ("a.nii", nifti_bytes(dim=(3, 0, 5, 6, 1, 1, 1, 1)), "size"),
-    "4D": ("a.nii", nifti_bytes(dim=(4, 4, 5, 3, 2, 1, 1, 1)), "4 dimensions"),
+    "4D": ("a.nii", nifti_bytes(dim=(4, 4, 5, 3, 2, 1, 1, 1)), r"4 dimensions, sizes \(4, 5, 3, 2\)"),
+    "8D": ("a.nii", nifti_bytes(dim=(8, 4, 5, 6, 1, 1, 1, 1)), "8 dimensions"),
     "colour": ("a.nii", nifti_bytes(datatype=(128, 24)), "datatype 128"),
     "bits contradict the type": ("a.nii", nifti_bytes(datatype=(4, 32)), "datatype 4"),
     "NaN affine": ("a.nii", nifti_bytes(sform=SFORM * NAN), "NaN"),
@@ -356,6 +358,44 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
     ),
 }
 SIZED = ("sizes", "sizes: 30000 30000 30000")
+
+
+def test_axes_of_length_one_behind_the_three_of_space_are_none(tmp_path: Path) -> None:
+    """As programs for time series write a single volume; the voxels are those of three axes."""
+    plain = read_volume(write(tmp_path, "a.nii", nifti_bytes()))
+    nrrd = nrrd_bytes(
+        ("dimension", "dimension: 4"),
+        ("sizes", "sizes: 4 5 6 1"),
+        ("space directions", "space directions: (2,0,0) (0,3,0) (0,0,4) none"),
+        ("kinds", "kinds: domain domain domain list"),
+    )
+    files = {"b.nii": nifti_bytes(dim=(4, *SHAPE, 1, 1, 1, 1)), "c.nii": nifti_bytes(dim=(5, *SHAPE, 1, 1, 7, 7))}
+    for name, content in {**files, "d.nrrd": nrrd}.items():
+        other = read_volume(write(tmp_path, name, content))
+        np.testing.assert_array_equal(other.values, plain.values)
+        np.testing.assert_allclose(np.abs(other.T_ct_index), np.abs(plain.T_ct_index))
+
+
+@pytest.mark.parametrize(("shift", "turned"), [(5.0, False), (0.0, False), (5.0, True)])
+def test_labels_that_lost_their_grid_are_refused(shift: float, turned: bool) -> None:
+    """They have the image's voxels and begin at 0; a grid that begins at 0 where the image lies is its own."""
+    T = np.diag([2.0, 3.0, 4.0, 1.0])
+    if turned:  # the same image, stored from its other end
+        T[:3, :3] *= -1
+        T[:3, 3] = (np.array(SHAPE) - 1) * [2.0, 3.0, 4.0]
+    T[:3, 3] += shift
+    image, start = VolumeGrid(SHAPE, T, {}), np.diag([2.0, 3.0, 4.0, 1.0])
+    if shift:
+        with pytest.raises(InputError) as caught:
+            refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
+        assert caught.value.code == "grid_lost"
+    else:
+        refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
+    refuse_lost_grid(VolumeGrid((4, 5, 7), start, {}), image, where=Path("labels.nii"))
+    start[0, 3] = 0.5  # another place, and not lost
+    refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
+
+
 FOUR_D = (("dimension", "dimension: 4"), ("sizes", "sizes: 2 4 5 3"))
 UNNAMED = nrrd_bytes(("space:", "space dimension: 3"))
 BAD_NRRD: dict[str, tuple[str, bytes, str]] = {

@@ -11,7 +11,7 @@ from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.search.bending.path_layers import path_layers
 from puncture_twin.planning.search.context import prepare

@@ -16,7 +16,7 @@ from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.collision.surroundings import with_surroundings
 from puncture_twin.planning.collision.workcell import case_checker
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare

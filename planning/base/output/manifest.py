@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import is_plain_file
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
 from puncture_twin.planning.base.strict_json import field, fitting, read_json, text, texts
@@ -98,6 +99,17 @@ class Manifest:
             "not_hashed": [TIMINGS_NAME],
         }
         return json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def is_output_folder(folder: Path) -> bool:
+    """Whether this program wrote a folder: the manifest in it says so."""
+    path = folder / MANIFEST_NAME
+    if not is_plain_file(path):
+        return False
+    try:
+        return FORMAT.encode() in read_input(path, max_bytes=MAX_MANIFEST_BYTES, where=str(path))
+    except InputError:
+        return False
 
 
 class Output(NamedTuple):

@@ -9,8 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.tables.needle_section import NeedleSection, TissueSection
-from puncture_twin.planning.formats.labels.by_name import ByName
-from puncture_twin.planning.formats.labels.naming import REST
+from puncture_twin.planning.formats.labels.naming import REST, ByName
 from puncture_twin.planning.needle.deflection import Bending
 from puncture_twin.planning.needle.shaft import GAUGES, STEEL_GPA, Shaft
 from puncture_twin.planning.needle.tissue import Tissue

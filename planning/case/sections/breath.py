@@ -12,7 +12,7 @@ from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.tables.breathing_section import BreathingSection
 from puncture_twin.planning.case.toml_types import Vector
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -14,13 +16,80 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.export.slicer.entry_area import EntryArea, area_scalars, area_vtp
-from puncture_twin.planning.export.slicer.scene import SceneNode, scene_references, scene_text
 from puncture_twin.planning.formats.itk_transform import parse_transform, transform_text
 from puncture_twin.planning.formats.meshes.vtp import read_vtp
 from puncture_twin.planning.formats.points.point_files import parse_points
 from puncture_twin.planning.geometry.rigid import inverse
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.placement import Placement
+
+Kind = Literal["MarkupsLine", "MarkupsFiducial", "Model", "LinearTransform"]
+_STORAGE = {
+    "MarkupsLine": "MarkupsJsonStorage",
+    "MarkupsFiducial": "MarkupsJsonStorage",
+    "Model": "ModelStorage",
+    "LinearTransform": "TransformStorage",
+}
+_DISPLAY = {"MarkupsLine": "MarkupsDisplay", "MarkupsFiducial": "MarkupsDisplay", "Model": "ModelDisplay"}
+_SHOWN = {
+    "ModelDisplay": {
+        "visibility": "true",
+        "opacity": "0.6",
+        "scalarVisibility": "true",
+        "activeScalarName": "window",
+        "colorNodeID": "vtkMRMLColorTableNodeFileViridis.txt",
+        "scalarRangeFlag": "UseData",
+        "backfaceCulling": "false",
+    },
+    "MarkupsDisplay": {"visibility": "true", "color": "1 0.5 0"},
+}
+
+
+@dataclass(frozen=True)
+class SceneNode:
+    """What a scene shows.
+
+    Attributes:
+        kind: Of the node, by Slicer's name.
+        name: As Slicer lists it.
+        file: Where it is stored, beside the scene.
+    """
+
+    kind: Kind
+    name: str
+    file: str
+
+
+def scene_text(nodes: Sequence[SceneNode]) -> str:
+    """The scene's file."""
+    root = ElementTree.Element("MRML", version="Slicer4.4.0", userTags="")
+    count: Counter[str] = Counter()
+
+    def add(tag: str, name: str, **more: str) -> str:
+        count[tag] += 1
+        number = f"vtkMRML{tag}Node{count[tag]}"
+        ElementTree.SubElement(root, tag, {"id": number, "name": name, **more})
+        return number
+
+    for node in nodes:
+        display = _DISPLAY.get(node.kind)
+        refers = f"storage:{add(_STORAGE[node.kind], f'{node.name} storage', fileName=node.file)};"
+        if display is not None:
+            refers = f"display:{add(display, f'{node.name} display', **_SHOWN[display])};{refers}"
+        add(node.kind, node.name, references=refers)
+    ElementTree.indent(root)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
+def scene_references(text: str) -> tuple[set[str], set[str]]:
+    """The files that a scene names, and the nodes that it refers to but does not hold."""
+    nodes = list(ElementTree.fromstring(text))
+    present = {node.get("id", "") for node in nodes}
+    parts = [part for node in nodes for part in node.get("references", "").split(";") if part]
+    return {node.attrib["fileName"] for node in nodes if "fileName" in node.attrib}, {
+        number for part in parts for number in part.partition(":")[2].split() if number not in present
+    }
+
 
 SLICER = "slicer"
 """The format's name."""

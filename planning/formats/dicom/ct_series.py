@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,18 +14,18 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
-from puncture_twin.planning.formats.dicom.attributes import text
-from puncture_twin.planning.formats.dicom.choose_series import choose_series
-from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom
+from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, text
 from puncture_twin.planning.formats.dicom.pixels import PixelLayout, pixel_layout, stored_values
-from puncture_twin.planning.formats.dicom.recognise import described
+from puncture_twin.planning.formats.dicom.recognise import choose_series, described
 from puncture_twin.planning.formats.dicom.slices import Slice, slices_of
-from puncture_twin.planning.formats.dicom.stack import Stack, stack_of
-from puncture_twin.planning.formats.dicom.tilt import StraightGrid, moved, straight_grid
+from puncture_twin.planning.formats.dicom.stack import Stack, StraightGrid, moved, stack_of, straight_grid
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, check_affine, check_shape
 from puncture_twin.planning.formats.volumes.volume_source import Content
 
+LOSSY = "{} files were compressed with loss, so that their values are not exact"
+CLASS_IN_META = "{} files do not say what they are; the SOP class of their meta information was taken"
+SCOUTS = "{} frames are scouts by their type, and were left out"
 UNMEASURED_HU = -2000.0
 """Written where the scanner did not measure: far below air, so that nothing takes it for air or body."""
 
@@ -38,7 +39,7 @@ class _Series:
     layouts: dict[str, PixelLayout]
     series_uid: str
     frame_of_reference: str
-    lossy: bool
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +68,7 @@ class CtSeries:
                 f"{self.path.name}: scanned with the gantry tilted by {tilt:.1f} degrees; its slices were moved to a "
                 "grid with right angles, and what they do not cover there counts as not scanned"
             )
-        if self._series.lossy:
-            notes.append(f"{self.path.name}: its images were compressed with loss, so that their values are not exact")
-        return tuple(notes)
+        return (*notes, *self._series.notes)
 
     @property
     def frame_of_reference(self) -> str:
@@ -128,7 +127,7 @@ class CtSeries:
         slices: list[Slice] = []
         layouts: dict[str, PixelLayout] = {}
         stated = set()
-        lossy = False
+        doubts = Counter[str]()
         for file in self.files:
             data = parse_dicom(self.content(file), Path(file))
             header = described(data, Path(file))
@@ -136,13 +135,17 @@ class CtSeries:
                 raise InputError(f"{header.sop_class}, no slice of a CT", where=file, allowed="has the file changed?")
             stated.add((header.series_uid, header.frame_of_reference))
             layouts[file] = pixel_layout(data, file)
-            slices += slices_of(data, file, layouts[file].frames)
-            lossy = lossy or text(data, "LossyImageCompression", where=file) == "01"
+            own = slices_of(data, file, layouts[file].frames)
+            slices += own
+            doubts[LOSSY] += text(data, "LossyImageCompression", where=file) == "01"
+            doubts[CLASS_IN_META] += not text(data, "SOPClassUID", where=file)
+            doubts[SCOUTS] += layouts[file].frames - len(own)
         series_uid, frame_of_reference = _one(stated, self.path)
         stack = stack_of(slices, self.path)
         rows, columns = _one_size(layouts, self.path)
         grid = straight_grid(stack, rows, columns, self.path)
-        return _Series(stack, grid, layouts, series_uid, frame_of_reference, lossy)
+        notes = tuple(f"{self.path.name}: {said.format(count)}" for said, count in doubts.items() if count)
+        return _Series(stack, grid, layouts, series_uid, frame_of_reference, notes)
 
 
 def _hounsfield(stored: NDArray[Any], one: Slice, layout: PixelLayout) -> NDArray[np.float32]:

@@ -12,8 +12,16 @@ from pydicom.pixels.decoders.base import get_decoder
 from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.dicom.attributes import has, name, number, text, value, whole
-from puncture_twin.planning.formats.dicom.dicom_file import how_to_convert, refused_if_damaged
+from puncture_twin.planning.formats.dicom.dicom_file import (
+    has,
+    how_to_convert,
+    name,
+    number,
+    refused_if_damaged,
+    text,
+    value,
+    whole,
+)
 from puncture_twin.planning.formats.dicom.storage import PLAIN
 
 MAX_SIDE = 4096
@@ -122,8 +130,13 @@ def _decompressed(data: Dataset, syntax: UID, where: str) -> NDArray[Any]:
             raise InputError(named, where=where, allowed=how_to_convert()) from None
         if not decoder.is_available:
             allowed = f"{how_to_convert()}; or install the extra 'compressed' (python-gdcm)"
-            raise InputError(f"{named} needs a decoder that is not installed", where=where, allowed=allowed)
-        cells, _ = decoder.as_array(data, raw=True)
+            what = f"{named} needs a decoder that is not installed"
+            raise InputError(what, where=where, allowed=allowed, code="no_decoder")
+        try:
+            cells, _ = decoder.as_array(data, raw=True)
+        except Exception as error:  # the decoders promise no kind of error
+            what = f"{named}: its pixels cannot be decoded ({str(error)[:150]})"
+            raise InputError(what, where=where, allowed=how_to_convert(), code="not_decoded") from error
         return np.ascontiguousarray(cells)
 
 

@@ -2,21 +2,43 @@
 
 from __future__ import annotations
 
-import os
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 from pydicom.datadict import tag_for_keyword
-from pydicom.dataset import Dataset
+from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.filereader import read_dataset
 from pydicom.tag import BaseTag
+from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import is_folder
 from puncture_twin.planning.base.input_file import read_input
-from puncture_twin.planning.formats.dicom.attributes import has, text, texts
-from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, read_meta, refused_if_damaged
-from puncture_twin.planning.formats.dicom.storage import DEFLATED, IMPLICIT, META_START, Kind, is_dicom, kind_of
+from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.formats.dicom.dicom_file import (
+    has,
+    parse_dicom,
+    read_meta,
+    refuse_big_endian,
+    refused_if_damaged,
+    sop_class_of,
+    text,
+    texts,
+)
+from puncture_twin.planning.formats.dicom.storage import (
+    BIG_ENDIAN,
+    DEFLATED,
+    IMPLICIT,
+    META_START,
+    Kind,
+    is_dicom,
+    is_dicom_file,
+    kind_of,
+)
+from puncture_twin.planning.formats.folder import FILE, FOLDER, HIDDEN, Entry, entries, unaccounted
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 
 MAX_FILES = 50_000
@@ -72,14 +94,31 @@ def recognise(path: Path) -> DicomFile | None:
             if not is_dicom(stream.read(META_START)):
                 return None
             with refused_if_damaged(path):
-                syntax = read_meta(stream).TransferSyntaxUID
+                meta = read_meta(stream)
+                syntax = meta.TransferSyntaxUID
+                if syntax == BIG_ENDIAN:
+                    return _big_endian(meta, path)
                 header = None if syntax == DEFLATED else _header(stream, implicit=syntax == IMPLICIT)
+                if header is not None:
+                    header.file_meta = meta
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
     if header is None:
         content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
         return described(parse_dicom(content, path), path)
     return described(header, path)
+
+
+def _big_endian(meta: FileMetaDataset, path: Path) -> DicomFile:
+    """What is none of what this project reads, as its meta information says.
+
+    Raises:
+        InputError: It may be: no value of such a file is read.
+    """
+    sop_class = text(meta, "MediaStorageSOPClassUID", where=str(path))
+    if not sop_class or kind_of(sop_class) is not Kind.OTHER:
+        refuse_big_endian(path)
+    return DicomFile(path.name, Kind.OTHER, UID(sop_class).name, "", "big endian", "", is_slice=False, date="")
 
 
 def described(data: Dataset, path: Path) -> DicomFile:
@@ -89,10 +128,10 @@ def described(data: Dataset, path: Path) -> DicomFile:
         InputError: Its header is damaged.
     """
     where = str(path)
-    sop_class = text(data, "SOPClassUID", where=where)
+    sop_class = sop_class_of(data, where=where)
     kind = kind_of(sop_class)
     with refused_if_damaged(path):
-        called = data.SOPClassUID.name if sop_class else "no SOP class"
+        called = UID(sop_class).name if sop_class else "no SOP class"
     number, description = (text(data, keyword, where=where) for keyword in ("SeriesNumber", "SeriesDescription"))
     types = {part.upper() for part in texts(data, "ImageType", where=where)}
     placed = has(data, "ImagePositionPatient") or has(data, "ImageOrientationPatient") or "SECONDARY" not in types
@@ -115,23 +154,19 @@ def _date(data: Dataset, where: str) -> str:
     return plain and f"{plain[:4]}-{plain[4:6]}-{plain[6:]}"
 
 
-def list_folder(folder: Path) -> tuple[DicomFile, ...]:
-    """Every DICOM file of a folder, by name; folders in it are not entered.
+def list_folder(folder: Path) -> tuple[tuple[DicomFile, ...], tuple[Entry, ...]]:
+    """Every DICOM file of a folder, by name, and every other entry; folders in it are not entered.
 
     Raises:
         InputError: Too many files, one that begins as DICOM and is damaged, or one whose name cannot be printed.
     """
-    try:
-        names = sorted(entry.name for entry in os.scandir(folder) if entry.is_file())
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot be listed ({error})", where=folder, allowed="a readable folder") from error
-    if len(names) > MAX_FILES:
-        raise InputError(f"{len(names)} files", where=folder, allowed=f"at most {MAX_FILES} files in one folder")
-    found = [one for name in names if (one := recognise(folder / name)) is not None]
-    for one in found:
-        if not one.name.isprintable():
+    listed = entries(folder, most=MAX_FILES)
+    found = {one: recognise(folder / one.name) for one in listed if one.what == FILE}
+    for one in found.values():
+        if one is not None and not one.name.isprintable():
             raise InputError(f"file name {one.name!a}", where=folder, allowed="names of printable characters")
-    return tuple(found)
+    files = tuple(one for one in found.values() if one is not None)
+    return files, tuple(one for one in listed if found.get(one) is None)
 
 
 def _header(stream: BinaryIO, *, implicit: bool) -> Dataset:
@@ -140,3 +175,99 @@ def _header(stream: BinaryIO, *, implicit: bool) -> Dataset:
 
 def _is_enough(tag: BaseTag, vr: str | None, length: int) -> bool:
     return tag > _LAST_TAG
+
+
+SHOWN, LOOKED_AT = 6, 100
+"""Series that a message lists, and files of a folder beside the slices that are opened."""
+
+
+@dataclass(frozen=True)
+class SeriesFiles:
+    """The files of one CT series.
+
+    Attributes:
+        folder: Where they are.
+        names: Their names there, sorted.
+        series_uid: The series.
+        notes: What else lies in the folder and was left out, one sentence.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    series_uid: str
+    notes: tuple[str, ...]
+
+
+def choose_series(path: Path) -> SeriesFiles:
+    """The files of the CT series that a path means.
+
+    Args:
+        path: A folder that holds one CT series, or a file of the series.
+
+    Raises:
+        InputError: No CT series there, several, or a file that is no slice of one.
+    """
+    folder = path if is_folder(path) else path.parent
+    found, others = list_folder(folder)
+    slices = [one for one in found if one.is_slice]
+    if folder != path:
+        named = next((one for one in found if one.name == path.name), None)
+        if named is None or not named.is_slice:
+            what = "no DICOM file" if named is None else f"{named.sop_class}, no slice of a CT"
+            raise InputError(what, where=path, allowed="a slice of a CT series, or its folder")
+        slices = [one for one in slices if one.series_uid == named.series_uid]
+    _check_one_series(slices, found, others, path)
+    names = tuple(one.name for one in slices)
+    if lost := [one for one in unaccounted(folder, others, lambda _: False) if _may_be_slice(one, names)]:
+        raise InputError(
+            f"beside the slices lies what is not read, and may be a slice: {first_few([one.said for one in lost])}",
+            where=path,
+            allowed="every slice of the series as a whole DICOM file (fetch it, copy it again, or move it elsewhere)",
+            code="slices_not_read",
+        )
+    aside = [one for one in found if one.name not in set(names)]
+    below = [one for one in others if one.what == FOLDER and _holds_dicom(folder / one.name)]
+    return SeriesFiles(folder, names, slices[0].series_uid, _notes(aside, below, path))
+
+
+def _may_be_slice(one: Entry, names: Sequence[str]) -> bool:
+    """What can be read by nobody, and files with the ending of the slices, or that of a part of one behind it."""
+    endings = {Path(name).suffix.lower() for name in names} | {".dcm", ".ima"}
+    named = {end for end in map(str.lower, Path(one.name).suffixes) if not end[1:].isdigit()} & endings
+    return one.what != FOLDER and bool(one.what not in (FILE, HIDDEN) or named)
+
+
+def _holds_dicom(folder: Path) -> bool:
+    """Whether slices may lie in a folder beside the series: its first files tell."""
+    return any(is_dicom_file(folder / one.name) for one in entries(folder, most=MAX_FILES)[:LOOKED_AT])
+
+
+def _check_one_series(
+    slices: Sequence[DicomFile], found: Sequence[DicomFile], others: Sequence[Entry], path: Path
+) -> None:
+    if not slices:
+        classes = Counter(one.sop_class for one in found)
+        shown = [f"{count} {name}" for name, count in classes.most_common()] or ["no DICOM file"]
+        what = f"no CT series here: {first_few([*shown, *(one.said for one in others)])}"
+        raise InputError(what, where=path, allowed="a folder with a CT series; folders in it are not entered")
+    series: dict[str, list[DicomFile]] = {}
+    for one in slices:
+        series.setdefault(one.series_uid, []).append(one)
+    if len(series) > 1:
+        listed = [
+            f"{_count(files)} of '{files[0].series}' (such as {files[0].name}, UID {uid or 'missing'})"
+            for uid, files in list(series.items())[:SHOWN]
+        ]
+        more = f"; and {len(series) - SHOWN} more" if len(series) > SHOWN else ""
+        what = f"{len(series)} CT series: {'; '.join(listed)}{more}"
+        raise InputError(what, where=path, allowed="one series: name one of its files instead of the folder")
+
+
+def _notes(aside: Sequence[DicomFile], below: Sequence[Entry], path: Path) -> tuple[str, ...]:
+    kinds = Counter(f"{one.sop_class} '{one.series}'" if one.kind is Kind.CT else one.sop_class for one in aside)
+    shown = [*(f"{count} {name}" for name, count in kinds.most_common()), *(f"DICOM in {one.name}" for one in below)]
+    return (f"{path.name}: files beside the CT series were left out: {first_few(shown)}",) if shown else ()
+
+
+def _count(files: Sequence[DicomFile]) -> str:
+    return f"{len(files)} file{'' if len(files) == 1 else 's'}"

@@ -12,9 +12,18 @@ from pydicom.dataset import Dataset
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.dicom.attributes import has, items, name, number, text, whole
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
-from puncture_twin.planning.formats.dicom.dicom_file import how_to_convert, parse_dicom
+from puncture_twin.planning.formats.dicom.dicom_file import (
+    has,
+    how_to_convert,
+    items,
+    name,
+    number,
+    parse_dicom,
+    sop_class_of,
+    text,
+    whole,
+)
 from puncture_twin.planning.formats.dicom.named_masks import (
     Mask,
     MaskVolume,
@@ -77,7 +86,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
     """
     data = parse_dicom(content(file), path)
     where = path.name
-    if (sop_class := text(data, "SOPClassUID", where=where)) != SEGMENTATION:
+    if (sop_class := sop_class_of(data, where=where)) != SEGMENTATION:
         raise InputError(f"SOP class {sop_class or 'missing'}", where=path, allowed="a DICOM SEG")
     kind = _checked_kind(data, path)
     if ct is not None:

@@ -13,7 +13,7 @@ from pydicom.dataset import Dataset
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.dicom.attributes import items, name, number, numbers, text, texts
+from puncture_twin.planning.formats.dicom.dicom_file import has, items, name, number, numbers, sop_class_of, text, texts
 from puncture_twin.planning.formats.dicom.recognise import NO_SLICES
 from puncture_twin.planning.formats.dicom.storage import CLASSIC_CT
 from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, MAX_SPACING_MM, MIN_SPACING_MM
@@ -22,6 +22,10 @@ UNIT_TOLERANCE = 1e-3
 """Of an axis' length, and of the cosine between two: positions are written with six digits, some with four."""
 HOUNSFIELD = ("HU", "US", "")
 """Types of rescaled values that are Hounsfield units in a CT, where the standard's default is HU."""
+WITH_RESCALE = (
+    "slices with slope and intercept (usually 1 and -1024 where air is stored as 0; 1 and 0 where as -1000): "
+    "export the series again from where it was made, or give the CT as NIfTI in Hounsfield units"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +80,7 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     Raises:
         InputError: A position, an axis, a spacing or a rescaling is missing, contradictory or not in Hounsfield units.
     """
-    if text(data, "SOPClassUID", where=file) == CLASSIC_CT:
+    if sop_class_of(data, where=file) == CLASSIC_CT:
         if frames != 1:
             what = f"{name('NumberOfFrames')} is {frames} in a CT image of one slice"
             raise InputError(what, where=file, allowed="one frame, or an Enhanced CT image")
@@ -167,6 +171,10 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
     kind = text(rescale, "RescaleType", where=label)
     if kind not in HOUNSFIELD:
         raise InputError(f"{name('RescaleType')} is {kind!r}", where=label, allowed="HU (Hounsfield units)")
+    for keyword in ("RescaleSlope", "RescaleIntercept"):
+        if not has(rescale, keyword):
+            what = f"{name(keyword)} is missing, so that nothing tells its Hounsfield units"
+            raise InputError(what, where=label, allowed=WITH_RESCALE, code="no_rescale")
     slope, intercept = (number(rescale, keyword, where=label) for keyword in ("RescaleSlope", "RescaleIntercept"))
     if slope == 0 or abs(slope) > 1e6 or abs(intercept) > 1e6:
         what = f"rescaling by {slope:g} and {intercept:g}"

@@ -15,9 +15,18 @@ from skimage.morphology import convex_hull_image
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.dicom.attributes import has, items, name, text, whole
+from puncture_twin.planning.base.text_names import first_few
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
-from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, refused_if_damaged
+from puncture_twin.planning.formats.dicom.dicom_file import (
+    has,
+    items,
+    name,
+    parse_dicom,
+    refused_if_damaged,
+    sop_class_of,
+    text,
+    whole,
+)
 from puncture_twin.planning.formats.dicom.named_masks import (
     Mask,
     MaskVolume,
@@ -25,7 +34,6 @@ from puncture_twin.planning.formats.dicom.named_masks import (
     check_frame_of_reference,
     unique_names,
 )
-from puncture_twin.planning.formats.dicom.polygon_fill import polygon_fill
 from puncture_twin.planning.formats.dicom.storage import STRUCTURE_SET
 from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, VolumeGrid, check_shape
 from puncture_twin.planning.formats.volumes.volume_source import Content
@@ -39,8 +47,6 @@ MAX_CONTOUR_POINTS = 100_000
 """In one contour: an image of 1000 pixels has 4000 around it."""
 MAX_LENGTH = 5_000_000
 """Pixels along one contour; the finest line through every pixel of an image has fewer."""
-SHOWN = 8
-"""Structures that a note names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +89,7 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     """
     data = parse_dicom(content(file), path)
     where = path.name
-    if (sop_class := text(data, "SOPClassUID", where=where)) != STRUCTURE_SET:
+    if (sop_class := sop_class_of(data, where=where)) != STRUCTURE_SET:
         raise InputError(f"SOP class {sop_class or 'missing'}", where=path, allowed="a DICOM RTSTRUCT")
     names = _names(data, ct, path)
     unique_names(list(names.values()), path)
@@ -254,7 +260,7 @@ def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[st
         (small, "contours smaller than a pixel count for the pixels along them, in"),
         (cut, "contours that reach beyond the CT's image end there, in"),
     )
-    return [f"{where}: {said} {_listed(some)}" for some, said in findings if some]
+    return [f"{where}: {said} {first_few(some)}" for some, said in findings if some]
 
 
 def _is_tiny(points: Floats, shape: tuple[int, int]) -> bool:
@@ -263,6 +269,30 @@ def _is_tiny(points: Floats, shape: tuple[int, int]) -> bool:
     return bool(narrow) and not polygon_fill(points, shape).any()
 
 
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    return ", ".join(names[:SHOWN]) + more
+def polygon_fill(points: Floats, shape: tuple[int, int]) -> Bools:
+    """Pixels inside a polygon; a channel of no width between two parts of it (a keyhole) encloses nothing.
+
+    A centre is inside if the edges that a ray from it along the first axis crosses upward and downward differ in
+    number: what is traced twice is inside still, where an odd count would leave it out. Each edge holds its lower end
+    and not its upper one, so that a vertex is counted once.
+
+    Args:
+        points: Shape (n, 2), in pixels: (i, j) is the centre of a pixel. The last is joined to the first.
+        shape: Of the image, (ni, nj); what lies outside of it is cut off.
+
+    Returns:
+        Shape (ni, nj).
+    """
+    ni, nj = shape
+    start, end = points, np.roll(points, -1, axis=0)
+    down = (start[:, 1] > end[:, 1])[:, None]
+    low, high = np.where(down, end, start), np.where(down, start, end)
+    first, last = (np.clip(np.ceil(one[:, 1]), 0, nj).astype(int) for one in (low, high))
+    crossed = last - first
+    edge = np.repeat(np.arange(len(points)), crossed)
+    j = np.arange(len(edge)) - np.repeat(np.cumsum(crossed) - crossed - first, crossed)
+    slope = (high[edge, 0] - low[edge, 0]) / (high[edge, 1] - low[edge, 1])
+    i = np.clip(np.ceil(low[edge, 0] + (j - low[edge, 1]) * slope), 0, ni).astype(int)
+    turn = np.where(down[edge, 0], -1.0, 1.0)
+    crossings = np.bincount(i * nj + j, turn, minlength=(ni + 1) * nj).reshape(ni + 1, nj)
+    return np.asarray(np.cumsum(crossings[:ni], axis=0) != 0)

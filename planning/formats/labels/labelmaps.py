@@ -18,6 +18,14 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume
 MAX_LABEL = 65_535
 """Label maps are 8 or 16 bit; a larger value means that an image was given instead."""
 
+ALLOWED = f"whole numbers from 0 (background) to {MAX_LABEL}"
+
+ROUNDED_BY = 0.02
+"""So far a value may lie off a whole number: of labels stored in 8 bits with a slope some are off by half a step."""
+
+LEAST_WHOLE = 0.15
+"""Of voxels beside the background: a blended map is whole inside its labels, an image in 4 % by chance."""
+
 Box = tuple[slice, slice, slice]
 
 
@@ -30,12 +38,14 @@ class LabelMap:
         T_ct_index: Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm.
         names: Label to name, as a .seg.nrrd states it, or None.
         path: Where it came from.
+        rounded_by: How far the file's values are off whole numbers, at most.
     """
 
     labels: NDArray[np.integer]
     T_ct_index: NDArray[np.float64]
     names: dict[int, str] | None
     path: Path
+    rounded_by: float = 0.0
 
     def __post_init__(self) -> None:
         labels = np.asarray(self.labels).view()
@@ -65,23 +75,40 @@ def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
             names that contradict each other.
     """
     names = segment_names(volume.fields, volume.path)
-    return LabelMap(_whole(volume.values, volume.path, may_be_empty), volume.T_ct_index, names, volume.path)
+    labels, rounded_by = whole_labels(volume.values, volume.path)
+    if not may_be_empty and not labels.any():
+        raise InputError("the label map is empty: every voxel is 0", where=volume.path, allowed=ALLOWED)
+    return LabelMap(labels, volume.T_ct_index, names, volume.path, rounded_by)
 
 
-def _whole(values: NDArray[Any], path: Path, may_be_empty: bool) -> NDArray[np.integer]:
-    allowed = f"whole numbers from 0 (background) to {MAX_LABEL}"
+def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer], float]:
+    """Voxels as whole numbers, and how far they were off, at most.
+
+    Args:
+        values: Of any type.
+        path: The file, for errors.
+
+    Raises:
+        InputError: Values that are negative, too large, or farther from whole numbers than `ROUNDED_BY`; those of a
+            map that was blended by an interpolation have a code of their own.
+    """
     low, high = values.min(), values.max()
-    if low < 0 or high > MAX_LABEL:
-        raise InputError(f"values from {low} to {high} are no labels", where=path, allowed=allowed)
-    if high == 0 and not may_be_empty:
-        raise InputError("the label map is empty: every voxel is 0", where=path, allowed=allowed)
+    if low < -ROUNDED_BY or high > MAX_LABEL:
+        raise InputError(f"values from {low} to {high} are no labels", where=path, allowed=ALLOWED, code="no_labels")
     if values.dtype.kind != "f":
-        return values
-    labels = values.astype(np.uint16)
-    if not np.array_equal(labels, values):
-        example = float(values[labels != values][0])
-        raise InputError(f"value {example} is not whole", where=path, allowed=allowed)
-    return labels
+        return values, 0.0
+    rounded = np.rint(values)
+    off = np.abs(rounded - values)
+    if off.max() > ROUNDED_BY:
+        between = off > ROUNDED_BY
+        example = float(values[between][0])
+        whole = np.count_nonzero((values > ROUNDED_BY) & ~between)
+        if high > 1.5 and whole > LEAST_WHOLE * np.count_nonzero(values > ROUNDED_BY):
+            what = f"holds values between its labels, such as {example:.3g}: they were blended by an interpolation"
+            allowed = f"{ALLOWED}: resample it again, with nearest neighbours"
+            raise InputError(what, where=path, allowed=allowed, code="labels_blended")
+        raise InputError(f"value {example} is not whole", where=path, allowed=ALLOWED, code="no_labels")
+    return rounded.astype(np.uint16), float(off.max())
 
 
 def segment_names(fields: dict[str, str], path: Path) -> dict[int, str] | None:

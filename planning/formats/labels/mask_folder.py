@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import is_folder
+from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.formats.folder import FILE, Entry, entries, unaccounted
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, corner_deviation_mm
 
 MASK_ENDINGS = (".nii.gz", ".nii", ".seg.nrrd", ".nrrd")
-"""Endings of files that are masks; other files of the folder (statistics, previews) are passed over."""
-UNREAD_VOLUMES = (".mha", ".mhd", ".hdr", ".img", ".mgz", ".mgh", ".mnc", ".nii.bz2")
-"""Endings of volumes that other programs write and this one does not read: a structure in one would count as free."""
-UNREAD = "is a volume of a kind that is not read (convert it to NIfTI or NRRD)"
-MAX_MASKS = 1000
-"""TotalSegmentator has 117 classes."""
+"""Endings of files that are masks."""
+MAX_MASKS, MAX_ENTRIES = 1000, 60_000
+"""TotalSegmentator has 117 classes; the slices of a CT may lie beside them."""
 SAME_PLACE_MM = 0.1
 """Two grids whose corners lie this close are one: headers in single precision round to 0.01 mm."""
 
@@ -32,21 +31,25 @@ def structure_name(file: str) -> str:
     return name[: len(name) - len(ending)]
 
 
-def mask_files(folder: Path, *, where: str | Path) -> tuple[str, ...]:
-    """The names of the masks in a folder, sorted.
+def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path) -> tuple[str, ...]:
+    """The names of the masks in a folder, sorted; nothing else may lie in it that could be an organ.
 
     Args:
         folder: Where they are.
+        known: Whether a path in it is something else that the case names.
         where: The file and key that name the folder, for errors.
 
     Raises:
-        InputError: No folder, no mask in it, too many, two of one structure, or a volume that would be passed over.
+        InputError: No folder, no mask in it, too many, two of one structure, or entries that would be passed over.
     """
     allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one a structure"
     if not is_folder(folder):
         raise InputError(f"'{folder.name[:200]}' is no folder", where=where, allowed=allowed)
-    _refuse_unread(folder, allowed)
-    files = sorted(one.name for one in folder.iterdir() if one.name.lower().endswith(MASK_ENDINGS) and one.is_file())
+    found = entries(folder, most=MAX_ENTRIES, allowed=allowed)
+    files = [one.name for one in found if is_mask(one) and not known(folder / one.name)]
+    left = unaccounted(folder, found, lambda path: path.name in files or known(path))
+    if left:
+        raise not_read(left, "masks", where)
     if not 1 <= len(files) <= MAX_MASKS:
         raise InputError(f"'{folder.name}' holds {len(files)} masks", where=where, allowed=allowed)
     names: dict[str, str] = {}
@@ -56,28 +59,34 @@ def mask_files(folder: Path, *, where: str | Path) -> tuple[str, ...]:
     return tuple(files)
 
 
-def _refuse_unread(folder: Path, allowed: str) -> None:
-    """A mask in another format, or a header with its voxels beside it, would be passed over and its organ lost."""
-    for one in sorted(folder.iterdir()):
-        if one.name.lower().endswith((*UNREAD_VOLUMES, ".nhdr")) and one.is_file():
-            raise InputError(UNREAD, where=one, allowed=allowed)
+def is_mask(entry: Entry) -> bool:
+    """Whether an entry is read as a mask."""
+    return entry.what == FILE and entry.name.lower().endswith(MASK_ENDINGS)
 
 
-def mask_label(mask: LabelMap) -> int | None:
-    """The one value beside 0 that a mask's voxels have, often 1 or 255; None for an empty mask.
+def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError:
+    """What lies in a folder of masks, or of meshes, and would be passed over: its organ would count as free."""
+    return InputError(
+        f"beside the {among} lies what is not read, and may be an organ: {first_few([one.said for one in left])}",
+        where=where,
+        allowed=f"{among} in formats that are read, and nothing else: convert it, fetch it, or move it elsewhere",
+        code="entries_not_read",
+    )
+
+
+def refuse_label_map(mask: LabelMap) -> None:
+    """Whether a mask's voxels have one value beside 0, often 1 or 255, or none.
 
     Raises:
         InputError: Several values: a label map, not the mask of one structure.
     """
     present = mask.labels_present()
     if len(present) > 1:
-        shown = ", ".join(map(str, present[:8]))
         raise InputError(
-            f"is no mask: its voxels have the labels {shown}{', ...' if len(present) > 8 else ''}",
+            f"is no mask: its voxels have the labels {first_few(list(map(str, present)))}",
             where=mask.path,
             allowed="0 and one other value; a label map is named with labelmap, outside of a folder of masks",
         )
-    return present[0] if present else None
 
 
 def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> None:

@@ -123,6 +123,9 @@ def _json_entries(data: bytes, path: Path) -> Iterator[_Entry]:
         raise InputError("no object of labels", where=path, allowed=ALLOWED_JSON)
     for key, value in table.items():
         number, name = (key, value) if isinstance(value, str) else (value, key)
+        if isinstance(value, list):
+            what = f"{str(key)[:60]!r} is a list of labels (a region): name its labels one by one"
+            raise InputError(what, where=path, allowed=ALLOWED_JSON, code="labels_of_regions")
         if isinstance(number, bool) or not isinstance(number, str | int) or not isinstance(name, str):
             raise InputError(
                 f"entry {str(key)[:60]!r} is no pair of a number and a name", where=path, allowed=ALLOWED_JSON

@@ -59,8 +59,9 @@ def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
     if header.cells.dtype.kind not in "iu":
         raise InputError(f"voxels of type {header.cells.dtype}", where=path, allowed="whole numbers")
     found = listed_segments(header.fields, header.layers, path)
+    listed = frozenset(found.values())
     masks = {
-        name: MaskVolume(path, (file,), (name,), header, partial(_mask, content, file, header, segment))
+        name: MaskVolume(path, (file,), (name,), header, partial(_mask, content, file, header, segment, listed))
         for name, segment in found.items()
     }
     return NamedMasks(masks, header.notes)
@@ -104,7 +105,11 @@ def _number(remarks: Mapping[str, str], key: str, default: str | None, path: Pat
     return int(text)
 
 
-def _mask(content: Content, file: str, header: VolumeHeader, segment: Segment) -> Mask:
+def _mask(content: Content, file: str, header: VolumeHeader, segment: Segment, listed: frozenset[Segment]) -> Mask:
     voxels = decoded(memoryview(content(file)), header)
     layer = voxels[segment.layer] if header.layers > 1 else voxels
+    lost = layer[~np.isin(layer, [0, *(one.label for one in listed if one.layer == segment.layer)])]
+    if lost.size:
+        what = f"layer {segment.layer} has voxels of {np.unique(lost)[:8].tolist()}, which are no segment's"
+        raise InputError(what, where=header.data_path, allowed="a segment for each label", code="label_without_segment")
     return np.asarray(layer == segment.label).astype(np.uint8)

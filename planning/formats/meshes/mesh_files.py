@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
     {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": _read_glb, ".vtp": read_vtp, ".vtk": read_vtk}
 )
 
-_STATEMENT = re.compile(rb"3D Slicer output\. SPACE=(LPS|RAS)\b")
+_STATEMENT = re.compile(rb"\bSPACE=(LPS|RAS)\b")
 
 _STATEMENT_BYTES = 1000
 """Slicer writes what space a mesh is in into its header or first comment; a VTP has a field for it."""
@@ -123,17 +124,31 @@ def _actual_space(stated: Space, space: Space, *, default: bool, where: str) -> 
     raise InputError(f"the file states SPACE={stated}, the case {space}", where=where, allowed=allowed)
 
 
-def mesh_extent(path: Path) -> NDArray[np.float64]:
-    """The box of a mesh file in its own unit, whatever that is: lowest and highest corner, shape (2, 3).
+class MeshExtent(NamedTuple):
+    """What is told of a mesh file before its unit is known.
+
+    Attributes:
+        box: Its lowest and highest corner in its own unit, whatever that is, shape (2, 3).
+        space: What it states of its axes, or None.
+    """
+
+    box: NDArray[np.float64]
+    space: Space | None
+
+
+def mesh_extent(path: Path) -> MeshExtent:
+    """The box of a mesh file in its own unit, and the space that it states.
 
     Raises:
         InputError: As `read_mesh`, but for the guard.
     """
     reader = _reader(path)
-    raw = reader(read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)), str(path))
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    raw = reader(data, str(path))
     if not np.isfinite(raw.vertices).all() or len(raw.vertices) == 0:
         raise InputError("a vertex is not finite, or there is none", where=path, allowed="finite vertices")
-    return np.stack([raw.vertices.min(axis=0), raw.vertices.max(axis=0)]).astype(np.float64)
+    box = np.stack([raw.vertices.min(axis=0), raw.vertices.max(axis=0)]).astype(np.float64)
+    return MeshExtent(box, raw.space or _stated_space(data))
 
 
 def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:

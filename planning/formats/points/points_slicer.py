@@ -21,6 +21,8 @@ _MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, de
 _LINE_POINTS = 2
 _SPACES = {"LPS": Space.LPS, "RAS": Space.RAS, "0": Space.RAS, "1": Space.LPS}
 _FCSV_ALLOWED = "a Slicer fiducial list with '# CoordinateSystem = ' and '# columns = id,x,y,z,...,label,...'"
+_FCSV_DEFINED = "2"
+"""Slicer 5 writes two fields more than its header names: whether the position is defined (2), and one other."""
 _FCSV_SYSTEM = "# coordinatesystem"
 _FCSV_COLUMNS = "# columns"
 
@@ -84,8 +86,10 @@ def read_fcsv_points(data: bytes, where: str) -> RawPoints:
             continue
         place = f"{where}, line {number}"
         fields = _fcsv_fields(line, place)
-        if len(fields) != len(columns):
+        if len(fields) - len(columns) not in (0, 2):
             refuse(f"{len(fields)} fields instead of {len(columns)}", place, _FCSV_ALLOWED)
+        if (status := (*fields, _FCSV_DEFINED)[len(columns)]) != _FCSV_DEFINED:
+            refuse(f"position status {status[:40]!r}", place, f"{_FCSV_DEFINED} (defined)")
         names.append(fields[columns.index("label")].strip())
         x, y, z = (parse_coordinate(fields[columns.index(axis)], place) for axis in "xyz")
         points.append((x, y, z))

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.volumes.inflate import first_bytes
 from puncture_twin.planning.formats.volumes.volume_header import (
     VolumeHeader,
     VoxelLayout,
@@ -22,6 +21,7 @@ from puncture_twin.planning.formats.volumes.volume_header import (
     check_shape,
     corner_deviation_mm,
 )
+from puncture_twin.planning.formats.volumes.voxels import first_bytes
 
 HEADER_BYTES = 348
 FIRST_VOXEL_BYTE = 352
@@ -145,9 +145,11 @@ def _parse(data: bytes, path: Path) -> _Fields:
 
 
 def _shape(fields: _Fields, path: Path) -> tuple[int, int, int]:
-    if fields.dim[0] != 3:
-        what = f"{fields.dim[0]} dimensions, sizes {fields.dim[1:]}"
-        raise InputError(what, where=path, allowed="one volume with 3 dimensions, no time series, no components")
+    count = fields.dim[0]
+    if not 3 <= count <= 7 or set(fields.dim[4 : count + 1]) - {1}:
+        what = f"{count} dimensions, sizes {fields.dim[1 : max(count, 3) + 1]}"
+        allowed = "one volume with 3 dimensions (further ones of length 1), no time series, no components"
+        raise InputError(what, where=path, allowed=allowed)
     return check_shape(fields.dim[1:4], where=path)
 
 

@@ -19,6 +19,8 @@ MIN_SPACING_MM, MAX_SPACING_MM = 0.05, 20.0
 """Finer than a micro-CT and coarser than any clinical slice: outside, the unit was mistaken."""
 SHEAR_TOLERANCE = 1e-4
 """Largest cosine between two axes; ITK accepts no more, and float32 headers stay below 1e-6."""
+ONE_PLACE_MM = 1.0
+"""Nearer to each other two volumes are taken to lie at one place."""
 MAX_ORIGIN_MM = 100_000.0
 """No scanner places a patient 100 m from its own origin."""
 
@@ -134,9 +136,32 @@ def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.
 
 def corner_deviation_mm(T_a: NDArray[np.float64], T_b: NDArray[np.float64], shape: tuple[int, int, int]) -> float:
     """Largest distance between where two affines place a corner of the volume, mm."""
-    corners = np.array(list(itertools.product(*((0, n - 1) for n in shape))), dtype=np.float64)
     difference = T_a - T_b
-    return float(np.linalg.norm(apply(difference, corners), axis=1).max())
+    return float(np.linalg.norm(apply(difference, _corners(shape)), axis=1).max())
+
+
+def _corners(shape: tuple[int, int, int]) -> NDArray[np.float64]:
+    """The voxels at the corners of a volume, shape (8, 3)."""
+    return np.array(list(itertools.product(*((0, n - 1) for n in shape))), dtype=np.float64)
+
+
+def refuse_lost_grid(labels: VolumeGrid, image: VolumeGrid, *, where: Path) -> None:
+    """Labels with an image's voxels that begin at 0, elsewhere: a program kept the voxels, and not where they lie.
+
+    Raises:
+        InputError: They are such.
+    """
+    boxes = np.array([apply(one.T_ct_index, _corners(one.shape)) for one in (labels, image)])
+    apart = max(float(np.abs(np.subtract(*ends)).max()) for ends in (boxes.min(axis=1), boxes.max(axis=1)))
+    if sorted(labels.shape) == sorted(image.shape) and not labels.T_ct_index[:3, 3].any() and apart > ONE_PLACE_MM:
+        sizes, steps = (" x ".join(f"{one:.4g}" for one in some) for some in (labels.shape, labels.spacing_mm))
+        raise InputError(
+            f"has the CT's {sizes} voxels, but begins at 0, 0, 0 in steps of {steps} mm, up to {apart:.0f} mm away: "
+            "where its voxels lie was lost",
+            where=where,
+            allowed="labels on the grid of their CT: copy its origin, spacing and direction",
+            code="grid_lost",
+        )
 
 
 def check_exact_size(actual: int, promised: int, *, where: Path) -> None:

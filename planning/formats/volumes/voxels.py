@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +12,80 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.volumes.inflate import inflated
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader, check_exact_size
+
+DEFLATE_RATIO = 1033
+"""Deflate cannot shrink by more than 1032:1 (zlib's technical notes), so a tiny file cannot hold a large volume."""
+GZIP_WINDOW = 16 + zlib.MAX_WBITS
+"""Tells zlib to expect gzip's header and check sum."""
+PART_BYTES = 1 << 20
+"""As much is read, and made, at a time."""
+
+
+def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.uint8]:
+    """All bytes of gzip data, which may have several members one after the other, padded with zeros.
+
+    Stops one byte after the promised length, so what a bomb would inflate to is never made.
+
+    Args:
+        content: The compressed bytes.
+        promised: Bytes that the header says they inflate to.
+        where: The file, for the message.
+
+    Returns:
+        Shape (promised,).
+
+    Raises:
+        InputError: Damaged, truncated, or of another length.
+    """
+    if promised > len(content) * DEFLATE_RATIO:
+        what = f"{len(content)} compressed bytes cannot hold the {promised} bytes that the header promises"
+        raise InputError(what, where=where, allowed="a complete file")
+    found = np.empty(promised, np.uint8)
+    count = 0
+    try:
+        for part in _parts(content, promised + 1):
+            if count + len(part) <= promised:
+                found[count : count + len(part)] = np.frombuffer(part, np.uint8)
+            count += len(part)
+    except (EOFError, zlib.error) as error:
+        what = f"the compressed data are damaged or cut short after {count} of {promised} bytes ({error})"
+        raise InputError(what, where=where, allowed="a complete gzip file") from error
+    check_exact_size(count, promised, where=where)
+    return found
+
+
+def first_bytes(content: memoryview, count: int, *, where: Path, allowed: str) -> bytes:
+    """The first bytes that gzip data inflate to; fewer where there are no more.
+
+    Raises:
+        InputError: No gzip data, or damaged at the beginning.
+    """
+    try:
+        return b"".join(_parts(content, count))
+    except (EOFError, zlib.error) as error:
+        raise InputError(f"not a readable gzip file ({error})", where=where, allowed=allowed) from error
+
+
+def _parts(content: memoryview, most: int) -> Iterator[bytes]:
+    """What gzip data inflate to, in parts: at most so many bytes, and the check sums of all members that end there."""
+    at, member = 0, zlib.decompressobj(GZIP_WINDOW)
+    while most > 0:
+        waiting: bytes | memoryview = member.unconsumed_tail
+        if not waiting:
+            waiting = content[at : at + PART_BYTES]
+            at += len(waiting)
+        part = member.decompress(waiting, min(most, PART_BYTES))
+        if member.eof:
+            at, member = at - len(member.unused_data), zlib.decompressobj(GZIP_WINDOW)
+            if at == len(content) or (content[at] == 0 and not any(content[at:])):
+                most = len(part)
+        elif not part and not waiting:
+            raise EOFError("the data end before their end mark")
+        most -= len(part)
+        if part:
+            yield part
+
 
 INTEGER_TEXT = re.compile(rb"[0-9+\-\s]*")
 FLOAT_TEXT = re.compile(rb"[0-9+\-.eE\s]*")

@@ -3,18 +3,90 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.needle.deflection import DeflectionBound
-from puncture_twin.planning.search.candidates import BreathingColumns, Candidates
-from puncture_twin.planning.search.phases.between import checked_between
+from puncture_twin.planning.search.candidates import BreathingColumns, Candidates, Verdict
 from puncture_twin.planning.search.phases.moving_weights import moving_weights
-from puncture_twin.planning.search.phases.one_phase import BreathingBody, rejected_at
+from puncture_twin.planning.search.phases.one_phase import BreathingBody, Phase, rejected_at
+
+LEAST_MM = 0.1
+"""Positions this near to each other are not parted: what is not shown to be clear there counts as too close."""
+
+
+class _Gap(NamedTuple):
+    """Between the positions low and high: m candidates, k structures, what both leave over the margins, (m, k), mm."""
+
+    rows: Ints
+    columns: Ints
+    low: float
+    high: float
+    at_low: Floats
+    at_high: Floats
+    deflection: Floats
+
+    def of(self, rows: Bools, columns: Bools) -> _Gap:
+        """Of some candidates and structures."""
+        part = np.ix_(rows, columns)
+        ends = self.at_low[part], self.at_high[part]
+        return _Gap(self.rows[rows], self.columns[columns], self.low, self.high, *ends, self.deflection[rows])
+
+
+def checked_between(body: BreathingBody, found: Candidates, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
+    """The verdict with those rejected that no measurement shows to be clear between two positions.
+
+    Args:
+        body: The case.
+        found: The candidates.
+        verdict: Of them, with what is rejected at the two positions.
+        low: The one position.
+        high: The other, of the same candidates.
+    """
+    deflection = np.fmax(low.deflection, high.deflection)
+    columns = np.arange(len(body.demanding))
+    return _checked(body, found, verdict, _Gap(low.rows, columns, low.s, high.s, low.excess, high.excess, deflection))
+
+
+def _checked(body: BreathingBody, found: Candidates, verdict: Verdict, gap: _Gap) -> Verdict:
+    moves = body.moves_mm(gap.low, gap.high)[gap.columns]
+    least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]
+    short = (least < 0) & (moves > 0) & (verdict.reason[gap.rows] == Reason.NONE.value)[:, None]
+    rows, columns = short.any(axis=1), short.any(axis=0)
+    if not rows.any():
+        return verdict
+    gap, least, middle = gap.of(rows, columns), least[np.ix_(rows, columns)], (gap.low + gap.high) / 2
+    if moves[columns].max() <= LEAST_MM:
+        nearest = _names(body, gap, least)
+        return rejected_at(
+            verdict, gap.rows, _too_close(nearest, np.full(len(nearest), np.nan)), body.breathing, middle
+        )
+    excess = body.excess_at(found, gap.rows, middle, gap.columns)
+    left = excess - gap.deflection[:, None]
+    bad = left.min(axis=1) < 0
+    column = left[bad].argmin(axis=1)
+    amount = excess[bad][np.arange(len(column)), column] + body.margins[gap.columns[column]]
+    close = _too_close(_names(body, gap, left)[bad], amount)
+    verdict = rejected_at(verdict, gap.rows[bad], close, body.breathing, middle)
+    verdict = _checked(body, found, verdict, gap._replace(high=middle, at_high=excess))
+    return _checked(body, found, verdict, gap._replace(low=middle, at_low=excess))
+
+
+def _names(body: BreathingBody, gap: _Gap, left: Floats) -> Texts:
+    """The structure that leaves each candidate least."""
+    names = np.array([body.anatomy.checked[column].name for column in body.demanding], dtype=object)
+    return np.asarray(names[gap.columns[left.argmin(axis=1)]])
+
+
+def _too_close(names: Texts, amount: Floats) -> Verdict:
+    blank, reason = np.full(len(names), "", dtype=object), np.full(len(names), Reason.TOO_CLOSE.value, dtype=object)
+    return Verdict(reason, names, np.full(len(names), np.nan), amount, blank)
 
 
 def with_breathing(

@@ -23,7 +23,7 @@ from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.settings import Needle, Obstacle, RobotSettings, SearchSettings
 from puncture_twin.planning.case.tables.errors_section import RehearsalSection
 from puncture_twin.planning.case.tables.search_section import RankingSection
-from puncture_twin.planning.formats.labels.by_name import ByName
+from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space

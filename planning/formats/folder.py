@@ -1,0 +1,121 @@
+"""A folder of which every entry is accounted for: read, known to be harmless, or named with the reason why not.
+
+An organ may lie in a format that nobody reads, behind a link to a file that is not there, in a download that did not
+end or in a folder of its own. A reader that looks for what it knows passes it over, and it counts as free.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import NamedTuple
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import absence
+from puncture_twin.planning.base.output.manifest import is_output_folder
+
+FILE, FOLDER, HIDDEN = "", "is a folder", "is hidden"
+"""What most entries are; of all others it is said why they are neither."""
+
+NOT_READ = "of a kind that is not read"
+
+HARMLESS = (
+    *(".ds_store", "thumbs.db", "desktop.ini", ".directory", ".git*", ".datalad", ".dvc", ".dvcignore"),
+    *("statistics.json", "statistics_radiomics.json", "dataset.json", "plans.json", "preview*.png"),
+    *("readme", "readme.*", "license", "license.*", "*.txt", "*.md", "*.log"),
+    *("*.toml", "*.csv", "*.fcsv", "*.mrk.json"),
+)
+"""Names of what holds no organ, in lower case: of file managers, of versions, what segmentation programs write beside
+their masks, cases, lists of points and plain text."""
+
+BESIDE = (".dvc", ".json", ".md5", ".sha256")
+"""Endings of files about a file that lies beside them, whose name they have with or without its own ending."""
+
+APPLE_DOUBLE = "._"
+"""How the name of a file begins in which macOS keeps what another file system cannot, beside the file itself."""
+
+MOST_DEPTH, MOST_INSIDE = 6, 100_000
+"""Folders in folders, and entries of each, that are looked through for something that is not accounted for."""
+
+
+class Entry(NamedTuple):
+    """One entry of a folder.
+
+    Attributes:
+        name: In the folder.
+        what: `FILE`, `FOLDER`, `HIDDEN` (either, by its name), or why it is neither.
+    """
+
+    name: str
+    what: str
+
+    @property
+    def said(self) -> str:
+        """Its name, and why it is not read."""
+        return f"{self.name} ({self.what or NOT_READ})"
+
+
+def entries(folder: Path, *, most: int, allowed: str = "a readable folder") -> tuple[Entry, ...]:
+    """Everything that lies in a folder, by name: also hidden files and links to nothing.
+
+    Raises:
+        InputError: It cannot be listed, or holds too much.
+    """
+    try:
+        with os.scandir(folder) as listed:
+            found = sorted(Entry(one.name, _what(one)) for one in listed)
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"cannot be read ({why})", where=folder, allowed=allowed, code="folder_not_listed") from error
+    if len(found) > most:
+        what = f"holds {len(found)} files, more than {most}"
+        raise InputError(what, where=folder, allowed=allowed, code="folder_too_large")
+    return tuple(found)
+
+
+def _what(one: os.DirEntry[str]) -> str:
+    try:
+        if one.name.startswith(".") and (one.is_file() or one.is_dir()):
+            return HIDDEN
+        return FILE if one.is_file() else absence(Path(one.path))
+    except OSError:  # a link that leads to itself, or through a folder that may not be entered
+        return absence(Path(one.path))
+
+
+def unaccounted(folder: Path, found: tuple[Entry, ...], known: Callable[[Path], bool], depth: int = 0) -> list[Entry]:
+    """The entries of a folder that are neither known nor harmless.
+
+    A folder in it is accounted for if this program wrote it, or if it holds something and all of that is accounted for.
+
+    Args:
+        folder: Where they lie.
+        found: What lies there.
+        known: Whether a path is read, by whoever asks or by someone else.
+        depth: How many folders have been entered.
+    """
+    names = {one.name for one in found}
+    return [
+        one
+        for one in found
+        if not known(folder / one.name)
+        and not (one.what in (FILE, HIDDEN) and is_harmless(one.name, names))
+        and not (one.what == FOLDER and _holds_known(folder / one.name, known, depth + 1))
+    ]
+
+
+def is_harmless(name: str, names: Collection[str]) -> bool:
+    """Whether a name is that of something that holds no organ, among the names of its folder."""
+    about = next((name.removesuffix(end) for end in BESIDE if name.endswith(end)), name)
+    about = about.removeprefix(APPLE_DOUBLE)
+    if about != name and any(f"{one}.".startswith(f"{about}.") and not one.endswith(BESIDE) for one in names):
+        return True
+    return any(fnmatchcase(name.lower(), pattern) for pattern in HARMLESS)
+
+
+def _holds_known(folder: Path, known: Callable[[Path], bool], depth: int) -> bool:
+    if is_output_folder(folder):
+        return True
+    found = entries(folder, most=MOST_INSIDE) if depth <= MOST_DEPTH else ()
+    return bool(found) and not unaccounted(folder, found, known, depth)

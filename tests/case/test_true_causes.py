@@ -1,0 +1,134 @@
+"""`init` and cases name the cause that is true: what lies there, and why each was passed over; cheap checks first."""
+
+import json
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+from case_world import CASE, image_of, write_case
+
+from puncture_twin.planning.anatomy.default_roles import NOT_ANNOTATED, default_role
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.progress import unnamed
+from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.init.finder import Wanted
+from puncture_twin.planning.init.start import Request, start_case
+
+SPACING = (4.0, 4.0, 4.0)
+AT = np.arange(40) * 4.0 - 78.0
+Z, Y, X = np.meshgrid(AT, AT, AT, indexing="ij")
+
+
+def inside(middle, radius):
+    """Voxels (z, y, x) of a ball."""
+    return (X - middle[0]) ** 2 + (Y - middle[1]) ** 2 + (Z - middle[2]) ** 2 < radius**2
+
+
+def ct():
+    """A body of 70 mm about the origin with noise, HU."""
+    noise = np.random.default_rng(5).normal(0.0, 12.0, X.shape)
+    return np.where(inside((0, 0, 0), 70.0), 40.0, -1000.0) + noise
+
+
+def labels():
+    """Three balls: 1, 2 and 3."""
+    voxels = np.zeros(X.shape, np.uint8)
+    for number, middle in enumerate(((0, 0, 0), (36, 10, 0), (0, -40, 20)), start=1):
+        voxels[inside(middle, 10.0)] = number
+    return voxels
+
+
+def patient(folder, image=None, labelmap=None, names=None):
+    """A CT and a label map; what is given replaces what is right."""
+    sitk.WriteImage(image_of(ct().astype(np.int16) if image is None else image, SPACING), str(folder / "ct.nii.gz"))
+    labelmap = labels() if labelmap is None else labelmap
+    sitk.WriteImage(image_of(labelmap, SPACING), str(folder / "labels.nii.gz"))
+    if names is not None:
+        (folder / "dataset.json").write_text(json.dumps({"labels": names}))
+    return folder
+
+
+NAMES = {"background": 0, "liver lesion": 1, "aorta": 2, "ignore": 3}
+
+
+def started(folder):
+    """`init` with the first ball's middle as the target."""
+    request = Request(folder, "0,0,0", None, "abdomen", Wanted(Space.LPS))
+    return start_case(request, NO_CACHE, unnamed)
+
+
+def refused(folder):
+    """How `init` refuses it."""
+    with pytest.raises(InputError) as caught:
+        started(folder)
+    return caught.value
+
+
+def test_an_image_without_hounsfield_units_is_no_label_map(tmp_path):
+    """It was asked who numbered its labels; its air tells the offset."""
+    error = refused(patient(tmp_path, image=np.clip(ct() + 1024, 0, None).astype(np.uint16), names=NAMES))
+    assert error.code == "no_ct"
+    assert "ct.nii.gz (no Hounsfield units, its air is 2" in error.what and "-1024 missing" in error.what
+
+
+@pytest.mark.parametrize(
+    ("labelmap", "code", "said"),
+    [
+        (lambda: np.where(labels() > 0, labels().astype(np.uint32) + 70_000, 0), "no_segmentation", "from 0 to 70003"),
+        (lambda: ct().astype(np.float32) * 0.01 + 20, "no_segmentation", "is not whole"),
+        (lambda: labels().astype(np.float32) - 2, "no_segmentation", "from -2.0 to 1.0"),
+    ],
+)
+def test_a_segmentation_that_lies_there_is_never_none(tmp_path, labelmap, code, said):
+    """The file is named with the reader's own reason."""
+    error = refused(patient(tmp_path, labelmap=labelmap(), names=NAMES))
+    assert error.code == code and "labels.nii.gz (" in error.what and said in error.what
+
+
+def test_labels_between_labels_are_refused_as_blended(tmp_path):
+    """One with a CT that is right."""
+    organ = 3 * inside((0, 0, 0), 30.0) + 2 * inside((50, 0, 0), 15.0)
+    blended = (organ[1:] / 3 + organ[:-1] * 2 / 3).astype(np.float32)
+    error = refused(patient(tmp_path, labelmap=blended, names=NAMES))
+    assert error.code == "labels_blended" and error.what.startswith("labels.nii.gz: ")
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ({"background": 0, "a": 1, "b": 2}, "dataset.json lacks 3 (it names 1 to 2)"),
+        ({**NAMES, "abdomen": [1, 2]}, "dataset.json: 'abdomen' is a list of labels"),
+        (None, "no table of names is beside it"),
+    ],
+)
+def test_a_table_that_lies_there_is_never_none(tmp_path, names, said):
+    """What it lacks, or why it is none."""
+    error = refused(patient(tmp_path, names=names))
+    assert error.code == "labels_without_names" and said in error.what
+
+
+def test_what_nobody_annotated_is_unknown_and_told(tmp_path):
+    """It was an organ called ignore."""
+    start = started(patient(tmp_path, names=NAMES))
+    assert '"ignore" = 2' in start.text.split("[structures.unknown]")[1]
+    assert any("not annotated" in note and "ignore" in note for note in start.notes)
+    assert default_role("Ignore", "brain") == NOT_ANNOTATED
+
+
+def test_nothing_at_all_says_so(tmp_path):
+    """One that holds only what nobody reads lists it."""
+    (tmp_path / "scan.bin").write_bytes(b"x")
+    assert "scan.bin (of a kind that is not read)" in refused(tmp_path).what
+
+
+def test_a_list_that_was_cut_is_refused_before_a_volume_is_read(tmp_path):
+    """A missing line break cost minutes: volumes of gigabytes were read first."""
+    text = CASE.replace("schema = 1", 'schema = 2\nregion = "other"')
+    write_case(tmp_path, text=text + "\n[end]\nstructures = 4\n")
+    (tmp_path / "markers_ct.csv").write_text((tmp_path / "markers_ct.csv").read_text().rstrip("\n"))
+    for volume in tmp_path.glob("*.n*"):
+        volume.write_bytes(b"no volume")
+    with pytest.raises(InputError, match="does not end with a line break"):
+        load_case(tmp_path)

@@ -1,0 +1,214 @@
+"""Every entry of a folder is read, known to be harmless, or named: what is passed over in silence is an organ lost."""
+
+import os
+import re
+from pathlib import Path
+
+import dicom_world as world
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.dicom.recognise import choose_series
+from puncture_twin.planning.formats.folder import entries, unaccounted
+from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, mask_files
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.init.finder import Wanted, find
+from puncture_twin.planning.init.segmentation import Place
+
+HARMLESS = (
+    *("statistics.json", "preview_total.png", ".DS_Store", "._liver.nii.gz", "README.md", "liver.nii.gz.dvc"),
+    *("liver.json", "markers.csv", "case.toml", ".gitattributes"),
+)
+LOST = (
+    *("vessel.npz", "vessel.nii.gz.part", "vessel.nii.zst", "vessel.mha", "vessel.stl", "vessel.dcm", "vessel"),
+    *("vessel.nii.bz2", "vessel.nrrd.crdownload", ".vessel.nii.gz", "vessel.nii.gz.dvc", "vessel.json", "vessel.png"),
+    *("._vessel.nii.gz", "vessel.nii.gz~", ".liver.nii.gz.Xy12Za", "vessel.h5", "vessel.mat"),
+)
+"""What programs leave behind, and formats that nobody reads here."""
+
+
+def nothing_else(path: Path) -> bool:
+    """Nothing but the masks is known."""
+    return False
+
+
+def masks(folder: Path) -> Path:
+    """A folder with two masks; no file is opened to list it."""
+    folder.mkdir()
+    for name in ("liver.nii.gz", "colon.nrrd"):
+        (folder / name).write_bytes(b"x")
+    return folder
+
+
+@pytest.mark.parametrize("name", LOST)
+def test_what_is_not_read_among_masks_is_refused_by_name(tmp_path: Path, name: str) -> None:
+    """Whatever its ending; the other masks do not stand for it."""
+    folder = masks(tmp_path / "seg")
+    (folder / name).write_bytes(b"x")
+    with pytest.raises(InputError, match=re.escape(name)) as caught:
+        mask_files(folder, nothing_else, where="case")
+    assert caught.value.code == "entries_not_read"
+
+
+def test_files_about_a_file_do_not_stand_for_it(tmp_path: Path) -> None:
+    """A pointer and a description of a mask that was not fetched vouch for nothing, not even for each other."""
+    folder = masks(tmp_path / "seg")
+    for name in ("vessel.nii.gz.dvc", "vessel.nii.gz.json"):
+        (folder / name).write_bytes(b"x")
+    with pytest.raises(InputError, match=r"vessel.nii.gz.dvc \(.*vessel.nii.gz.json \("):
+        mask_files(folder, nothing_else, where="case")
+
+
+def test_what_holds_no_organ_may_lie_beside_masks(tmp_path: Path) -> None:
+    """Statistics, previews, what file managers and version control leave, and files about a file beside them."""
+    folder = masks(tmp_path / "seg")
+    for name in HARMLESS:
+        (folder / name).write_bytes(b"x")
+    assert mask_files(folder, nothing_else, where="case") == ("colon.nrrd", "liver.nii.gz")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_entry_of_any_kind_is_lost(tmp_path: Path, seed: int) -> None:
+    """Of files, links to nothing, links in a circle, pipes and folders each is a mask, harmless, or refused."""
+    rng = np.random.default_rng(seed)
+    folder = masks(tmp_path / "seg")
+    endings = (*MASK_ENDINGS, ".part", ".npz", ".txt", "", ".json", ".nii.gz.tmp")
+    for number in range(rng.integers(1, 6)):
+        name = f"organ{number}{endings[rng.integers(len(endings))]}"
+        kind = rng.integers(5)
+        if kind == 0:
+            (folder / name).write_bytes(b"x")
+        elif kind == 1:
+            (folder / name).symlink_to("not_fetched")
+        elif kind == 2:
+            (folder / name).symlink_to(name)
+        elif kind == 3:
+            os.mkfifo(folder / name)
+        else:
+            (folder / name).mkdir()
+    sound = [one.name for one in folder.iterdir() if one.is_file() and one.name.endswith(MASK_ENDINGS)]
+    text = [one.name for one in folder.iterdir() if one.is_file() and one.name.endswith(".txt")]
+    rest = {one.name for one in folder.iterdir()} - {*sound, *text}
+    try:
+        assert set(mask_files(folder, nothing_else, where="case")) == set(sound) and not rest
+    except InputError as error:
+        assert error.code == "entries_not_read" and all(name in str(error) for name in rest), (rest, error)
+        assert rest and not any(f" {name} (" in str(error) for name in (*sound, *text))
+
+
+def test_a_folder_in_a_folder_is_known_by_what_is_in_it(tmp_path: Path) -> None:
+    """One with what is known, or of this program's outputs, is no loss; an empty one may be what was not fetched."""
+    folder = masks(tmp_path / "seg")
+    (folder / "notes").mkdir()
+    with pytest.raises(InputError, match=r"notes \(is a folder\)"):
+        mask_files(folder, nothing_else, where="case")
+    (folder / "notes" / "a.txt").write_text("x")
+    (folder / "out").mkdir()
+    (folder / "out" / "manifest.json").write_text('{"format": "puncture-twin output set"}')
+    (folder / "out" / "map.nii.gz").write_text("x")
+    assert len(mask_files(folder, nothing_else, where="case")) == 2
+    (folder / "notes" / "b").symlink_to("..")  # a folder that holds itself ends somewhere
+    with pytest.raises(InputError, match="notes"):
+        mask_files(folder, nothing_else, where="case")
+
+
+def test_a_folder_that_cannot_be_listed_is_refused(tmp_path: Path) -> None:
+    """It is no folder without masks."""
+    with pytest.raises(InputError) as caught:
+        entries(tmp_path / "none", most=10)
+    assert caught.value.code == "folder_not_listed"
+    masks(tmp_path / "seg")
+    with pytest.raises(InputError) as caught:
+        entries(tmp_path / "seg", most=1)
+    assert caught.value.code == "folder_too_large"
+    assert [one.name for one in unaccounted(tmp_path, entries(tmp_path, most=9), nothing_else)] == ["seg"]
+
+
+@pytest.mark.parametrize("name", ["4.dcm", "4.dcm.part", "4", ".4.dcm"])
+def test_a_slice_that_cannot_be_read_is_no_end_of_the_scan(tmp_path: Path, name: str) -> None:
+    """A link to nothing beside the slices, a pointer in place of one, half a download: the scan would be shorter."""
+    folder = world.write_series(tmp_path / "s", world.series(), [f"{n}.dcm" for n in range(4)])
+    assert choose_series(folder).notes == ()
+    if name == "4":
+        (folder / name).symlink_to("not_fetched/4")
+    else:
+        (folder / name).write_text("version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(InputError, match=re.escape(name)) as caught:
+        choose_series(folder)
+    assert caught.value.code == "slices_not_read"
+
+
+def test_slices_in_a_folder_beside_the_series_are_told(tmp_path: Path) -> None:
+    """They are not entered, and may be its other half; other files and folders are none of the scan's."""
+    folder = world.write_series(tmp_path / "s", world.series(), [f"{n}.dcm" for n in range(4)])
+    for name in ("labels.nii.gz", "VERSION", "notes.txt"):
+        (folder / name).write_text("x")
+    (folder / "seg").mkdir()
+    assert choose_series(folder).notes == ()
+    world.write_series(folder / "part 2", world.series())
+    assert "DICOM in part 2" in choose_series(folder).notes[0]
+
+
+def volume(path: Path, values: np.ndarray) -> None:
+    """A small volume, indices (z, y, x)."""
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(path))
+
+
+def patient(folder: Path) -> Path:
+    """A CT, and masks in a folder of their own."""
+    (folder / "seg").mkdir(parents=True)
+    noise = np.random.default_rng(1).normal(0.0, 10.0, (12, 12, 12))
+    ct = np.full((12, 12, 12), -1000.0) + noise
+    ct[3:9, 3:9, 3:9] += 1040
+    volume(folder / "ct.nii.gz", ct.astype(np.int16))
+    for k, name in enumerate(("liver", "colon")):
+        mask = np.zeros((12, 12, 12), np.uint8)
+        mask[4 + 2 * k, 4:6, 4:6] = 1
+        volume(folder / "seg" / f"{name}.nii.gz", mask)
+    return folder
+
+
+def found(folder: Path, **wanted: str):
+    """What `init` finds there."""
+    return find(Place(folder, NO_CACHE), Wanted(Space.LPS, **wanted))
+
+
+def test_init_refuses_what_it_does_not_read_among_masks_and_lists_it_elsewhere(tmp_path: Path) -> None:
+    """In the folder that the case will name, and above it where the name is that of a volume or mesh."""
+    folder = patient(tmp_path)
+    (folder / "letter.docx").write_bytes(b"x")
+    (folder / "statistics.json").write_text("{}")
+    seen = found(folder)
+    assert not seen.problems and len(seen.segmentations) == 1
+    assert seen.passed == [("letter.docx", "of a kind that is not read")]
+    (folder / "seg" / "letter.docx").write_bytes(b"x")
+    (folder / "vessel.nii.gz").symlink_to("annex")
+    problems = {error.where: error for error in found(folder).problems}
+    assert {error.code for error in problems.values()} == {"entries_not_read"}
+    assert "letter.docx" in str(problems[str(folder / "seg")])
+    assert "vessel.nii.gz (is a link to a file that is not there)" in str(problems[str(folder)])
+    (folder / "seg" / "letter.docx").unlink()
+    assert not found(folder, segmentation="seg").problems, "the user said which"
+
+
+def test_a_folder_that_is_too_deep_is_told(tmp_path: Path) -> None:
+    """Two levels below the patient's folder are looked through; among masks what is deeper is refused."""
+    folder = patient(tmp_path)
+    (folder / "a" / "b" / "c").mkdir(parents=True)
+    (folder / "a" / "b" / "c" / "x.dat").write_text("x")
+    assert ("a/b/c", "is a folder") in found(folder).passed
+
+
+def test_among_meshes_alone_nothing_else_lies(tmp_path: Path) -> None:
+    """A mesh in another format, or one that was not fetched; a material is none."""
+    for name in ("liver.obj", "colon.obj"):
+        (tmp_path / name).write_text("v 0 0 0\nv 900 0 0\nv 0 9 0\nv 0 0 9\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    (tmp_path / "liver.mtl").write_text("x")
+    assert not found(tmp_path).problems
+    (tmp_path / "vessel.step").write_text("x")
+    (tmp_path / "vein.obj").symlink_to("annex")
+    (error,) = found(tmp_path).problems
+    assert error.code == "entries_not_read" and "vessel.step" in str(error) and "vein.obj" in str(error)
