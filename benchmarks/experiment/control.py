@@ -26,7 +26,7 @@ from benchmarks.experiment.workbench import (
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.plant.felt import Felt
 from puncture_twin.twin.world.client import step
-from puncture_twin.twin.world.control.admittance import Admittance, VirtualMass
+from puncture_twin.twin.world.control.insertion import Admittance, VirtualMass
 from puncture_twin.twin.world.engine import pybullet
 
 WALL_N_M, OVER_M = 1e5, 3e-3

@@ -8,8 +8,7 @@ from time import process_time
 import numpy as np
 
 from benchmarks.experiment.row import Row
-from puncture_twin.planning.needle.beam import Beam
-from puncture_twin.planning.needle.bevel_path import bevel_path, step_for
+from puncture_twin.planning.needle.bevel_path import Beam, bevel_path, step_for
 from puncture_twin.planning.needle.deflection import ALLOWANCE, MOST_SLENDER, deflection_bound
 from puncture_twin.planning.needle.insertion_force import insertion_force
 from puncture_twin.planning.needle.shaft import GAUGES, Shaft

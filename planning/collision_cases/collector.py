@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from decimal import ROUND_CEILING, ROUND_FLOOR
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +21,138 @@ from puncture_twin.planning.collision_cases.checks_file import (
     WindowSection,
     read_checks,
 )
-from puncture_twin.planning.collision_cases.direction_finding import direction_finding
-from puncture_twin.planning.collision_cases.finding import Difference, Finding
+from puncture_twin.planning.collision_cases.finding import Difference, Finding, NewNumber
 from puncture_twin.planning.collision_cases.pytest_run import ARM_PROPERTY, UPDATE, updating
 from puncture_twin.planning.collision_cases.rewrite import Change
 from puncture_twin.planning.collision_cases.session import Session, session_of
 from puncture_twin.planning.collision_cases.table_lines import table_lines
-from puncture_twin.planning.collision_cases.window_finding import window_finding
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.explain import Explanation
+from puncture_twin.planning.search.explain import Explanation, reason_text
+from puncture_twin.planning.search.selection.windows import Windows, find_windows, nearest_row
+
+DIGIT = 0.1
+"""Of a tolerance: a rewritten number keeps the rest of it."""
+
+LEAST_DIGIT_MM, CHANCE_DIGIT = 0.01, 0.01
+"""To which a rewritten least clearance (mm) and a rewritten chance (of itself) are rounded."""
+
+
+def direction_finding(check: CheckSection, found: Explanation) -> Finding:
+    """What of a direction is not as expected."""
+    differences = (*_verdict(check, found), *_clearances(check, found), *_least(check, found), *_touch(check, found))
+    if not differences:
+        return Finding()
+    case, arm = shlex.quote(str(found.case.path)), "--arm" if check.arm else "--no-arm"
+    command = f"run-twin check {case} --theta {check.theta_deg:g} --beta {check.beta_deg:g} {arm} --all"
+    return Finding(differences, (*found.head(), *found.structure_lines()), f"all of it: {command}")
+
+
+def _verdict(check: CheckSection, found: Explanation) -> Iterator[Difference]:
+    row = found.candidates.verdict
+    stated = (
+        ("verdict", check.verdict, found.verdict),
+        ("reason", None if check.reason is None else check.reason.value, str(row.reason[0])),
+        ("structure", check.structure, str(row.structure[0])),
+    )
+    for what, want, got in stated:
+        if want is not None and want != got:
+            yield Difference(f"{what}: expected {want!r}, found {got!r}")
+
+
+def _clearances(check: CheckSection, found: Explanation) -> Iterator[Difference]:
+    clearances = found.clearances()
+    for name, want in check.clearance_mm.items():
+        if name not in clearances:
+            yield Difference(f"clearance of {name!r}: no such structure; there are {', '.join(clearances)}")
+        elif not abs(clearances[name] - want) <= check.tolerance_mm:
+            got = clearances[name]
+            line = f"clearance of {name}: expected {want:g} ± {check.tolerance_mm:g} mm, found {got:.4f} mm"
+            yield Difference(line, _number(NewNumber(("clearance_mm", name), got, DIGIT * check.tolerance_mm)))
+
+
+def _least(check: CheckSection, found: Explanation) -> Iterator[Difference]:
+    want, got = check.min_clearance_mm, float(found.candidates.least_clearance[0])
+    if want is None or got >= want:
+        return
+    line = f"min_clearance_mm: expected at least {want:g} mm, found {got:.4f} mm, {found.nearest_demanding()}"
+    yield Difference(line, _number(NewNumber(("min_clearance_mm",), got, LEAST_DIGIT_MM, ROUND_FLOOR)))
+
+
+def _touch(check: CheckSection, found: Explanation) -> Iterator[Difference]:
+    want, chances = check.max_touch, found.candidates.chances
+    if want is None:
+        return
+    if found.case.errors is None:
+        yield Difference("max_touch: the case declares no [errors], so that nothing says how likely a touch is")
+    elif chances is None or not np.isfinite(chances.touch_any[0]):
+        need = "a direction that organs and arm allow" if check.arm else "arm = true"
+        yield Difference(f"max_touch: the chance to touch is not known; it takes {need}")
+    elif not chances.touch_any[0] <= want:
+        got = float(chances.touch_any[0])
+        line = f"max_touch: expected at most {want:g}, found {got:.3g}"
+        yield Difference(line, _number(NewNumber(("max_touch",), got, CHANCE_DIGIT * got, ROUND_CEILING)))
+
+
+def _number(new: NewNumber) -> NewNumber | None:
+    """None where there is no number to expect."""
+    return new if np.isfinite(new.value) else None
+
+
+DIGIT_SQUARE_DEG = 1.0
+"""To which a rewritten area is rounded."""
+
+MOST_SHOWN = 6
+"""Windows."""
+
+
+def window_finding(window: WindowSection, direction: Candidates, search: Candidates) -> Finding:
+    """What of a window is not as expected.
+
+    Args:
+        window: What is expected.
+        direction: The direction alone, checked.
+        search: The search of the case's grid.
+    """
+    windows = find_windows(search)
+    differences = tuple(_differences(window, direction, search, windows))
+    return Finding(differences, tuple(_listed(search, windows))) if differences else Finding()
+
+
+def _differences(
+    window: WindowSection, direction: Candidates, search: Candidates, windows: Windows
+) -> Iterator[Difference]:
+    if not direction.safe[0]:
+        yield Difference(f"the direction is rejected: {reason_text(direction, 0)}")
+        return
+    row = nearest_row(search, direction.outward_ct[0])
+    if row is None:
+        yield Difference("the direction is safe, but lies beyond the grid that the case searches")
+    elif not search.safe[row]:
+        yield Difference(f"the nearest direction of the grid, {_angles(search, row)}: {reason_text(search, row)}")
+    else:
+        yield from _too_small(window, windows, int(windows.of_row[row]))
+
+
+def _too_small(window: WindowSection, windows: Windows, number: int) -> Iterator[Difference]:
+    want, got = window.min_square_deg, windows.windows[number - 1].square_deg
+    if not got >= want:
+        line = f"window {number} that holds it: expected at least {want:g} square degrees, found {got:.1f}"
+        yield Difference(line, NewNumber(("min_square_deg",), got, DIGIT_SQUARE_DEG, ROUND_FLOOR))
+
+
+def _listed(search: Candidates, windows: Windows) -> Iterator[str]:
+    yield f"windows: {len(windows.windows)}"
+    for one in windows.windows[:MOST_SHOWN]:
+        yield f"  {one.number}: {one.square_deg:.1f} square degrees, best at {_angles(search, one.best)}"
+
+
+def _angles(found: Candidates, row: int) -> str:
+    at = found.at(row)
+    return f"theta {at['theta_deg']:g} deg, beta {at['beta_deg']:g} deg"
+
 
 ONLY_NUMBERS = f"{UPDATE} rewrites numbers alone: verdict, reason, structure and plans are for a person to change"
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,19 +13,140 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.collision.checker import StateChecker
-from puncture_twin.planning.export.blends import blend_radii_mm
-from puncture_twin.planning.export.csv_times import csv_text, read_csv
-from puncture_twin.planning.export.motion import check_sampled
+from puncture_twin.planning.export.motion import SampledMotion, check_sampled
 from puncture_twin.planning.export.program import program_of, waypoint_rows
 from puncture_twin.planning.export.program_check import check_program
 from puncture_twin.planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
+from puncture_twin.planning.export.text import heading
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
+from puncture_twin.planning.motion.approach import MAX_SWEEP_MM
+from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_geometry
+
+GRID_MM = MAX_SWEEP_MM / 2.0
+"""In two directions: no state of the triangle is farther from a checked one than half of ``MAX_SWEEP_MM``."""
+
+LARGEST_BLEND_MM = 5.0
+"""The first radius tried: enough not to stop, small against the room that a plan leaves."""
+
+SMALLEST_BLEND_MM = 1.0
+"""Radii are halved down to this; then the arm stops at the waypoint."""
+
+LARGEST_FRACTION = 0.45
+"""Of each segment, so that two blends never meet: the controller skips a waypoint whose blend overlaps the next."""
+
+SAMPLES = 400
+"""Along a segment, to find where the tip comes within the radius."""
+
+
+def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
+    """A radius for each waypoint between the ends; 0 where no corner may be cut.
+
+    Args:
+        checker: Judges contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
+        waypoints: Shape (k, 6), rad.
+
+    Returns:
+        Shape (k - 2,), mm.
+    """
+    corners = range(1, len(waypoints) - 1)
+    return np.array([_radius_mm(checker, waypoints[at - 1 : at + 2]) for at in corners])
+
+
+def _radius_mm(checker: StateChecker, waypoints: Floats) -> float:
+    """The largest radius tried that is free, of the corner between three waypoints (3, 6)."""
+    before, corner, after = waypoints
+    radius = LARGEST_BLEND_MM
+    while radius >= SMALLEST_BLEND_MM:
+        starts, ends = (_fraction_within(checker, corner, other, radius) for other in (before, after))
+        if max(starts, ends) <= LARGEST_FRACTION and _free(
+            checker, corner, starts * (before - corner), ends * (after - corner)
+        ):
+            return radius
+        radius /= 2.0
+    return 0.0
+
+
+def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radius_mm: float) -> float:
+    """The last fraction of the path from a corner at which the tip is still within a radius of it, or the next sample.
+
+    1 where the tip is so near the other end, so that half of the distance between two tips bounds both radii.
+    """
+    fractions = np.linspace(0.0, 1.0, SAMPLES + 1)
+    poses = flange_pose(checker.model, corner + fractions[:, None] * (other - corner))
+    tips = poses[:, :3, 3] + checker.tool.needle_length_mm * poses[:, :3, 2]
+    far = np.linalg.norm(tips - tips[0], axis=1)
+    if radius_mm > LARGEST_FRACTION * far[-1]:
+        return 1.0
+    return float(fractions[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
+
+
+def _free(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> bool:
+    """Whether every state of the triangle corner, corner + back, corner + ahead is free of contact."""
+    states = _triangle(checker, corner, back, ahead)
+    return all(checker.contact(q, needle_may_touch_patient=False) is None for q in states)
+
+
+def _triangle(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> Floats:
+    """States of a triangle, (m, 6), in rays from its corner: neighbours on a ray or across are within ``GRID_MM``."""
+    rays, steps = 1, 1
+    while True:
+        turn = np.linspace(0.0, 1.0, rays + 1)[:, None, None]
+        along = np.linspace(0.0, 1.0, steps + 1)[None, :, None]
+        grid = corner + along * ((1.0 - turn) * back + turn * ahead)
+        outward = max(float(checker.sweep_mm(ray).max()) for ray in grid)
+        across = max(float(checker.sweep_mm(arc).max()) for arc in grid.swapaxes(0, 1)[1:])
+        if max(outward, across) <= GRID_MM:
+            return grid[:, 1:].reshape(-1, 6)
+        rays = math.ceil(rays * max(1.0, across / GRID_MM))
+        steps = math.ceil(steps * max(1.0, outward / GRID_MM))
+
+
+COLUMNS = ("phase", "time_s", *(f"q{joint}_rad" for joint in range(1, 7)))
+
+NOTES = (
+    "joint angles of the controller, base to wrist 3; each phase starts at time 0 and at rest",
+    "the insertion is for the operator to start: nothing in this table waits",
+)
+
+
+def csv_text(plan: Plan, *, case_checked: bool) -> str:
+    """The table, with comment lines (#) above its header."""
+    lines = [*heading(plan, NOTES, case_checked=case_checked), ",".join(COLUMNS)]
+    for phase in SampledMotion._fields:
+        trajectory = getattr(plan, phase)
+        for time, row in zip(trajectory.times_s.tolist(), trajectory.q.tolist(), strict=True):
+            lines.append(",".join([phase, repr(time), *map(repr, row)]))
+    return "\n".join(lines) + "\n"
+
+
+def read_csv(text: str, *, where: Path) -> SampledMotion:
+    """Read the table back.
+
+    Raises:
+        InputError: Another header, another phase, or rows that are no motion.
+    """
+    rows = list(csv.reader(io.StringIO("\n".join(line for line in text.splitlines() if not line.startswith("#")))))
+    if not rows or tuple(rows[0]) != COLUMNS:
+        raise InputError("the table's header is another", where=where, allowed=",".join(COLUMNS))
+    phases: dict[str, list[list[float]]] = {phase: [] for phase in SampledMotion._fields}
+    for number, row in enumerate(rows[1:], start=2):
+        try:
+            phases[row[0]].append([float(cell) for cell in row[1:]])
+        except (KeyError, IndexError, ValueError) as error:
+            allowed = f"{' or '.join(phases)} and seven numbers"
+            raise InputError(f"row {number} of the table: {error}", where=where, allowed=allowed) from error
+        if len(row) != len(COLUMNS):
+            raise InputError(f"row {number} has {len(row)} cells", where=where, allowed=f"{len(COLUMNS)} cells")
+    tables = [np.array(table).reshape(-1, 7) for table in phases.values()]
+    return SampledMotion(*(Trajectory(table[:, 0], table[:, 1:]) for table in tables))
 
 
 @dataclass(frozen=True, eq=False)

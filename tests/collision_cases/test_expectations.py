@@ -7,10 +7,13 @@ import pytest
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.collision_cases.checks_file import CheckSection, WindowSection
-from puncture_twin.planning.collision_cases.collector import plan_finding, unique_names
-from puncture_twin.planning.collision_cases.direction_finding import direction_finding
+from puncture_twin.planning.collision_cases.collector import (
+    direction_finding,
+    plan_finding,
+    unique_names,
+    window_finding,
+)
 from puncture_twin.planning.collision_cases.finding import MOST_LINES
-from puncture_twin.planning.collision_cases.window_finding import window_finding
 from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.plan.planner import make_plan
 from puncture_twin.planning.search.context import prepare

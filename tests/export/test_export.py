@@ -21,10 +21,8 @@ from puncture_twin.planning.arm.ur import JOINT_NAMES, UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
-from puncture_twin.planning.export.blends import blend_radii_mm
 from puncture_twin.planning.export.corners import corner_rows, rests_at
-from puncture_twin.planning.export.csv_times import csv_text, read_csv
-from puncture_twin.planning.export.exporter import FORMATS, export_plan
+from puncture_twin.planning.export.exporter import FORMATS, blend_radii_mm, csv_text, export_plan, read_csv
 from puncture_twin.planning.export.limits import check_trajectory
 from puncture_twin.planning.export.motion import check_sampled
 from puncture_twin.planning.export.program import program_of, waypoint_rows

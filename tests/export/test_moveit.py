@@ -21,10 +21,8 @@ from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import JOINT_NAMES, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.settings import Gantry, Obstacle
-from puncture_twin.planning.export.moveit.goal_messages import check_goals, goal_messages
 from puncture_twin.planning.export.moveit.messages import BOX, CYLINDER
-from puncture_twin.planning.export.moveit.moveit_files import SENDER_TEXT
-from puncture_twin.planning.export.moveit.scene_message import scene_message
+from puncture_twin.planning.export.moveit.moveit_files import SENDER_TEXT, check_goals, goal_messages, scene_message
 from puncture_twin.planning.export.moveit.urdf import urdf_with_needle
 from puncture_twin.planning.export.ros2 import ros2_text
 from puncture_twin.planning.motion.trajectory import Trajectory

@@ -24,7 +24,7 @@ from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
-from puncture_twin.planning.export.csv_times import csv_text
+from puncture_twin.planning.export.exporter import csv_text
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import write_plan

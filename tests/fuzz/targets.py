@@ -11,7 +11,7 @@ from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.whole_case import SCHEMA_ONE_NOTE
 from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.checks_file import read_checks
-from puncture_twin.planning.export.csv_times import read_csv
+from puncture_twin.planning.export.exporter import read_csv
 from puncture_twin.planning.formats.dicom.ct_series import parse_series
 from puncture_twin.planning.formats.dicom.recognise import recognise
 from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation

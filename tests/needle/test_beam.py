@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.experiment.tissue import beyond, in_every_order, proven
-from puncture_twin.planning.needle.beam import Beam
-from puncture_twin.planning.needle.bevel_path import bevel_path, step_for
+from puncture_twin.planning.needle.bevel_path import Beam, bevel_path, step_for
 from puncture_twin.planning.needle.deflection import ALLOWANCE, MOST_SLENDER, deflection_bound, stiffest_resolved
 from puncture_twin.planning.needle.shaft import GAUGES, Shaft
 from puncture_twin.planning.needle.tissue import Tissue

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.reasons import SAFE, css
-from puncture_twin.planning.search.html import candidates_html
+from puncture_twin.planning.search.candidates import candidates_html
 
 
 class Grid(SimpleNamespace):

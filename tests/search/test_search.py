@@ -17,10 +17,9 @@ from puncture_twin.planning.case.tables.search_section import RankingSection
 from puncture_twin.planning.clearance.cross_check import CrossCheckError
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.organs import inside_length, organ_candidates
 from puncture_twin.planning.search.ranking import pareto_front, rank, ranked
 from puncture_twin.planning.search.table import write_table
-from puncture_twin.planning.search.tissue import inside_length
 from tests.carton_truth import carton_field
 
 

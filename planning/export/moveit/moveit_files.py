@@ -5,18 +5,144 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
+
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.arm.model_urdf import model_urdf
+from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.collision.workcell import case_tool
-from puncture_twin.planning.export.moveit.goal_messages import check_goals, goal_messages
-from puncture_twin.planning.export.moveit.scene_message import scene_message
+from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.workcell import case_tool, patient_surface
+from puncture_twin.planning.export.motion import SampledMotion, check_sampled
+from puncture_twin.planning.export.moveit.messages import (
+    RosFrames,
+    box_message,
+    cylinder_message,
+    mesh_message,
+    pose_message,
+)
 from puncture_twin.planning.export.moveit.urdf import urdf_with_needle
+from puncture_twin.planning.export.ros2 import NANOSECONDS, TIME_RESOLUTION_S, velocities
 from puncture_twin.planning.export.text import warning_lines
+from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_geometry
+
+PATIENT, NEEDLE, HOLDER = "patient", "needle", "needle_holder"
+
+
+def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
+    """The scene as a difference to what MoveIt knows: all that the plan was checked against, and its first state.
+
+    Args:
+        case: The plan's case.
+        anatomy: Its structures and skin.
+        plan: The plan; its registration places the patient.
+    """
+    frames = RosFrames.of(model_urdf(plan.model))
+    solids = [_solid(box, frames) for box in case_boxes(case, plan.T_base_ct)]
+    start = {"name": list(plan.model.joint_names), "position": [float(angle) for angle in plan.approach.q[0]]}
+    carried = _attached(case_tool(case), frames)
+    return {
+        "name": "puncture",
+        "is_diff": True,
+        "robot_state": {
+            "is_diff": True,
+            "joint_state": start,
+            "attached_collision_objects": carried,
+        },
+        "world": {"collision_objects": [_patient(anatomy, plan, frames), *solids]},
+    }
+
+
+def _patient(anatomy: Anatomy, plan: Plan, frames: RosFrames) -> dict[str, Any]:
+    """The skin with all that the CT shows outside of it, in its own frame; the pose says where it lies."""
+    pose = pose_message(frames.T_root_base @ plan.T_base_ct)
+    return _object(PATIENT, frames.root) | {"meshes": [mesh_message(patient_surface(anatomy))], "mesh_poses": [pose]}
+
+
+def _solid(box: Box, frames: RosFrames) -> dict[str, Any]:
+    primitive, pose = box_message(box, frames)
+    return _object(box.name, frames.root) | {"primitives": [primitive], "primitive_poses": [pose]}
+
+
+def _attached(tool: Tool, frames: RosFrames) -> list[dict[str, Any]]:
+    ends = tool.needle_length_mm - tool.shaft_mm, tool.needle_length_mm
+    parts = [(NEEDLE, *ends, tool.needle_diameter_mm)]
+    if ends[0] > 0:
+        parts.insert(0, (HOLDER, 0.0, ends[0], tool.holder_diameter_mm))
+    made = []
+    for name, start, end, diameter in parts:
+        primitive, pose = cylinder_message(start, end, diameter)
+        body = _object(name, frames.flange) | {"primitives": [primitive], "primitive_poses": [pose]}
+        made.append({"link_name": frames.flange, "object": body, "touch_links": list(frames.touching)})
+    if tool.body is not None:
+        body = _object("tool", frames.flange) | {
+            "meshes": [mesh_message(tool.body.mesh)],
+            "mesh_poses": [pose_message(np.eye(4))],
+        }
+        made.append({"link_name": frames.flange, "object": body, "touch_links": list(frames.touching)})
+    return made
+
+
+def _object(name: str, frame: str) -> dict[str, Any]:
+    """``moveit_msgs/CollisionObject``; its own pose is the frame's, those of its shapes say the rest."""
+    return {"header": {"frame_id": frame}, "id": name, "pose": {"orientation": {"w": 1.0}}}
+
+
+PATH_TOLERANCE_RAD, GOAL_TOLERANCE_RAD = 0.02, 0.002
+"""Beyond them the controller gives up: on the way 20 mm at a metre, at the end 2 mm."""
+
+GOAL_TIME_S = 1
+"""How much later than planned the arm may arrive."""
+
+
+def goal_messages(plan: Plan) -> dict[str, Any]:
+    """``approach`` and ``insertion``."""
+    return {phase: _goal(plan, getattr(plan, phase)) for phase in SampledMotion._fields}
+
+
+def _goal(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
+    speeds, names = velocities(plan.model, trajectory), plan.model.joint_names
+    points = [_point(*row) for row in zip(trajectory.times_s, trajectory.q, speeds, strict=True)]
+    return {
+        "trajectory": {"header": {"frame_id": ""}, "joint_names": list(names), "points": points},
+        "path_tolerance": [{"name": name, "position": PATH_TOLERANCE_RAD} for name in names],
+        "goal_tolerance": [{"name": name, "position": GOAL_TOLERANCE_RAD} for name in names],
+        "goal_time_tolerance": {"sec": GOAL_TIME_S, "nanosec": 0},
+    }
+
+
+def _point(time_s: float, q: Floats, speeds: Floats) -> dict[str, Any]:
+    sec, nanosec = divmod(round(float(time_s) * NANOSECONDS), NANOSECONDS)
+    return {
+        "positions": q.tolist(),
+        "velocities": speeds.tolist(),
+        "time_from_start": {"sec": sec, "nanosec": nanosec},
+    }
+
+
+def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
+    """Refuse goals that were read back and are not the plan's, or break a limit of the arm.
+
+    Raises:
+        InputError: Says what differs.
+    """
+    parts = {}
+    for phase in SampledMotion._fields:
+        trajectory = goals[phase]["trajectory"]
+        if trajectory["joint_names"] != list(plan.model.joint_names):
+            raise InputError(f"{phase} is of other joints", where=where, allowed=", ".join(plan.model.joint_names))
+        starts = [point["time_from_start"] for point in trajectory["points"]]
+        times = np.array([one["sec"] + one["nanosec"] / NANOSECONDS for one in starts])
+        parts[phase] = Trajectory(times, np.array([point["positions"] for point in trajectory["points"]]))
+    check_sampled(SampledMotion(**parts), plan, time_resolution_s=TIME_RESOLUTION_S, where=where)
+
 
 MOVEIT = "moveit"
 

@@ -87,7 +87,7 @@ def test_across_it_is_what_the_beams_clamp_bears():
 
 def test_the_beams_clamp_bears_what_presses_on_it():
     """A cantilever's load and its moment; in a foundation the sum of what each length of it presses, by quadrature."""
-    from puncture_twin.planning.needle.beam import Beam
+    from puncture_twin.planning.needle.bevel_path import Beam
 
     loaded = Beam(SHAFT.bending_stiffness, 1.0, 150).bent(np.zeros(150), np.zeros(151), tip_load=0.3)
     assert loaded.clamp_force == pytest.approx(0.3) and loaded.clamp_moment == pytest.approx(0.3 * 150)

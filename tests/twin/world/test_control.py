@@ -19,9 +19,9 @@ from benchmarks.experiment.workbench import (
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.twin.world.client import STANDARD_GRAVITY_MM_S2
-from puncture_twin.twin.world.control.admittance import Admittance, VirtualMass
 from puncture_twin.twin.world.control.gains import STEPS_S, Stiffness, allowed_step, damping, stability_ratio
 from puncture_twin.twin.world.control.impedance import rotation_error
+from puncture_twin.twin.world.control.insertion import Admittance, VirtualMass
 from puncture_twin.twin.world.control.tip import tips
 from puncture_twin.twin.world.engine import pybullet
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.formats.dicom.storage import is_dicom_file
 from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
@@ -16,6 +21,7 @@ from puncture_twin.planning.search.doubt import Doubt
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.twin.report.map.map_raster import MapRaster
+from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.numbers import (
     TRUTH_IS_BELIEF,
     demanding,
@@ -28,15 +34,13 @@ from puncture_twin.twin.report.numbers import (
     target_text,
 )
 from puncture_twin.twin.report.page import page_tables as tables
-from puncture_twin.twin.report.page.page_budget import budget_section
 from puncture_twin.twin.report.page.page_chances import chance_card, chances_section, rooms_section
 from puncture_twin.twin.report.page.page_charts import rehearsal_charts
-from puncture_twin.twin.report.page.page_dates import dates_text
 from puncture_twin.twin.report.page.page_map import map_data
-from puncture_twin.twin.report.page.page_methods import methods_text
 from puncture_twin.twin.report.page.page_scene import scene_figure
 from puncture_twin.twin.report.page.page_slices import SHOWN_TONES, slices_data
-from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
+from puncture_twin.twin.report.page.page_tables import PROJECT, faint, table, two
+from puncture_twin.twin.report.page.template import Card, plotly_script, png_address, script_json, write_html
 from puncture_twin.twin.report.slices.sheet import Slices
 
 
@@ -216,3 +220,119 @@ def _direction_card(candidates: Candidates, row: int, *, best: bool) -> Card:
     where = f"θ {np.degrees(candidates.theta[row]):.4g}°, β {np.degrees(candidates.beta[row]):.4g}°"
     detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body; {nearest_text(candidates, row)}"
     return Card("best direction" if best else "chosen direction", where, detail)
+
+
+def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
+    """What was checked, by what, and what was not."""
+    theta, step = np.degrees(candidates.theta), np.degrees(step_of(candidates))
+    checked = sum(1 for one in anatomy.checked if str(one.role) in {"avoid", "unknown"})
+    arm_name = case.robot.model.name.upper()
+    arm = (
+        f"For each remaining direction it was checked whether a {arm_name} reaches it and inserts the "
+        "needle without contact."
+        if candidates.arm_checked
+        else "The arm was not checked."
+    )
+    chances = (
+        "Chances to hit and to touch were propagated from the declared errors of markers, touches and arm."
+        if candidates.chances is not None
+        else "No errors were declared, so that no chances were computed."
+    )
+    return (
+        f"Straight needle paths to the target were searched with {PROJECT} {version(PROJECT)} over {len(candidates):,} "
+        f"entry directions, θ {theta.min():g}° to {theta.max():g}° and every azimuth β of the case, in steps of "
+        f"{step:g}° (angles as in Chen et al. 2019, Eq. 10-15; {needle_text(case)}). For each direction the distance "
+        f"between the needle and each of {checked} structures to keep away from was computed exactly on their triangle "
+        f"meshes and compared with the structure's margin; a direction through a region that the images or labels do "
+        f"not show was refused as unknown. {arm} {chances} Every input is listed below with its SHA-256. "
+        + _left_out(case)
+    )
+
+
+def _left_out(case: Any) -> str:
+    """What was not modelled, and what was of breath and needle."""
+    if case.breathing is None and case.bending is None:
+        return "Breathing, needle bending and tissue motion were not modelled."
+    return " ".join([_breath(case.breathing), _needle(case.bending), "The deformation of tissue was not modelled."])
+
+
+def _breath(breath: Any) -> str:
+    if breath is None:
+        return "Breathing was not modelled."
+    return (
+        f"Breathing was taken as a motion of {breath.amplitude_mm:g} mm along one line after Lujan et al. 1999 "
+        f"(exponent {breath.exponent}, {len(breath.positions)} positions), each structure with a weight of its own: a "
+        f"safe direction is safe {breath.window_text}; a needle in place moves with the organ and bends."
+    )
+
+
+def _needle(bending: Any) -> str:
+    if bending is None:
+        return "Needle bending was not modelled."
+    return (
+        f"The needle was taken as a beam in an elastic foundation whose bevel cuts {np.degrees(bending.alpha):g}° off "
+        "its direction (Webster et al. 2006); its greatest deflection to any side was kept as clearance."
+    )
+
+
+EPOCH = "SOURCE_DATE_EPOCH"
+"""Seconds since 1970 that stand for "now", as tools take them that make the same bytes on every day."""
+
+
+def dates_text(case: Any) -> str:
+    """The day of the page and of its scan."""
+    return f"Made on {made_on()} (UTC); scan of {scan_date(case) or 'a date that its files do not state'}."
+
+
+def made_on() -> str:
+    """Today, UTC."""
+    stated = os.environ.get(EPOCH, "")
+    at = datetime.fromtimestamp(int(stated), UTC) if stated.isascii() and stated.isdigit() else datetime.now(UTC)
+    return at.date().isoformat()
+
+
+def scan_date(case: Any) -> str:
+    """The day of the first CT slice among a case's inputs; the empty string where none says so (as in NIfTI)."""
+    for one in case.inputs:
+        path = case.path.parent / one.path
+        if is_dicom_file(path):
+            from puncture_twin.planning.formats.dicom.recognise import recognise  # with pydicom: few cases need it
+
+            found = recognise(path)
+            if found is not None and found.is_slice:
+                return found.date
+    return ""
+
+
+SHOWN_MM = 0.005
+"""A source that costs less would be 0.00."""
+
+
+def budget_section(facts: Mapping[str, Any]) -> Markup:
+    """The picture, and its numbers.
+
+    Args:
+        facts: As ``register --json`` has them under ``budget``, of the direction that is shown.
+    """
+    from puncture_twin.twin.report.budget_picture import budget_png  # with matplotlib, only where there is a budget
+
+    now, best = facts["expected_mm"], facts["best"]
+    won = now - best["expected_mm"]
+    head = f"Expected tip error of this insertion: {now:.2f} mm (rms)"
+    text = f"{head}. The next {won:.2f} mm is won by {best['text']}." if won >= SHOWN_MM else f"{head}."
+    form = (
+        "<p>{}</p>"
+        '<p><img src="{}" style="max-width:100%" alt="What each source of the error costs, and what changes leave"></p>'
+    )
+    sources = [
+        (one["text"], f"{one['alone_mm']:.2f}", f"{one['without_mm']:.2f}")
+        for one in facts["sources"]
+        if one["alone_mm"] >= SHOWN_MM
+    ]
+    changes = [(one["text"], f"{one['expected_mm']:.2f}") for one in facts["changes"]]
+    numbers = two(
+        table(("source", "alone, mm", "all but it, mm"), sources, kind="numbers"),
+        table(("with this one change", "expected, mm"), changes, kind="numbers"),
+    )
+    shown = Markup(form).format(text, png_address(budget_png(facts)))
+    return shown + numbers + faint(f"Not modelled: {facts['not_modelled']}.")
