@@ -155,25 +155,27 @@ class Lacking(NamedTuple):
     probability: float
     """Of residuals that they explain so well, where all are zero: F(k, freedom)."""
     freedom: int
-    """m - p - k."""
+    """Residuals less p and k."""
     variance: float
     """Of one residual, beside them."""
     variance_without: float
     """Of one residual, as the model without them has it."""
 
 
-def lacking(z: Floats, A: Floats, more: Floats) -> Lacking | None:
+def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> Lacking | None:
     """The F-test of z = A x + more y + noise against y = 0; None where the data cannot show y.
 
     Args:
         z: Shape (m,), in standard deviations (of one common size, which need not be known).
         A: Shape (m, p): columns of the model.
         more: Shape (m, k): columns that it lacks.
+        count: How many residuals count, where others have next to no weight; None for all.
     """
     basis, values, _ = np.linalg.svd(A, full_matrices=False)
     basis = basis[:, values > UNSEEN * values[0]]
     beside, left = more - basis @ (basis.T @ more), z - basis @ (basis.T @ z)
     (m, k), p = more.shape, basis.shape[1]
+    m = m if count is None else count
     freedom = m - p - k
     size = np.linalg.norm(more, axis=0)
     if freedom < 1 or not (size > 0.0).all():
@@ -181,7 +183,7 @@ def lacking(z: Floats, A: Floats, more: Floats) -> Lacking | None:
     shown = np.linalg.svd(beside / size, compute_uv=False)
     if not shown[-1] > UNSEEN:
         return None
-    found = np.linalg.lstsq(beside, left, rcond=None)[0]
+    found = np.asarray(np.linalg.lstsq(beside, left, rcond=None)[0], dtype=np.float64)
     before, after = float(left @ left), float(np.sum((left - beside @ found) ** 2))
     f = np.inf if after == 0.0 else (before - after) / k / (after / freedom)
     sd = np.sqrt(after / freedom * np.diag(np.linalg.inv(beside.T @ beside)))

@@ -54,7 +54,9 @@ def checked_calibration(recording: Recording, case: SelfcalCase | None, where: P
     try:
         found = calibrate_case(recording, case)
     except InputError:
-        _refuse_slip(recording, np.inf, where)
+        rms_mm = _residual_mm(lambda r: _read(r, r.A, r.B, r.P), recording)
+        if rms_mm > SUSPECT_MM:
+            _refuse_slip(recording, rms_mm, where)
         raise
     if found.rms_mm > SUSPECT_MM:
         _refuse_slip(recording, found.rms_mm, where)

@@ -24,6 +24,7 @@ def calibration_summary(found: Calibration, recording: Recording) -> dict[str, A
         "poses": len(recording),
         "residual_rms_mm": found.rms_mm,
         "set_aside": list(found.outliers),
+        "findings": [one.document() for one in found.findings],
         "iterations": found.iterations,
         "condition": found.condition,
         "noise": noise_summary(found),
@@ -65,10 +66,10 @@ def arms_summary(found: Calibration) -> dict[str, Any] | None:
 
 
 def predicted_tre(found: Calibration, recording: Recording) -> float:
-    """Expected (rms) error at the recorded tips, from the calibration, and from the arms where declared, mm."""
-    if found.arms is not None:
-        return expected_error_mm(found, recording)
-    return float(np.sqrt(np.mean(found.predicted_tre_mm(recording.P, recording.A) ** 2)))
+    """Expected (rms) error at the recorded tips, mm: from the calibration, the declared arms, an image that errs."""
+    known = found.predicted_tre_mm(recording.P, recording.A) if found.arms is None else None
+    noise = expected_error_mm(found, recording) if known is None else _rms(known)
+    return float(np.hypot(noise, found.image.rms_mm if found.image is not None and found.image.doubted else 0.0))
 
 
 def choice_summary(choice: Choice) -> dict[str, Any]:

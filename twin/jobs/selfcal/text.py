@@ -67,6 +67,7 @@ def _calibration(facts: Facts) -> list[str]:
         lines.append("  chi-squared over freedom {chi2_per_freedom:.2f}".format(**facts["arms"]))
     if facts["set_aside"]:
         lines.append(f"  set aside: {', '.join(facts['set_aside'])}")
+    lines += [f"  note: {one['sentence']}" for one in facts["findings"] if one["severity"] == "note"]
     return lines + [f"  cannot be shown: {line}" for line in facts["cannot_show"]]
 
 

@@ -24,8 +24,6 @@ SHAFT_BIAS = (
     "residual as it is; the known needle length would hold it"
 )
 
-SCALE_TAKEN = "the image's mm per pixel was taken as given: 1 % off makes the error at the tip half as large again"
-
 ARMS_TAKEN = (
     "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared with the joints, so "
     "the stated errors count noise alone and are too small"
@@ -91,7 +89,7 @@ def calibrate(
     if needle_length_mm is not None and known_tip is None:
         bias = float(solution.estimate.V @ solution.estimate.t_Q) - needle_length_mm
         solution = with_length(solution, bias)
-    cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None) + [SCALE_TAKEN] * (not scale)
+    cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None)
     cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
     if arms is not None and recording.turn_probe is None and any(arm.play_rad > 0.0 for arm in arms):
         cannot.append(PLAY_SIGN)
@@ -149,4 +147,4 @@ def _solve(
         problem, fit = refitted(problem, fit, seen, recheck=robust)
         if not np.array_equal(before, fit.tip_kept):
             observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
-    return solution_of(problem, fit, observability)
+    return solution_of(problem, fit, observability, seen)

@@ -9,9 +9,11 @@ from scipy.stats import chi2, f
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.brief import brief
+from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.image_errors import ImageErrors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.small_sample import SmallSample
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import PARAMETERS, T_Q
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, linear_model
@@ -40,6 +42,8 @@ class Calibration:
         rms_mm: Root mean square length of the residuals of the poses that were used.
         weights: One per pose, shape (n,): 1 used, 0 set aside.
         outliers: Names of the poses set aside.
+        image: What errors of the image the residuals show, doubted or not; None where the poses cannot show them.
+        findings: What the recording says against itself.
         iterations: Steps of the refinement, all rounds together.
         condition: Least over largest singular value of the Jacobian, lengths in 100 mm.
         covariance: Shape (p, p), of the parameters named below.
@@ -66,6 +70,8 @@ class Calibration:
     rms_mm: float
     weights: Floats
     outliers: tuple[str, ...]
+    image: ImageErrors | None
+    findings: tuple[Finding, ...]
     iterations: int
     condition: float
     covariance: Floats
@@ -94,13 +100,15 @@ class Calibration:
         """How often a right declaration has residuals as large as these."""
         return float(chi2.sf(self.chi_squared_ratio * self.freedom, self.freedom))
 
-    def declaration_doubts(self) -> tuple[str, ...]:
-        """A sentence where the residuals are larger than a stated noise and the declared arms let expect."""
+    def doubts(self) -> tuple[str, ...]:
+        """A sentence a warning, and one where the residuals are larger than the stated noise and arms let expect."""
+        said = tuple(one.sentence for one in self.findings if one.severity is Severity.WARNING)
         ratio = self.chi_squared_ratio
         if not isinstance(self.noise, Noise) or ratio <= LARGEST_RATIO:
-            return ()
+            return said
         chance = 100.0 * self.chi_squared_chance()
         return (
+            *said,
             f"chi-squared of the residuals is {ratio:.2f} times their freedom ({self.freedom}): noise or arms are "
             f"probably declared too small, and the stated errors with them; a right one gives this in {chance:.2g} %",
         )

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, read_only
+from puncture_twin.planning.base.findings import Finding
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, direction_findings
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import RobustFit, weighed
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.image_errors import ImageErrors, image_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.small_sample import SmallSample, small_sample
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import DIRECTION, PARAMETERS, T_Q
@@ -27,6 +30,8 @@ class Solution(NamedTuple):
     estimate: Estimate
     active: NDArray[np.int_]
     tip_kept: NDArray[np.bool_]
+    image: ImageErrors | None
+    findings: tuple[Finding, ...]
     iterations: int
     noise: Noise | Spread
     covariance: Floats
@@ -42,16 +47,20 @@ class Solution(NamedTuple):
     orientations: Floats
 
 
-def solution_of(problem: Problem, fit: RobustFit, observability: Observability) -> Solution:
+def solution_of(problem: Problem, fit: RobustFit, observability: Observability, seen: SeenDirection) -> Solution:
     """What is known at a fit, under the noise that was found or declared."""
     at_fit = weighed(problem, fit)
     count = 3 * int(fit.tip_kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction
     freedom = count - len(problem.active)
     region = small_sample(problem, fit) if problem.arms is not None else None
+    image = image_errors(problem, fit)
+    told = direction_findings(problem.recording.names, fit.tip_kept & ~fit.direction_kept, seen)
     return Solution(
         fit.estimate,
         problem.active,
         fit.tip_kept,
+        image,
+        told if image is None or not image.doubted else (*told, image.finding()),
         fit.iterations,
         problem.noise,
         at_fit.covariance,
@@ -107,6 +116,8 @@ def assembled(
         float(np.sqrt(np.mean(np.sum(solution.residuals[kept] ** 2, axis=1)))),
         read_only(1.0 * kept),
         tuple(name for name, used in zip(recording.names, kept, strict=True) if not used),
+        solution.image,
+        solution.findings,
         solution.iterations,
         solution.observability.ratio,
         read_only(solution.covariance[:p, :p]),
