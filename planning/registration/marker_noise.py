@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.stated_arm import check_arm
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
@@ -17,9 +17,6 @@ from puncture_twin.planning.registration.marker_pairs import MarkerPairs, check_
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.registration.touch_poses import touching_configuration
-
-MAX_JOINTS_OFF_MM = 5.0
-"""A controller with its own calibration puts the tip up to some mm from where the data sheet's arm does."""
 
 GUESSED_HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """An arm bent at the elbow, its needle down."""
@@ -35,7 +32,8 @@ def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where:
     check_pairs(markers, where)
     q_touch = touches(case, markers)
     if markers.joints is not None:
-        _check_joints(model, tip, markers, where)
+        tool = [np.array([0.0, 0.0, tip])]
+        check_arm(model, markers.joints, markers.points_base, tool, names=markers.names, where=where)
     return reading_noise(errors, model, tip, q_touch, known=markers.joints is not None)
 
 
@@ -54,17 +52,3 @@ def _guessed(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Flo
         return touching_configuration(model, tip_mm, point_base, needle_base)
     except NoAnswerError:
         return GUESSED_HOME
-
-
-def _check_joints(model: UrModel, tip_mm: float, markers: MarkerPairs, where: str | Path) -> None:
-    assert markers.joints is not None
-    flanges = flange_pose(model, markers.joints)
-    tips = flanges[:, :3, 3] + tip_mm * flanges[:, :3, 2]
-    away = np.linalg.norm(tips - markers.points_base, axis=1)
-    worst = int(np.argmax(away))
-    if away[worst] > MAX_JOINTS_OFF_MM:
-        raise InputError(
-            f"the joints of marker {markers.names[worst]} put the tip {away[worst]:.1f} mm away from where it touched",
-            where=where,
-            allowed=f"within {MAX_JOINTS_OFF_MM:g} mm: joints in degrees, of this robot, with this needle",
-        )

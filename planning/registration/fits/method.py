@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -68,6 +68,8 @@ def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path)
             where=where,
             allowed="triad, rigid or weighted; affine only reproduces the paper's Table 6",
         )
+    if method not in get_args(Method):
+        raise InputError(f"method {method!r}", where=where, allowed=", ".join(get_args(Method)), code="method")
     if method in WEIGHING and noise is None:
         raise InputError(
             f"method '{method}' weighs by declared errors", where=where, allowed="[errors], or method rigid"

@@ -17,6 +17,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder
 from puncture_twin.planning.base.input_file import decode_text, read_input
+from puncture_twin.planning.formats.joint_readings import joint_readings
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
@@ -75,13 +76,17 @@ def parse_recording(content: bytes, file: Path) -> Recording:
     try:
         first = 26 + width + shaft
         v, shaft_mm = values[:, 26 : 26 + width] if width else None, values[:, first - 1] if shaft else None
-        q_probe, q_needle = np.radians(np.split(values[:, first : first + 12], 2, axis=1)) if behind else (None, None)
+        q_probe, q_needle = None, None
+        if behind:
+            parts = np.split(values[:, first : first + 12], 2, axis=1)
+            q_probe, q_needle = (joint_readings(part, "deg", where="joints", names=names) for part in parts)
         turn_probe, turn_needle = np.split(values[:, first + 12 :], 2, axis=1) if behind == 24 else (None, None)
         A, B = (pose(part[:, :9].reshape(-1, 3, 3), part[:, 9:]) for part in (values[:, :12], values[:, 12:24]))
         joints = (q_probe, q_needle, turn_probe, turn_needle)
         return Recording(A, B, values[:, 24:26], v, names, pixels, *joints, shaft_mm)
     except InputError as error:
-        raise InputError(error.what, where=f"{file}: {error.where}", allowed=error.allowed) from error
+        where = f"{file}: {error.where}"
+        raise InputError(error.what, where=where, allowed=error.allowed, code=error.code) from error
 
 
 def write_recording(recording: Recording, path: Path) -> None:
