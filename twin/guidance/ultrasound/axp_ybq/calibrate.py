@@ -10,10 +10,9 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredAr
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import needle_direction
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.found_spreads import refitted
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers.robust import plain_fit, robust_fit
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import DIRECTION, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import refitted
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit, robust_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.solution import Solution, assembled, solution_of, with_length

@@ -12,13 +12,12 @@ from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import PARAMETERS, T_Q, Estimate, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.image_errors import ImageErrors
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.small_sample import SmallSample
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import PARAMETERS, T_Q
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import SmallSample
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import linearised_tip, tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, tip_residuals
 
 LARGEST_RATIO = 1.1
 """Chi-squared over its freedom from which on a declaration is doubted: arms declared half as large as they are give

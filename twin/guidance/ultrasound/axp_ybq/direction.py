@@ -15,7 +15,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     direction_residuals,
     directions_end2,
     directions_image,

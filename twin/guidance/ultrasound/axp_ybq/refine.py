@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import parameter_units
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, parameter_units
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
     Problem,
     Weights,

@@ -13,15 +13,14 @@ from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, direction_findings
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate, tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import RobustFit, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.image_errors import ImageErrors, image_errors
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.small_sample import SmallSample, small_sample
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import SmallSample, small_sample
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import DIRECTION, PARAMETERS, T_Q
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import needle_in_image
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
 
 
 class Solution(NamedTuple):

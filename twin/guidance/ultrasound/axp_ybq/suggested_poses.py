@@ -27,7 +27,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import (
     tips_centre,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import needle_in_image
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
 
 TURN_RAD = float(np.radians(25.0))
 """How far the probe is turned, and the insertion angle changed."""
