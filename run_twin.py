@@ -597,9 +597,8 @@ def selfcal(
 ) -> None:
     """Let two arms calibrate themselves by ultrasound, AXP = YBQ, and send the needle to targets in the image."""
     require_extra("twin", "selfcal")
-    from puncture_twin.twin.jobs.selfcal.facts import selfcal_facts
     from puncture_twin.twin.jobs.selfcal.job import run_selfcal
-    from puncture_twin.twin.jobs.selfcal.text import selfcal_text
+    from puncture_twin.twin.jobs.selfcal.text import selfcal_facts, selfcal_text
 
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:

@@ -19,8 +19,8 @@ from puncture_twin.planning.registration.fits.better_names import better_names
 from puncture_twin.planning.registration.fits.fit_map import carried, design, least_squares_map
 from puncture_twin.planning.registration.fits.distortion import Distortion, distortion
 from puncture_twin.planning.registration.fits.least_squares import rigid_fre_mm
-from puncture_twin.planning.registration.fits.method import Method, checked_fit
-from puncture_twin.planning.registration.fits.residual_checks import check_residuals
+from puncture_twin.planning.registration.fits.marker_ambiguity import better_names
+from puncture_twin.planning.registration.fits.method import Method, check_residuals, checked_fit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.residual_test import Interval, ResidualTest

@@ -23,9 +23,8 @@ from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.straight_approach import ApproachCheckers, why_not
-from puncture_twin.planning.touch.touch_plan import TouchTour
 from puncture_twin.planning.touch.touch_planner import PLANNED_PADDING_MM, approach_checkers
-from puncture_twin.planning.touch.tour_motions import NoMotionError, Stops, tour_through
+from puncture_twin.planning.touch.tour_motions import NoMotionError, Stops, TouchTour, tour_through
 from puncture_twin.planning.uncertainty.touch_choice import touch_candidates
 
 LEAST_POSES, MOST_POSES = 4, 12

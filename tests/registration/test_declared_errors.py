@@ -7,9 +7,13 @@ from scipy.special import chdtri
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.registration.fits.fit_map import design, differenced_map, least_squares_map
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.weighted import fit_weighted
+from puncture_twin.planning.registration.fits.least_squares import (
+    design,
+    differenced_map,
+    fit_rigid,
+    fit_weighted,
+    least_squares_map,
+)
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
 from puncture_twin.planning.registration.reading_noise import ReadingNoise

@@ -21,7 +21,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.gauss_newton import lacking
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.fit_map import carried, design
+from puncture_twin.planning.registration.fits.least_squares import carried, design
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 

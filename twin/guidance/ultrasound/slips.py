@@ -1,4 +1,6 @@
-"""Recordings that were written in another reading: inverse poses, arms in each other's place, metres.
+"""The calibration of a recording, with what a case says of its noise, its needle and the arms' errors.
+
+Recordings that were written in another reading: inverse poses, arms in each other's place, metres.
 
 Such a recording still has a best fit, with residuals of centimetres, and no pose stands out because all are wrong. So
 where the reading as given does not fit, the slips that people make are undone one by one; the one that then fits is
@@ -19,8 +21,16 @@ from puncture_twin.planning.geometry.rigid import inverse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.calibrate_case import calibrate_case
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
+
+
+def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:
+    """Calibrate with what the case says of noise and needle; pixels are solved for where the recording has them."""
+    noise = None if case is None or case.content.noise is None else case.content.noise.noise()
+    length = case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
+    arms = None if case is None or recording.q_probe is None else case.declared_arms
+    return calibrate(recording, noise=noise, needle_length_mm=length, scale=recording.pixels, arms=arms)
+
 
 Reading = Callable[[Recording], Recording]
 

@@ -17,15 +17,13 @@ from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, acqu
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.calibrate_case import calibrate_case
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
-from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, drawing, expected_tre_mm, find_candidates
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
 from puncture_twin.twin.guidance.ultrasound.recording_file import MAX_BYTES, parse_recording, recording_file
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth
-from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
-from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
+from puncture_twin.twin.guidance.ultrasound.slips import calibrate_case, checked_calibration
+from puncture_twin.twin.guidance.ultrasound.summaries import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 from puncture_twin.twin.plant.true_arm import ArmErrors, draw_true_arm
 

@@ -17,11 +17,10 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.geometry.gauss_newton import lacking
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import SCALE, Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import RobustFit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, linear_model, residual_weights
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit, Whitening
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import directions_image, linearised_tip
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Whitening
 
 DOUBTED = 0.01
 """A recording without such errors is said to have them once in a hundred."""

@@ -27,9 +27,9 @@ from scipy.stats import f
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import Fitted, RobustFit, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import settled
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import LEAST_MM, UNWEIGHTED, Problem, Spread
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Fitted, RobustFit, weighed
 
 WIDEST_RATIO = 30.0
 """Inside and across the image are not taken to differ by more."""

@@ -21,7 +21,6 @@ from scipy.special import gammaincinv
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import RobustFit, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
     LinearModel,
     Problem,
@@ -29,7 +28,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
     linear_model,
     median_spread,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit, refine, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import facing
 
 FALSE_ALARMS = 0.01

@@ -14,12 +14,12 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredAr
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, direction_findings
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate, tangent_basis
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import RobustFit, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.image_errors import ImageErrors, image_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import SmallSample, small_sample
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit, weighed
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import needle_in_image
 
 
