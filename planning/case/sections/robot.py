@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from puncture_twin.planning.arm.own_arm import own_arm
+from puncture_twin.planning.arm.model_urdf import own_arm
 from puncture_twin.planning.arm.speed_limits import SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.arm.urdf.document import MOST_BYTES

@@ -7,16 +7,21 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import (
+    Calibration,
+    Solution,
+    assembled,
+    solution_of,
+    with_length,
+)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import needle_direction
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate, active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import refitted
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import require_observable
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit, robust_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.solution import Solution, assembled, solution_of, with_length
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import require_observable
 
 SHAFT_BIAS = (
     "a constant error of the detected tip along the shaft moves the tip in the needle's flange frame and leaves every "
