@@ -1,15 +1,10 @@
-"""What a self-calibration found, and how well it is known.
-
-A fit with all that is known about it, and the calibration that is made of it.
-"""
+"""What a self-calibration found, and how well it is known."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
 from puncture_twin.planning.base.arrays import Floats, read_only
@@ -240,112 +235,73 @@ class Calibration:
         return float(p * f.ppf(level, p, max(self.freedom / per_pose, 1.0)))
 
 
-class Solution(NamedTuple):
-    """A fit with all that is known about it."""
+def calibration_of(
+    problem: Problem,
+    fit: RobustFit,
+    observability: Observability,
+    seen: SeenDirection,
+    cannot_show: tuple[str, ...],
+    arms: DeclaredArms | None,
+) -> Calibration:
+    """What is known at a fit, under the noise that was found or declared; its arrays are read-only.
 
-    estimate: Estimate
-    active: NDArray[np.int_]
-    tip_kept: NDArray[np.bool_]
-    image: ImageErrors | None
-    findings: tuple[Finding, ...]
-    iterations: int
-    noise: Noise | Spread
-    covariance: Floats
-    """Of the free parameters, then of the arms' lasting errors where they are declared, shape (p + m, p + m)."""
-    arm_errors: Floats
-    """Posterior mean of the arms' lasting errors, in standard deviations, shape (m,): 46, with
-    play in both arms 58, and 0 where none are declared."""
-    small_sample: SmallSample | None
-    residuals: Floats
-    noise_ratio: float
-    freedom: int
-    observability: Observability
-    orientations: Floats
-
-
-def solution_of(problem: Problem, fit: RobustFit, observability: Observability, seen: SeenDirection) -> Solution:
-    """What is known at a fit, under the noise that was found or declared."""
-    at_fit = weighed(problem, fit)
-    count = 3 * int(fit.tip_kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction
-    freedom = count - len(problem.active)
-    region = small_sample(problem, fit) if problem.arms is not None else None
-    image = image_errors(problem, fit)
-    told = direction_findings(problem.recording.names, fit.tip_kept & ~fit.direction_kept, seen)
-    return Solution(
-        fit.estimate,
-        problem.active,
-        fit.tip_kept,
-        image,
-        told if image is None or not image.doubted else (*told, image.finding()),
-        fit.iterations,
-        problem.noise,
-        at_fit.covariance,
-        at_fit.shared,
-        region,
-        at_fit.residuals[:, :3],
-        float(np.sqrt(at_fit.chi_squared / max(freedom, 1))),
-        freedom,
-        observability,
-        needle_in_image(fit.estimate, problem.recording),
+    Args:
+        problem: As it was solved.
+        fit: Its solution.
+        observability: How well the poses show it.
+        seen: The needle's direction before it took part.
+        cannot_show: What the poses cannot show, one sentence each.
+        arms: As declared.
+    """
+    at_fit, estimate, kept, p = weighed(problem, fit), fit.estimate, fit.tip_kept, len(problem.active)
+    freedom = 3 * int(kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction - p
+    residuals, names = at_fit.residuals[:, :3], problem.recording.names
+    image, told = image_errors(problem, fit), direction_findings(names, kept & ~fit.direction_kept, seen)
+    return Calibration(
+        X=read_only(pose(estimate.R_X, estimate.t_X)),
+        Y=read_only(pose(estimate.R_Y, estimate.t_Y)),
+        tip_end2=read_only(estimate.t_Q),
+        needle_direction_end2=read_only(estimate.V),
+        scale=read_only(estimate.scale),
+        residuals=read_only(residuals),
+        rms_mm=float(np.sqrt(np.mean(np.sum(residuals[kept] ** 2, axis=1)))),
+        weights=read_only(1.0 * kept),
+        outliers=tuple(name for name, used in zip(names, kept, strict=True) if not used),
+        image=image,
+        findings=told if image is None or not image.doubted else (*told, image.finding()),
+        iterations=fit.iterations,
+        condition=observability.ratio,
+        covariance=read_only(at_fit.covariance[:p, :p]),
+        parameters=tuple(PARAMETERS[column] for column in problem.active),
+        freedom=freedom,
+        noise=problem.noise,
+        noise_ratio=float(np.sqrt(at_fit.chi_squared / max(freedom, 1))),
+        tip_bias_mm=None,
+        orientations=read_only(needle_in_image(estimate, problem.recording)),
+        cannot_show=cannot_show,
+        arms=arms,
+        arm_errors=read_only(at_fit.shared),
+        joint_covariance=read_only(at_fit.covariance),
+        small_sample=small_sample(problem, fit) if problem.arms is not None else None,
     )
 
 
-def with_length(solution: Solution, bias: float) -> Solution:
-    """The solution after t_Q <- t_Q - (V.t_Q - length) V."""
-    V, t_Q = solution.estimate.V, solution.estimate.t_Q
+def with_length(found: Calibration, length_mm: float) -> Calibration:
+    """The calibration after t_Q <- t_Q - (V.t_Q - length) V."""
+    V, t_Q, p = found.needle_direction_end2, found.tip_end2, len(found.parameters)
+    bias = float(V @ t_Q) - length_mm
     full = np.eye(len(PARAMETERS))
     full[T_Q, T_Q] -= np.outer(V, V)
     full[T_Q, DIRECTION] = -(bias * np.eye(3) + np.outer(V, t_Q)) @ tangent_basis(V)
-    change = full[np.ix_(solution.active, solution.active)]
-    whole = np.eye(len(solution.covariance))
-    whole[: len(change), : len(change)] = change
-    region = solution.small_sample
-    if region is not None:
-        region = region._replace(covariance=change @ region.covariance @ change.T)
-    return solution._replace(
-        estimate=solution.estimate._replace(t_Q=t_Q - bias * V),
-        covariance=np.asarray(whole @ solution.covariance @ whole.T),
-        small_sample=region,
-    )
-
-
-def assembled(
-    recording: Recording, solution: Solution, bias: float | None, cannot: tuple[str, ...], arms: DeclaredArms | None
-) -> Calibration:
-    """The calibration of a solution, its arrays read-only.
-
-    Args:
-        recording: What it was solved from.
-        solution: As solved.
-        bias: What was taken off the tip along the shaft, mm; None where the needle's length is not known.
-        cannot: What the poses cannot show, one sentence each.
-        arms: As declared.
-    """
-    estimate, kept, p = solution.estimate, solution.tip_kept, len(solution.active)
-    return Calibration(
-        read_only(pose(estimate.R_X, estimate.t_X)),
-        read_only(pose(estimate.R_Y, estimate.t_Y)),
-        read_only(estimate.t_Q),
-        read_only(estimate.V),
-        read_only(estimate.scale),
-        read_only(solution.residuals),
-        float(np.sqrt(np.mean(np.sum(solution.residuals[kept] ** 2, axis=1)))),
-        read_only(1.0 * kept),
-        tuple(name for name, used in zip(recording.names, kept, strict=True) if not used),
-        solution.image,
-        solution.findings,
-        solution.iterations,
-        solution.observability.ratio,
-        read_only(solution.covariance[:p, :p]),
-        tuple(PARAMETERS[column] for column in solution.active),
-        solution.freedom,
-        solution.noise,
-        solution.noise_ratio,
-        bias,
-        read_only(solution.orientations),
-        cannot,
-        arms,
-        read_only(solution.arm_errors),
-        read_only(solution.covariance),
-        solution.small_sample,
+    active = [PARAMETERS.index(name) for name in found.parameters]
+    whole = np.eye(len(found.joint_covariance))
+    whole[:p, :p] = change = full[np.ix_(active, active)]
+    joint, region = np.asarray(whole @ found.joint_covariance @ whole.T), found.small_sample
+    return replace(
+        found,
+        tip_end2=read_only(t_Q - bias * V),
+        covariance=read_only(joint[:p, :p]),
+        tip_bias_mm=bias,
+        joint_covariance=read_only(joint),
+        small_sample=None if region is None else region._replace(covariance=change @ region.covariance @ change.T),
     )
