@@ -42,9 +42,9 @@ from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.fits.method import Method
 from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residual_test import NoiseTest
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances

@@ -1,7 +1,4 @@
-"""The URDF behind an arm's model: its own, or the one that ships under its name.
-
-An arm from a URDF of the user's: a model as good as those of the table, if it is built as a UR.
-"""
+"""The URDF behind an arm's model: the user's own, if it is built as a UR, or the one that ships under its name."""
 
 from __future__ import annotations
 
@@ -12,9 +9,8 @@ import numpy as np
 
 from puncture_twin import meshes
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE, ArmUrdf, read_arm_urdf
-from puncture_twin.planning.arm.urdf.limits import NOTHING_STATED, StatedLimits, urdf_limits
-from puncture_twin.planning.arm.urdf.shapes import Read
+from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE, ArmUrdf, Read, read_arm_urdf
+from puncture_twin.planning.arm.urdf.lengths import NOTHING_STATED, StatedLimits, urdf_limits
 from puncture_twin.planning.base.errors import InputError
 
 SHAPES = "ur"

@@ -1,7 +1,4 @@
-"""How fast a plan may move: the needle's tip, and the joints as a fraction of what the arm can.
-
-How fast the needle's tip moves while the joints do.
-"""
+"""How fast a plan may move: the needle's tip, and the joints as a fraction of what the arm can."""
 
 from __future__ import annotations
 

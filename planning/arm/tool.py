@@ -1,9 +1,4 @@
-"""What else the flange carries: a body of the user's own, such as a holder with its cable or a camera.
-
-What the arm carries and what stands about it: needle holder and needle, and the workcell's boxes.
-
-A CT gantry for the arm's workcell: a wall with a round bore, as boxes that never leave more space than the bore.
-"""
+"""What the arm carries and what stands about it: needle holder and needle, and the workcell's boxes."""
 
 from __future__ import annotations
 

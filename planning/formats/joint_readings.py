@@ -40,19 +40,16 @@ _ALLOWED = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actual_q_0 
 
 
 class JointRecording(NamedTuple):
-    """Rows of a recording.
-
-    Attributes:
-        names: Of the rows: what their ``name`` says, or their number.
-        q: Shape (n, 6), rad.
-        time_s: Shape (n,), or None where the file has no times.
-        tool_base: Where the controller had its tool, shape (n, 3), mm, or None where the file does not say it.
-    """
+    """Rows of a recording."""
 
     names: tuple[str, ...]
+    """What their ``name`` says, or their numbers."""
     q: Floats
+    """Shape (n, 6), rad."""
     time_s: Floats | None
+    """Shape (n,); None where the file has no times."""
     tool_base: Floats | None
+    """Where the controller had its tool, shape (n, 3), mm; None where the file does not say it."""
 
 
 def joint_readings(values: ArrayLike, unit: Unit, *, where: str | Path, names: Sequence[str] = ()) -> Floats:

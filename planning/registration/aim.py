@@ -1,7 +1,4 @@
-"""The insertion for which a pose is corrected, and how residuals tell of the arm's errors there.
-
-An insertion that the arm reaches, where nobody has chosen one yet.
-"""
+"""The insertion for which a pose is corrected, and how residuals tell of the arm's errors there."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""The noise of markers that were touched in given configurations, from the declared errors of CT, touch and arm.
-
-Configurations in which an arm can touch a point with its needle's tip.
-
-The declared noise of a case's markers, and how the arm stood, or may have stood, when it touched them.
-"""
+"""The declared noise of a case's markers, and how the arm stood, or may have stood, when it touched them."""
 
 from __future__ import annotations
 

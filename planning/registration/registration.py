@@ -18,13 +18,28 @@ from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, 
 from puncture_twin.planning.registration.fits.better_names import better_names
 from puncture_twin.planning.registration.fits.fit_map import carried, design, least_squares_map
 from puncture_twin.planning.registration.fits.distortion import Distortion, distortion
-from puncture_twin.planning.registration.fits.least_squares import rigid_fre_mm
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid, rigid_fre_mm
 from puncture_twin.planning.registration.fits.marker_ambiguity import better_names
 from puncture_twin.planning.registration.fits.method import Method, check_residuals, checked_fit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.residual_test import Interval, ResidualTest
-from puncture_twin.planning.registration.weak_points import fit_doubts, odd_marker_of
+from puncture_twin.planning.registration.residual_test import Interval, OddMarker, ResidualTest, odd_marker
+
+
+def fit_doubts(test: ResidualTest, uncertainty: FitUncertainty | None) -> tuple[str, ...]:
+    """Residuals that the noise does not explain and the case accepts: of the rigid fit, or of the declared errors."""
+    if uncertainty is None:
+        return () if test.explained else (f"{test.text()}; accepted by the case",)
+    declared = uncertainty.test
+    if declared.agrees:
+        return ()
+    return (declared.text() + ("; all errors are scaled to them" if declared.explained else "; accepted by the case"),)
+
+
+def odd_marker_of(markers: MarkerPairs, fle_mm: float | None) -> OddMarker | None:
+    """The marker that does not fit the others, if there is one; ``fle_mm`` is the declared noise or None."""
+    return odd_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
+
 
 ALLOWED_RESIDUALS = "names and readings checked, the true errors declared, or registration.accept_residuals = true"
 

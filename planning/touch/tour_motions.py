@@ -1,7 +1,4 @@
-"""Markers to be touched: each from a standoff, straight and slowly, and the motions between them.
-
-The motions of a tour: from home through the standoffs of all touches in the order of least cost, and back.
-"""
+"""Markers to be touched, and the motions of a tour: from home through all standoffs at least cost, and back."""
 
 from __future__ import annotations
 

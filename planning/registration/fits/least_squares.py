@@ -1,12 +1,8 @@
-"""The linear map from reading errors to the pose that each method makes of them.
+"""T_base_ct by each method: rigid, mirrored, triad, affine, weighted, joint; and the map from reading errors to it.
 
 With A_i = [I, -[p_i - c]x] stacked and weights W, a reading error z moves the fitted pose by L z, L = (A' W A)^-1 A' W:
 a shift of the centroid c, then a rotation about it, base axes. The weighted fit is Gauss-Newton along this map:
 Moghari, Abolmaesumi, IEEE TMI 26(12), 2007; Danilchenko, Fitzpatrick, IEEE TMI 30(3), 2011.
-
-T_base_ct of least squares: rigid, mirrored to show a mirrored list, of three markers as a triad, or affine.
-
-T_base_ct weighted by the declared noise, and jointly with the arm's errors.
 """
 
 from __future__ import annotations

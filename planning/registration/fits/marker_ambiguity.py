@@ -5,8 +5,6 @@ RSS = Sx + Sy - 2 (s1 + s2 +- s3), with Sx, Sy the squared spreads and s the sin
 H = sum (y_p(i) - cy)(x_i - cx)'. For two markers (d_ij - d'_p(i)p(j))^2 <= (|r_i| + |r_j|)^2 <= 2 (r_i^2 + r_j^2), so
 among any k of them the squared differences of their distances sum up to 2 (k - 1) RSS at most: a permutation that
 breaks this with its first k names is dropped with all that begin alike, and what is left is complete.
-
-Where named markers do not fit: which permutations of their names would, so that a refusal names the slip.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The methods of registration, and whether one can weigh the declared noise.
-
-Residuals that no honest markers leave: a mirrored list, a marker far off.
-"""
+"""The methods of registration, and whether one can weigh the declared noise."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
-"""Metal in a CT: connected voxels that are denser than bone, and the weights by which such a body is measured.
-
-Markers found in a CT, by a voxel and by less than a voxel.
+"""Markers and a lesion found in a CT, by a voxel and by less than a voxel.
 
 The rule of Chen 2019, section 3.1: the number of the slice that shows a marker best, times the spacing, and its place
-in that slice to 1 mm. Beside it the middle of the metal, by weights (`metal`).
-
-The middle of a soft lesion: voxels weighed by how far they have its value and not that of its surroundings.
+in that slice to 1 mm. Beside it the middle of the metal, by weights.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
-"""Poses in which the needle shows in the image, both arms can stand, and nothing touches.
+"""Poses that both arms can take with the needle in the image, and which of them to record.
 
 The geometry of the picture is drawn first (where the tip shows, how steep the needle is, how the probe is tilted); the
 arms follow by inverse kinematics. Every draw that cannot be taken falls to a reason, and the reasons are counted.
 
-Which of many possible poses to record: those that tell most about the error at the tip.
-
-The bound can count errors of the arms that all poses share, as unknowns with a prior behind the parameters (their
-deviations are 1): poses that repeat one of them do not average it out, and poses that show it correct the aim. The
-choice does not count them: so chosen, a region from found noise holds the truth less often than it says.
+Those are recorded that tell most about the error at the tip. The bound can count errors of the arms that all poses
+share, as unknowns with a prior behind the parameters (their deviations are 1): poses that repeat one of them do not
+average it out, and poses that show it correct the aim. The choice does not count them: so chosen, a region from found
+noise holds the truth less often than it says.
 """
 
 from __future__ import annotations

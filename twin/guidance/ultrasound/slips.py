@@ -1,6 +1,4 @@
-"""The calibration of a recording, with what a case says of its noise, its needle and the arms' errors.
-
-Recordings that were written in another reading: inverse poses, arms in each other's place, metres.
+"""Recordings that were written in another reading: inverse poses, arms in each other's place, metres.
 
 Such a recording still has a best fit, with residuals of centimetres, and no pose stands out because all are wrong. So
 where the reading as given does not fit, the slips that people make are undone one by one; the one that then fits is

@@ -1,7 +1,4 @@
-"""One draw of the truth and what came of it, and what choosing poses was worth.
-
-Calibrations, trials and punctures as plain values, mm and degrees: for files, JSON, page and terminal.
-"""
+"""Calibrations, trials and punctures as plain values, mm and degrees: for files, JSON, page and terminal."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The page's charts of a self-calibration, as plotly's script reads them.
-
-``report.html`` of a self-calibration: one page that needs no network.
-"""
+"""``report.html`` of a self-calibration: one page that needs no network."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What ``selfcal`` found, as one table of plain values: ``--json``, the text and the page read nothing else.
-
-What ``selfcal`` prints for a person.
-"""
+"""What ``selfcal`` found, as one table of plain values (``--json`` and the page read nothing else), and as text."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The parameters of A X P = Y B Q: their names, which are free, and how large a step of each counts as one.
-
-One value of every unknown of A X P = Y B Q, and how a small step changes it.
-"""
+"""The unknowns of A X P = Y B Q: their names, which are free, one value of each, and how a small step changes it."""
 
 from __future__ import annotations
 

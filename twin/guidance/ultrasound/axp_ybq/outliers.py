@@ -1,10 +1,4 @@
-"""The squared studentised residual of each pose, and the limit above which it stands out.
-
-Which tips and which directions agree with a fit.
-
-The fit of the poses that agree with it: fitted and checked in turn until no pose changes sides.
-
-Least squares that single wrong poses cannot bend: find them, set them aside, fit the others.
+"""Least squares that single wrong poses cannot bend: find them, set them aside, fit the others.
 
 1. Fit all. If no studentised residual stands out, that is the answer, at full efficiency.
 2. Otherwise weigh residuals down as they grow, first by Huber's weights, then by Tukey's; the scale from the median.

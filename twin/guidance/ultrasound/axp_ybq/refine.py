@@ -1,4 +1,4 @@
-"""Residuals in units of their standard deviation, with errors of the arms that all poses share.
+"""Weighted least squares (Gauss-Newton on the rotations' tangent space), and what is known where it ended.
 
 Each pose's own noise Omega_i is whitened alone. Errors that all poses share (N per standard deviation of each) couple
 the poses: the residuals' covariance is C = Omega + N N^T, and with S = Omega^-1/2 N
@@ -6,10 +6,6 @@ the poses: the residuals' covariance is C = Omega + N N^T, and with S = Omega^-1
     C^-1/2 = (I + S S^T)^-1/2 Omega^-1/2,   (I + S S^T)^-1/2 = I - S V diag(1 / (s (s + 1))) V^T S^T,   s^2 = 1 + d^2,
 
 where S^T S = V diag(d^2) V^T. The same estimate comes from taking the shared errors as unknowns with a prior.
-
-What is known where a fit ended: residuals, covariance, and the errors that all poses share.
-
-Weighted least squares: Gauss-Newton on the rotations' tangent space, damped where a step fails.
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
-"""What every pose says of the tip: residuals of A X P = Y B Q and their Jacobian.
+"""What every pose says of tip and direction: residuals of A X P = Y B Q and their Jacobians.
 
 F = R_Y (R_B t_Q + t_B) + t_Y - R_A (R_X S p + t_X) - t_A (mm, base1), S = diag(scale).
 With R <- R exp([w]x) its derivatives by w_X, t_X, w_Y, t_Y, t_Q, scale are
 R_A R_X [S p]x, -R_A, -R_Y [R_B t_Q + t_B]x, I, R_Y R_B, -R_A R_X[:, :2] diag(u, v).
 (Spec 3, section 2. The patent prints the first and third without their signs; its G is -J.)
-
-What every pose says of the needle's direction: residuals and their Jacobian.
 
 m = M V with the rotation M = (R_A R_X)^T R_Y R_B from end2 to image. Two residuals: how far m points away from the
 measured v inside the image, and across it: e1.m and e2.m, e1 = z x v made unit and e2 = v x e1.

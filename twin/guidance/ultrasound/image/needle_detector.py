@@ -1,13 +1,12 @@
-"""The brightest straight segment of a picture: a Radon transform that may begin and end anywhere.
+"""The needle in a B-mode picture: its tip, its direction, and whether to believe either.
 
-Every line of a grid of angles and offsets is sampled; along it the segment with the largest sum is found in one pass
-(Kadane's maximum subarray, Bentley, Commun. ACM 27, 1984). What a sample must exceed to lengthen the segment is
-subtracted before, so that noise has a falling sum and the largest one stays small where there is no needle.
-
-The needle in a B-mode picture: its tip, its direction, and whether to believe either.
+Every line of a grid of angles and offsets is sampled (a Radon transform that may begin and end anywhere); along it the
+segment with the largest sum is found in one pass (Kadane's maximum subarray, Bentley, Commun. ACM 27, 1984). What a
+sample must exceed to lengthen the segment is subtracted before, so that noise has a falling sum and the largest one
+stays small where there is no needle.
 
 1. Amplitude over background: the display's log compression is undone, the median around divides it.
-2. The brightest straight segment (:mod:`twin.guidance.ultrasound.image.line_search`); too small a sum is no needle.
+2. The brightest straight segment; too small a sum is no needle.
 3. The line, by weighted least squares on the ridge, through a window that narrows to it.
 4. The tip: where the amplitude along the line falls half way from the shaft's level to the background's, for good.
 
