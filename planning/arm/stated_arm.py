@@ -16,6 +16,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UR_MODELS, UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.joint_readings import JointRecording
 
 MOST_OFF_MM = 5.0
 """A controller with its own calibration puts the tip up to some mm from where the data sheet's arm does."""
@@ -72,6 +73,25 @@ def check_arm(
     what = f"the joints of {names[row]} put the tool of a {model.name} {own[row]:.1f} mm from where it was{arm}"
     allowed = f"within {MOST_OFF_MM:g} mm: joints of the case's arm, in their unit, with its needle"
     raise InputError(what, where=where, allowed=allowed, code="joints_of_another_arm")
+
+
+def check_recording(model: UrModel, tip_mm: float, recording: JointRecording, *, where: str | Path) -> None:
+    """Refuse a recording whose controller had its tool where this arm's joints do not put one; without a tool, nothing.
+
+    Args:
+        model: The case's arm.
+        tip_mm: Flange to tip of its needle.
+        recording: Joints, and where the controller had its tool: flange, tip, or another point that all rows share.
+        where: What the error names.
+
+    Raises:
+        InputError: As `check_arm`.
+    """
+    if recording.tool_base is None:
+        return
+    tools = [np.zeros(3), np.array([0.0, 0.0, tip_mm])]
+    names = [f"row {number}" for number in range(1, len(recording.q) + 1)]
+    check_arm(model, recording.q, recording.tool_base, tools, names=names, where=where, any_tool=True)
 
 
 def check_flanges(model: UrModel, q: Floats, T_base_flange: Floats, *, names: Sequence[str], where: str | Path) -> None:

@@ -33,7 +33,7 @@ def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibratio
 Reading = Callable[[Recording], Recording]
 
 SUSPECT_MM = 1.5
-"""Residuals (rms) from which on other readings are tried: three times those of a usual recording."""
+"""Residuals (rms) from which on other readings are tried: three times the usual ones."""
 
 SOUND_MM = 5.0
 """Residuals (rms) beyond which nothing was calibrated, whatever the reason."""
@@ -61,10 +61,12 @@ def checked_calibration(recording: Recording, case: SelfcalCase | None, where: P
     _check_reach(recording, where)
     try:
         found = calibrate_case(recording, case)
-    except InputError:
+    except InputError as error:
         rms_mm = _residual_mm(lambda r: _read(r, r.A, r.B, r.P), recording)
         if rms_mm > SUSPECT_MM:
             _refuse_slip(recording, rms_mm, where)
+        if error.code:
+            raise InputError(error.what, where=where, allowed=error.allowed, code=error.code) from error
         raise
     if found.rms_mm > SUSPECT_MM:
         _refuse_slip(recording, found.rms_mm, where)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.stated_arm import check_recording
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
@@ -69,6 +70,7 @@ def pivot_case(case: Case, joints: Path) -> PivotRun:
     """
     data = read_input(joints, max_bytes=MAX_FILE_BYTES, where=str(joints))
     read = parse_joint_recording(data, joints, timed=False)
+    check_recording(case.robot.model, case.needle.length_mm, read, where=joints)
     pivot = calibrated(case, read.names, read.q, where=str(joints))
     inputs = (content_input("joints", joints.name, data), *case.inputs)
     return PivotRun(case, pivot, read.names, inputs)

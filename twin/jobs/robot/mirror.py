@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.stated_arm import check_arm
+from puncture_twin.planning.arm.stated_arm import check_recording
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
@@ -211,10 +211,8 @@ class RecordedJoints:
         """
         read = parse_joint_recording(self.data, self.path, timed=True)
         assert read.time_s is not None
-        if case is not None and read.tool_base is not None:
-            tools = [np.zeros(3), np.array([0.0, 0.0, case.needle.length_mm])]
-            names = [f"row {number}" for number in range(1, len(read.q) + 1)]
-            check_arm(case.robot.model, read.q, read.tool_base, tools, names=names, where=self.path, any_tool=True)
+        if case is not None:
+            check_recording(case.robot.model, case.needle.length_mm, read, where=self.path)
         return map(RecordedState, read.time_s.tolist(), read.q)
 
     def warnings(self) -> tuple[str, ...]:

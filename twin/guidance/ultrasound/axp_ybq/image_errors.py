@@ -39,7 +39,6 @@ class ImageErrors(NamedTuple):
     found: Floats
     """Shape (k,): a, b, k (per mm) and w (rad)."""
     sd: Floats
-    """Shape (k,)."""
     probability: float
     """Of residuals so well explained where there are none: F(k, freedom)."""
     rms_mm: float
