@@ -20,8 +20,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import farthest_from_singular
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.case.case import Case

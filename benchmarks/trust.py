@@ -27,8 +27,8 @@ from scipy.special import chdtri, fdtri
 
 from benchmarks.scenes import DATA
 from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import farthest_from_singular
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.clearance.near_faces import near_faces

@@ -7,8 +7,8 @@ import trimesh
 from case_world import points_file
 from places import ROOT
 
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import farthest_from_singular
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.read_case import load_case

@@ -1,8 +1,7 @@
 """The one gate for how an arm stood: joint angles and times that a file, a case or a controller states.
 
-A recording of an arm, a list of touches, a case's home and the word of a live controller all come through here:
-angles that a joint can have, in the unit that their columns state, at times that do not run backwards. Whether they
-are of the case's arm is asked by `planning/arm/stated_arm.py`.
+A recording, a list of touches, a case's home and a live controller's word come through here: angles that a joint can
+have, in the unit that is stated, at times that do not run backwards. Whose arm: `planning/arm/stated_arm.py`.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ MOST_RAD = np.radians([363.0, 363.0, 363.0, 363.0, 363.0, 720.0])
 
 WHOLE_TURN = 2.0 * np.pi + 0.05
 """Six angles that all lie within it are none in degrees: an arm that lies stretched out, or radians."""
-
 _ALLOWED = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actual_q_0 to actual_q_5, one row a pose"
 
 
@@ -133,7 +131,7 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
         raise InputError("holds no row", where=path, allowed=_ALLOWED)
     tool = RTDE_TOOL if set(RTDE_TOOL) <= set(header) else ()
     wanted = [*joints, *([time] if time else []), *tool]
-    table = np.array([_numbers(row, header, wanted, f"{path}: row {i}") for i, row in enumerate(rows[1:], start=1)])
+    table = np.array([row_numbers(row, header, wanted, f"{path}: row {i}") for i, row in enumerate(rows[1:], start=1)])
     names = tuple(row[header.index("name")].strip() for row in rows[1:]) if "name" in header else ()
     q = joint_readings(table[:, :6], unit, where=path, names=names)
     times = table[:, 6] if time else None
@@ -154,7 +152,12 @@ def _joint_columns(header: Sequence[str], path: Path) -> tuple[tuple[str, ...], 
     return columns, unit
 
 
-def _numbers(row: list[str], header: Sequence[str], wanted: Sequence[str], where: str) -> list[float]:
+def row_numbers(row: Sequence[str], header: Sequence[str], wanted: Sequence[str], where: str) -> list[float]:
+    """The numbers of one row of a table in the columns that are wanted.
+
+    Raises:
+        InputError: More or fewer fields than the header has, or one that is no finite number.
+    """
     if len(row) != len(header):
         raise InputError(f"{len(row)} fields", where=where, allowed=f"{len(header)} fields, as in the header")
-    return [parse_coordinate(row[header.index(name)].strip(), where) for name in wanted]
+    return [parse_coordinate(row[header.index(name)].strip(), f"{where}, {name}") for name in wanted]

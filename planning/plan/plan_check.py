@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from puncture_twin.planning.arm.insertion import needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.needle_line import needle_lines
 from puncture_twin.planning.arm.speed_limits import slowed, tip_speeds
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats

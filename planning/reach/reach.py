@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from puncture_twin.planning.arm.needle_line import needle_lines
+from puncture_twin.planning.arm.insertion import needle_lines
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.collision.checker import StateChecker

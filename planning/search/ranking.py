@@ -78,8 +78,7 @@ def ranked_by(found: Candidates, cost: Floats) -> Candidates:
         InputError: Another shape, or a safe candidate whose cost is not finite.
     """
     rows = np.flatnonzero(found.safe)
-    real = cost.dtype.kind in "iufb"
-    if cost.shape != (len(found),) or not real or not np.isfinite(cost[rows]).all():
+    if cost.shape != (len(found),) or cost.dtype.kind not in "iufb" or not np.isfinite(cost[rows]).all():
         allowed = f"shape ({len(found)},), real numbers, finite for the {len(rows)} safe candidates"
         raise InputError(f"a cost of shape {cost.shape}, {cost.dtype}", where="rerank", allowed=allowed, code="cost")
     ranks = np.zeros(len(found), np.int32)

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import away_from_singularities
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats

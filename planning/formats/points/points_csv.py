@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import decode_text
-from puncture_twin.planning.formats.joint_readings import JOINTS_DEG
+from puncture_twin.planning.formats.joint_readings import JOINTS_DEG, row_numbers
 from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_coordinate
 from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.units import Unit, parse_unit
@@ -58,8 +58,7 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
         space=None,
         kinds=tuple(f[columns["kind"]].strip() for _, f in rows[1:]) if "kind" in columns else None,
         joints_deg=[
-            tuple(parse_coordinate(fields[header.index(name)], f"{where}, line {line}") for name in JOINTS_DEG)
-            for line, fields in rows[1:]
+            tuple(row_numbers(fields, header, JOINTS_DEG, f"{where}, line {line}")) for line, fields in rows[1:]
         ]
         if "q1" in columns
         else None,

@@ -1,10 +1,9 @@
 """Is one list of markers scaled, stretched or sheared against the other? A rigid fit beside fits of one parameter more.
 
-A unit that is a little off, a tip of the wrong length, slices whose step is wrong, a gantry tilt that nobody took back,
-a table that creeps while it is scanned: each deforms what one side shows, and a rigid motion leaves that to the
-residuals, where it looks like noise. Seven deformations of the CT's frame are tried, one at a time: a similarity, a
-stretch along each axis, a shear in each plane. With z the residuals of the rigid fit, whitened by what is declared of
-the readings, A its design and d the column of a deformation:
+A unit that is a little off, slices whose step is wrong, a gantry tilt that nobody took back: each deforms what one side
+shows, and a rigid motion leaves that to the residuals, where it looks like noise. Seven deformations of the CT's frame
+are tried, one at a time: a similarity, a stretch along each axis, a shear in each plane. With z the residuals of the
+rigid fit, whitened by what is declared of the readings, A its design and d the column of a deformation:
 
     F = (SSE_6 - SSE_7) / (SSE_7 / (3 N - 7))   follows F(1, 3 N - 7) where there is none,
 

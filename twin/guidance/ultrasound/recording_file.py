@@ -17,8 +17,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder
 from puncture_twin.planning.base.input_file import decode_text, read_input
-from puncture_twin.planning.formats.joint_readings import joint_readings
-from puncture_twin.planning.formats.points.raw_points import parse_coordinate
+from puncture_twin.planning.formats.joint_readings import joint_readings, row_numbers
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
@@ -69,7 +68,8 @@ def parse_recording(content: bytes, file: Path) -> Recording:
             allowed=", ".join(columns(False, (3, 1), 24)),
         )
     pixels, (width, shaft), behind = KINDS[header]
-    values = np.array([row_numbers(row, header, f"{file}, row {i}") for i, row in enumerate(rows[1:], start=2)])
+    places = (f"{file}, row {i}" for i in range(2, len(rows) + 1))
+    values = np.array([row_numbers(row, header, header[1:], at) for row, at in zip(rows[1:], places, strict=True)])
     if values.size == 0:
         raise InputError("no pose", where=file, allowed="one row per pose")
     names = tuple(row[0].strip() for row in rows[1:])
@@ -111,17 +111,6 @@ def write_recording(recording: Recording, path: Path) -> None:
 
 def _row_major(T: Floats) -> Floats:
     return np.column_stack([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]])
-
-
-def row_numbers(row: list[str], header: tuple[str, ...], where: str) -> list[float]:
-    """The numbers behind the name of one row, as many as the header has columns.
-
-    Raises:
-        InputError: More or fewer fields, or one that is no finite number.
-    """
-    if len(row) != len(header):
-        raise InputError(f"{len(row)} fields", where=where, allowed=f"{len(header)} fields, as in the header")
-    return [parse_coordinate(cell, f"{where}, {name}") for name, cell in zip(header[1:], row[1:], strict=True)]
 
 
 def columns(pixels: bool, direction: tuple[int, int], behind: int) -> tuple[str, ...]:

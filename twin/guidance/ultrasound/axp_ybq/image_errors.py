@@ -24,7 +24,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import directions_
 
 DOUBTED = 0.01
 """A recording without such errors is said to have them once in a hundred."""
-
 CLEAR = 3.0
 """An error so many standard deviations from zero is named beside the largest one."""
 
