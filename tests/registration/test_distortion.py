@@ -11,7 +11,7 @@ from puncture_twin.planning.registration.fits.distortion import DOUBTED, KINDS
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.twin.phantoms.chen2019_tables import TABLE_1, TABLE_4
+from puncture_twin.twin.experiment.chen2019_tables import TABLE_1, TABLE_4
 
 TARGET = np.array(TABLE_1["M"], float)
 MARKERS = np.array([TABLE_1[name] for name in "ABCDE"], float)
