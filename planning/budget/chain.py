@@ -25,7 +25,6 @@ from puncture_twin.planning.registration.fits.least_squares import fit_triad
 from puncture_twin.planning.registration.marker_noise import reading_noise, touches
 from puncture_twin.planning.registration.placement import default_method
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.uncertainty.pose_error import Bend, PoseError
 

@@ -15,10 +15,14 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.conditioning import Conditioning, conditioning
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
-from puncture_twin.planning.registration.fits.better_names import better_names
-from puncture_twin.planning.registration.fits.fit_map import carried, design, least_squares_map
 from puncture_twin.planning.registration.fits.distortion import Distortion, distortion
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid, rigid_fre_mm
+from puncture_twin.planning.registration.fits.least_squares import (
+    carried,
+    design,
+    fit_rigid,
+    least_squares_map,
+    rigid_fre_mm,
+)
 from puncture_twin.planning.registration.fits.marker_ambiguity import better_names
 from puncture_twin.planning.registration.fits.method import Method, check_residuals, checked_fit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs

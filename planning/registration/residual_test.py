@@ -255,8 +255,6 @@ def _left_out(
 WARNED = 0.01
 """Residuals that the declared errors exceed once in 100 registrations: it is warned, and the errors are scaled."""
 
-REGION = 0.95
-
 
 @dataclass(frozen=True)
 class NoiseTest:
@@ -300,7 +298,7 @@ class NoiseTest:
     @property
     def interval(self) -> Interval:
         """The 95 % interval of the true size over the declared one: nu s^2 over chi-squared."""
-        tail = (1 - REGION) / 2
+        tail = (1 - INTERVAL) / 2
         low, high = (float(np.sqrt(self.chi_squared / chdtri(self.freedom, p))) for p in (tail, 1 - tail))
         return Interval(low, high)
 
@@ -318,8 +316,8 @@ class NoiseTest:
     def region_factor(self) -> float:
         """The k of the 95 % region d' Sigma^-1 d <= k^2 in three dimensions, Sigma scaled: sqrt(chi2) or sqrt(3 F)."""
         if self.scaled:
-            return float(np.sqrt(3 * fdtri(3, self.freedom, REGION)))
-        return float(np.sqrt(chdtri(3, 1 - REGION)))
+            return float(np.sqrt(3 * fdtri(3, self.freedom, INTERVAL)))
+        return float(np.sqrt(chdtri(3, 1 - INTERVAL)))
 
     def text(self) -> str:
         """What the test found, in one sentence."""

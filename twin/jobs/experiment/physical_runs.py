@@ -24,8 +24,14 @@ from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import BEST
 from puncture_twin.planning.touch.straight_approach import plan_puncture
-from puncture_twin.twin.jobs.experiment.drawn_runs import DrawnRuns, drawn_runs
-from puncture_twin.twin.jobs.experiment.touch_job import Tour, plan_tour, touch_once, true_at_target, true_touches
+from puncture_twin.twin.jobs.experiment.touch_job import (
+    Tour,
+    drawn_once,
+    plan_tour,
+    touch_once,
+    true_at_target,
+    true_touches,
+)
 from puncture_twin.twin.rehearsal.in_physics import rehearse_touched
 from puncture_twin.twin.rehearsal.result import Rehearsal
 
