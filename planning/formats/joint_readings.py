@@ -24,7 +24,6 @@ Unit = Literal["rad", "deg"]
 JOINTS_DEG = tuple(f"q{number}_deg" for number in range(1, 7))
 JOINTS_RAD = tuple(f"q{number}_rad" for number in range(1, 7))
 RTDE_JOINTS = tuple(f"actual_q_{number}" for number in range(6))
-"""As the controller's own interface names them, and its clients head their recordings."""
 RTDE_TOOL = tuple(f"actual_TCP_pose_{number}" for number in range(3))
 """Where the controller has its tool, m, base frame."""
 TIMES = ("time_s", "timestamp")

@@ -221,11 +221,7 @@ class RecordedJoints:
 
 
 def told(time_s: float, q: list[float]) -> RecordedState:
-    """A controller's word, if it is a time and six angles that an arm can have.
-
-    Raises:
-        InputError: It is not.
-    """
+    """A controller's word, if it is a time and six angles that an arm can have; else an `InputError`."""
     if not np.isfinite(time_s):
         raise InputError(f"a time of {time_s} s", where="the robot's answer", allowed="a finite time")
     return RecordedState(float(time_s), joint_readings([q], "rad", where="the robot's answer")[0])
