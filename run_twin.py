@@ -444,7 +444,8 @@ def mirror(
         str | None, typer.Argument(metavar="HOST", help="Address of a running UR; it is only read.")
     ] = None,
     recorded: Annotated[
-        Path | None, typer.Option("--from", help="A CSV with time_s and q1_rad..q6_rad instead.")
+        Path | None,
+        typer.Option("--from", help="A CSV with time_s and q1_rad..q6_rad, or of RTDE."),
     ] = None,
     seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="How long; else until Ctrl-C.")] = None,
     rate: Annotated[float, typer.Option("--rate", min=0.1, max=125, help="Readings a second.")] = 10.0,
@@ -462,7 +463,7 @@ def mirror(
     mirrored, inputs = Mirror.of(followed), followed.inputs
     if recorded is not None:
         recording = RecordedJoints.read(recorded)
-        inputs, states = (recording.input, *inputs), recording.states()
+        inputs, states = (recording.input, *inputs), recording.states(followed)
         for warning in recording.warnings():
             print(f"warning: {warning}", file=sys.stderr)
     else:
@@ -596,9 +597,8 @@ def selfcal(
 ) -> None:
     """Let two arms calibrate themselves by ultrasound, AXP = YBQ, and send the needle to targets in the image."""
     require_extra("twin", "selfcal")
-    from puncture_twin.twin.jobs.selfcal.facts import selfcal_facts
     from puncture_twin.twin.jobs.selfcal.job import run_selfcal
-    from puncture_twin.twin.jobs.selfcal.text import selfcal_text
+    from puncture_twin.twin.jobs.selfcal.text import selfcal_facts, selfcal_text
 
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:

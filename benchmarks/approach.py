@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.arm.gantry import gantry_boxes
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, slowed
-from puncture_twin.planning.arm.tip_speed import TipLimit
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, TipLimit, slowed
+from puncture_twin.planning.arm.tool import gantry_boxes
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import NoAnswerError

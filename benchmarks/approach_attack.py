@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.arm.gantry import gantry_boxes
+from puncture_twin.planning.arm.tool import gantry_boxes
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool

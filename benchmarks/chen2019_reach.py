@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.needle_line import flange_poses
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.singularity import MIN_SINGULARITY
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.entry import outward

@@ -27,8 +27,8 @@ from scipy.special import chdtri, fdtri
 
 from benchmarks.scenes import DATA
 from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import farthest_from_singular
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.clearance.near_faces import near_faces
@@ -40,12 +40,11 @@ from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.fits.method import Method
+from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.touch_noise import reading_noise
-from puncture_twin.planning.registration.touch_poses import touching_configuration
+from puncture_twin.planning.registration.residual_test import NoiseTest
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances

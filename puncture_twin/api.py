@@ -98,7 +98,7 @@ def rerank(candidates: Candidates, cost: ArrayLike) -> Candidates:
     """
     from puncture_twin.planning.search.ranking import ranked_by
 
-    return ranked_by(candidates, np.asarray(cost, dtype=np.float64))
+    return ranked_by(candidates, np.asarray(cost))
 
 
 def register(

@@ -7,8 +7,8 @@ import trimesh
 from case_world import points_file
 from places import ROOT
 
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import farthest_from_singular
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.read_case import load_case
@@ -18,11 +18,10 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.touch_noise import reading_noise
-from puncture_twin.planning.registration.touch_poses import touching_configuration
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture
 

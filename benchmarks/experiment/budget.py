@@ -8,8 +8,7 @@ import numpy as np
 
 from benchmarks.experiment.row import Row
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.registration.fits.fit_map import carried, design, least_squares_map
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import carried, design, fit_rigid, least_squares_map
 from puncture_twin.twin.experiment.declarations import AS_STATED
 from puncture_twin.twin.experiment.printed import READ, rows_of
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.frames import frame_about

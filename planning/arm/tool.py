@@ -3,14 +3,59 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.tool_body import ToolBody
+from puncture_twin.planning.arm.links import convex_pieces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
+
+SLABS = 6
+"""Into how many slabs along its longest side a tool is cut before the hulls are taken: what is bent stays bent."""
+
+
+@dataclass(frozen=True, eq=False)
+class ToolBody:
+    """A rigid body that is bolted to the flange.
+
+    Attributes:
+        mesh: Its surface, mm, in the flange's frame.
+        file: The mesh's file.
+        unit_mm: How many millimetres one unit of the file is.
+        T_flange_file: Shape (4, 4), mm: the file's frame in the flange's.
+        key: Where it is stated, for errors.
+    """
+
+    mesh: TriangleMesh
+    file: Path
+    unit_mm: float
+    T_flange_file: Floats
+    key: str
+
+    @cached_property
+    def pieces(self) -> tuple[TriangleMesh, ...]:
+        """Convex pieces that together contain it: open or turned inside out, it is the same body.
+
+        Raises:
+            InputError: It is flat.
+        """
+        pieces = convex_pieces(self.mesh, SLABS)
+        if not pieces:
+            raise InputError("the mesh is flat", where=self.key, allowed="a body, not a sheet")
+        return pieces
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ToolBody) and self.mesh.digest == other.mesh.digest
+
+    def __hash__(self) -> int:
+        return hash(self.mesh.digest)
+
 
 HOLDER_ROOT_MM = 5.0
 """How far the holder's body reaches back into wrist 3, whose mesh ends up to 1.4 mm before the flange plane: without
@@ -108,3 +153,41 @@ class Box:
         """Lowest and highest corner of the axis-aligned box about it, base frame, shape (2, 3), mm."""
         half = np.abs(self.T_base_box[:3, :3]) @ (np.asarray(self.size_mm) / 2.0)
         return np.stack([self.T_base_box[:3, 3] - half, self.T_base_box[:3, 3] + half])
+
+
+SIDES = 24
+"""Of the polygon that stands for the bore: inscribed, so the bore is up to 0.9 % narrower than it is (3 mm of 350)."""
+
+
+def gantry_boxes(
+    T_base_gantry: NDArray[np.float64], *, bore_diameter_mm: float, wall_mm: float, depth_mm: float
+) -> tuple[Box, ...]:
+    """The wall about a bore.
+
+    Args:
+        T_base_gantry: Shape (4, 4), mm: the bore's centre; its axis is z, so a tilt is a turn about x.
+        bore_diameter_mm: Of the bore.
+        wall_mm: How far the wall reaches outward from the bore; the housing beyond does not count.
+        depth_mm: Along the bore.
+
+    Returns:
+        Boxes named ``gantry_0`` ...: every point of the wall is in one of them, and every point nearer to the axis than
+        cos(pi / ``SIDES``) times the bore's radius in none.
+
+    Raises:
+        InputError: If a length is not finite and positive, or the pose not rigid.
+    """
+    for name, value in (("bore_diameter_mm", bore_diameter_mm), ("wall_mm", wall_mm), ("depth_mm", depth_mm)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise InputError(f"{name} = {value}", where="gantry", allowed="finite and above 0")
+    radius = bore_diameter_mm / 2.0
+    inner, outer = radius * np.cos(np.pi / SIDES), radius + wall_mm
+    size = (outer - inner, 2.0 * outer * np.tan(np.pi / SIDES), depth_mm)
+    boxes = []
+    for side in range(SIDES):
+        turn = 2.0 * np.pi * side / SIDES
+        T = np.eye(4)
+        T[:2, 0], T[:2, 1] = (np.cos(turn), np.sin(turn)), (-np.sin(turn), np.cos(turn))
+        T[:2, 3] = (inner + outer) / 2.0 * T[:2, 0]
+        boxes.append(Box(f"gantry_{side}", np.asarray(T_base_gantry, dtype=np.float64) @ T, size))
+    return tuple(boxes)

@@ -22,10 +22,9 @@ from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_uncertainty
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty
 from puncture_twin.planning.registration.fits.least_squares import fit_triad
-from puncture_twin.planning.registration.marker_noise import touches
+from puncture_twin.planning.registration.marker_noise import reading_noise, touches
 from puncture_twin.planning.registration.placement import default_method
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.search.bending.insertion import insertion_along
 from puncture_twin.planning.uncertainty.pose_error import Bend, PoseError
 

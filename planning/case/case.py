@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
-from puncture_twin.planning.arm.tool_body import ToolBody
+from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.provenance import Input, InputFiles

@@ -20,11 +20,18 @@ from pydantic import (
 )
 
 from puncture_twin.planning.base.text_names import MAX_NAME
+from puncture_twin.planning.formats.joint_readings import plainly_radians
 
 
 def _plain_name(value: str) -> str:
     if not re.fullmatch(r"[^\W_]([\w .\-]*[\w.\-])?", unicodedata.normalize("NFC", value)):
         raise ValueError("letters, digits, spaces and . _ - alone, a letter or digit first")
+    return value
+
+
+def _degrees(value: tuple[float, ...]) -> tuple[float, ...]:
+    if plainly_radians(value):
+        raise ValueError(f"all six within {max(map(abs, value)):g} of zero: radians? They are degrees")
     return value
 
 
@@ -37,7 +44,9 @@ Margin = Annotated[Number, Field(ge=0, le=1000)]
 Weight = Annotated[Number, Field(ge=0, le=1000)]
 JointDegrees = Annotated[Number, Field(ge=-360, le=360)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
-Sextuple = tuple[JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees]
+Sextuple = Annotated[
+    tuple[JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees], AfterValidator(_degrees)
+]
 Text = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME)]
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
 CaseName = Annotated[str, StringConstraints(max_length=80), AfterValidator(_plain_name)]

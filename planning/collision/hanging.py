@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import fcl
 
-from puncture_twin.planning.arm.tool_body import ToolBody
+from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.body import Body
 from puncture_twin.planning.collision.bodies.shapes import convex, padded, touch

@@ -11,8 +11,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
 from puncture_twin.planning.anatomy.body.outside_body import BOX_FACES
-from puncture_twin.planning.arm.gantry import gantry_boxes
-from puncture_twin.planning.arm.tool import Box
+from puncture_twin.planning.arm.tool import Box, gantry_boxes
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case

@@ -27,6 +27,9 @@ KEYS = "docs/how-to/collision-cases.md"
 DEFAULT_TOLERANCE_MM = 0.01
 """A tenth of the 0.1 mm to which a robot repeats itself."""
 
+MOST_TOLERANCE_MM = 10.0
+"""A clearance that may be off by more is not checked at all."""
+
 TestName = Annotated[str, StringConstraints(pattern=r"^[^\s:\[\]/\\]([^:\[\]/\\]*[^\s:\[\]/\\])?$", max_length=80)]
 """What pytest can select a test by: without the signs of its own names."""
 
@@ -57,7 +60,7 @@ class CheckSection(Expectation):
     reason: Reason | None = None
     structure: str | None = None
     clearance_mm: dict[str, Number] = Field(default_factory=dict)
-    tolerance_mm: NotNegative = DEFAULT_TOLERANCE_MM
+    tolerance_mm: Annotated[NotNegative, Field(le=MOST_TOLERANCE_MM)] = DEFAULT_TOLERANCE_MM
     min_clearance_mm: Number | None = None
     max_touch: Chance | None = None
     arm: Yes = False

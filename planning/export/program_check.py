@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.tip_speed import tip_rates
+from puncture_twin.planning.arm.speed_limits import tip_rates
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from scipy.special import fdtrc
 
 from puncture_twin.planning.base.arrays import Floats
 
@@ -32,6 +33,9 @@ NOT_HIGHER = 1 + 1e-12
 
 MOST_DAMPINGS = 30
 """Of one step; from 1e-6 by tens, far beyond any step that moves the estimate."""
+
+UNSEEN = 1e-6
+"""Relative length of a column beside the model's own below which the data cannot show it."""
 
 
 class System(NamedTuple, Generic[X]):
@@ -139,3 +143,48 @@ def _descend(
                 return step, after, damping / 10 if damping > 1e-9 else 0.0
             damping = max(10 * damping, 1e-6)
     return np.zeros(len(normal.values)), estimate, damping
+
+
+class Lacking(NamedTuple):
+    """What k unknowns that a linear model lacks would explain of its residuals."""
+
+    found: Floats
+    """Shape (k,): their values."""
+    sd: Floats
+    """Shape (k,): their standard deviations, by the residuals that they leave."""
+    probability: float
+    """Of residuals that they explain so well, where all are zero: F(k, freedom)."""
+    freedom: int
+    """Residuals less p and k."""
+    variance: float
+    """Of one residual, beside them."""
+    variance_without: float
+    """Of one residual, as the model without them has it."""
+
+
+def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> Lacking | None:
+    """The F-test of z = A x + more y + noise against y = 0; None where the data cannot show y.
+
+    Args:
+        z: Shape (m,), in standard deviations (of one common size, which need not be known).
+        A: Shape (m, p): columns of the model.
+        more: Shape (m, k): columns that it lacks.
+        count: How many residuals count, where others have next to no weight; None for all.
+    """
+    basis, values, _ = np.linalg.svd(A, full_matrices=False)
+    basis = basis[:, values > UNSEEN * values[0]]
+    beside, left = more - basis @ (basis.T @ more), z - basis @ (basis.T @ z)
+    (m, k), p = more.shape, basis.shape[1]
+    m = m if count is None else count
+    freedom = m - p - k
+    size = np.linalg.norm(more, axis=0)
+    if freedom < 1 or not (size > 0.0).all():
+        return None
+    shown = np.linalg.svd(beside / size, compute_uv=False)
+    if not shown[-1] > UNSEEN:
+        return None
+    found = np.asarray(np.linalg.lstsq(beside, left, rcond=None)[0], dtype=np.float64)
+    before, after = float(left @ left), float(np.sum((left - beside @ found) ** 2))
+    f = np.inf if after == 0.0 else (before - after) / k / (after / freedom)
+    sd = np.sqrt(after / freedom * np.diag(np.linalg.inv(beside.T @ beside)))
+    return Lacking(found, sd, float(fdtrc(k, freedom, max(f, 0.0))), freedom, after / freedom, before / (m - p))

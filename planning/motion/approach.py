@@ -15,8 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, slowed
-from puncture_twin.planning.arm.tip_speed import TipLimit
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.collision.checker import CellChecker, Contact, StateChecker

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from puncture_twin.planning.arm.tip_speed import TipLimit, tip_rates
+from puncture_twin.planning.arm.speed_limits import TipLimit, tip_rates
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError

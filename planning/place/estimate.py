@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import N_BRANCHES, inverse
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel

@@ -9,11 +9,10 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.marker_noise import touches
+from puncture_twin.planning.registration.marker_noise import reading_noise, touches
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import Placement, default_method
 from puncture_twin.planning.registration.registration import Registration, register
-from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 

@@ -8,7 +8,7 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.needle_line import flange_poses
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.bodies.solid import Solid

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from puncture_twin.planning.arm.insertion import needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.needle_line import needle_lines
-from puncture_twin.planning.arm.speed_limits import slowed
-from puncture_twin.planning.arm.tip_speed import tip_speeds
+from puncture_twin.planning.arm.speed_limits import slowed, tip_speeds
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from puncture_twin.planning.arm.insertion import NeedleLine
 from puncture_twin.planning.arm.inverse_kinematics import (
     EVERY_BRANCH,
     N_BRANCHES,
     fill_branches,
     wrapped_angle,
 )
-from puncture_twin.planning.arm.needle_line import NeedleLine
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb

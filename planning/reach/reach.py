@@ -10,8 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from puncture_twin.planning.arm.insertion import first_stop
-from puncture_twin.planning.arm.needle_line import needle_lines
+from puncture_twin.planning.arm.insertion import first_stop, needle_lines
 from puncture_twin.planning.arm.singularity import away_from_singularities
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.errors import InputError

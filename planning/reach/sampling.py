@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.arm.insertion import NeedleLine
 from puncture_twin.planning.arm.kinematics import link_frames
-from puncture_twin.planning.arm.needle_line import NeedleLine
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.sweep import SweptBodies, motion_bounds

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, MAX_JOINT_STEP_RAD_PER_MM
+from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, MAX_JOINT_STEP_RAD_PER_MM, NeedleLine
 from puncture_twin.planning.arm.inverse_kinematics import (
     EVERY_BRANCH,
     N_BRANCHES,
@@ -17,7 +17,6 @@ from puncture_twin.planning.arm.inverse_kinematics import (
     fill_branches,
     wrapped_angle,
 )
-from puncture_twin.planning.arm.needle_line import NeedleLine
 from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, least_term
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats

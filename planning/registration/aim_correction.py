@@ -25,8 +25,7 @@ from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
-from puncture_twin.planning.registration.fits.fit_map import carried, design
-from puncture_twin.planning.registration.fits.weighted import fit_joint
+from puncture_twin.planning.registration.fits.least_squares import carried, design, fit_joint
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.registration import Registration
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.registration.fits.fit_map import carried, design, differenced_map, least_squares_map
-from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
+from puncture_twin.planning.registration.fits.least_squares import carried, design, differenced_map, least_squares_map
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
+from puncture_twin.planning.registration.residual_test import NoiseTest, noise_test
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,20 +6,98 @@ from pathlib import Path
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.error_jacobian import N_PARAMETERS, PARAMETERS, error_jacobian
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.singularity import farthest_from_singular, singularity
+from puncture_twin.planning.arm.stated_arm import check_arm
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.case.errors import ArmUncertainty, ErrorModel
+from puncture_twin.planning.geometry.frames import frame_about
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, check_pairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.touch_noise import reading_noise
-from puncture_twin.planning.registration.touch_poses import touching_configuration
 
-MAX_JOINTS_OFF_MM = 5.0
-"""A controller with its own calibration puts the tip up to some mm from where the data sheet's arm does."""
+
+def parameter_variances(arm: ArmUncertainty) -> Floats:
+    """The diagonal of Sigma_eta, shape (28,), in the order of `error_jacobian`'s columns; mm^2 and rad^2."""
+    deviations = np.empty(N_PARAMETERS)
+    for kind, value in (
+        ("link", arm.link_mm),
+        ("twist", arm.twist),
+        ("joint", arm.joint),
+        ("tip_offset", arm.tip_offset_mm),
+        ("needle_direction", arm.needle_direction),
+    ):
+        deviations[PARAMETERS[kind]] = value
+    return np.asarray(deviations**2)
+
+
+def reading_noise(errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Floats, *, known: bool) -> ReadingNoise:
+    """The noise of markers that were touched in given configurations.
+
+    Args:
+        errors: As declared.
+        model: The arm.
+        tip_mm: Flange to tip.
+        q_touch: Shape (N, 6), rad.
+        known: Whether these are the real ones.
+    """
+    eta_variances = parameter_variances(errors.arm)
+    J = error_jacobian(model, q_touch, tip_mm)[:, :3]
+    Jq = J[..., PARAMETERS["joint"]]
+    cov_base = errors.touch_mm**2 * np.eye(3) + errors.arm.repeatability**2 * Jq @ np.swapaxes(Jq, -1, -2)
+    return ReadingNoise(errors.marker_cov_ct, cov_base, J.reshape(-1, N_PARAMETERS), eta_variances, known)
+
+
+TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
+"""How far the needle may lean from the wished direction, tried in this order."""
+
+AZIMUTHS = 12
+"""Sides to which it may lean."""
+
+LEAST_SINGULARITY = 0.05
+"""A pose nearer than this to a singularity is not used to measure (of 0..1)."""
+
+
+def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:
+    """Joint angles that put the tip on a point, shape (6,), rad: the least tilt, then the farthest from singular.
+
+    Of equals the one with its elbow on the side from which the needle comes: mirrored branches are equal.
+
+    Args:
+        model: The arm.
+        tip_mm: Flange to tip, along the flange's z.
+        point_base: Shape (3,), mm.
+        needle_base: Shape (3,), unit: the wished direction from the needle's top to its tip.
+
+    Raises:
+        NoAnswerError: There are none in the tried directions.
+    """
+    for tilt in np.radians(TILTS_DEG):
+        poses = touching_poses(tip_mm, point_base, needle_base, float(tilt))
+        q = np.concatenate([inverse(model, T)[0] for T in poses])
+        q = q[model.within_limits(q)]
+        if len(q) and singularity(model, q).least().max() >= LEAST_SINGULARITY:
+            return farthest_from_singular(model, q, -needle_base)
+    place = ", ".join(f"{value:.1f}" for value in point_base)
+    raise NoAnswerError(f"a {model.name} cannot touch ({place}) mm with a needle of {tip_mm:g} mm")
+
+
+def touching_poses(tip_mm: float, point_base: Floats, needle_base: Floats, tilt: float) -> list[Floats]:
+    """Flange poses (4, 4) with the tip on a point, leaning by ``tilt`` (rad) to every side; arguments as above."""
+    frame = frame_about(needle_base)
+    sides = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False) if tilt > 0 else [0.0]
+    poses = []
+    for side in sides:
+        lean = [np.sin(tilt) * np.cos(side), np.sin(tilt) * np.sin(side), np.cos(tilt)]
+        R = frame_about(frame @ np.array(lean))  # any roll will do: it is q6 alone
+        poses.append(pose(R, point_base - tip_mm * R[:, 2]))
+    return poses
+
 
 GUESSED_HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """An arm bent at the elbow, its needle down."""
@@ -35,7 +113,8 @@ def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where:
     check_pairs(markers, where)
     q_touch = touches(case, markers)
     if markers.joints is not None:
-        _check_joints(model, tip, markers, where)
+        tool = [np.array([0.0, 0.0, tip])]
+        check_arm(model, markers.joints, markers.points_base, tool, names=markers.names, where=where)
     return reading_noise(errors, model, tip, q_touch, known=markers.joints is not None)
 
 
@@ -54,17 +133,3 @@ def _guessed(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Flo
         return touching_configuration(model, tip_mm, point_base, needle_base)
     except NoAnswerError:
         return GUESSED_HOME
-
-
-def _check_joints(model: UrModel, tip_mm: float, markers: MarkerPairs, where: str | Path) -> None:
-    assert markers.joints is not None
-    flanges = flange_pose(model, markers.joints)
-    tips = flanges[:, :3, 3] + tip_mm * flanges[:, :3, 2]
-    away = np.linalg.norm(tips - markers.points_base, axis=1)
-    worst = int(np.argmax(away))
-    if away[worst] > MAX_JOINTS_OFF_MM:
-        raise InputError(
-            f"the joints of marker {markers.names[worst]} put the tip {away[worst]:.1f} mm away from where it touched",
-            where=where,
-            allowed=f"within {MAX_JOINTS_OFF_MM:g} mm: joints in degrees, of this robot, with this needle",
-        )

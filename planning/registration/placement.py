@@ -17,11 +17,10 @@ from puncture_twin.planning.case.tables.registration_section import MarkerSectio
 from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.aim import aim_at
+from puncture_twin.planning.registration.aim import aim_at, reached_insertion
 from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.marker_noise import marker_noise
 from puncture_twin.planning.registration.marker_pairs import check_pairs, match
-from puncture_twin.planning.registration.reached_insertion import reached_insertion
 from puncture_twin.planning.registration.registration import Registration, register
 
 MAX_AIM_OFF_MM = 20.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,35 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.conditioning import Conditioning, conditioning
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
-from puncture_twin.planning.registration.fits.better_names import better_names
-from puncture_twin.planning.registration.fits.fit_map import carried, design, least_squares_map
-from puncture_twin.planning.registration.fits.least_squares import rigid_fre_mm
-from puncture_twin.planning.registration.fits.method import Method, checked_fit
-from puncture_twin.planning.registration.fits.residual_checks import check_residuals
+from puncture_twin.planning.registration.fits.distortion import Distortion, distortion
+from puncture_twin.planning.registration.fits.least_squares import (
+    carried,
+    design,
+    fit_rigid,
+    least_squares_map,
+    rigid_fre_mm,
+)
+from puncture_twin.planning.registration.fits.marker_ambiguity import better_names
+from puncture_twin.planning.registration.fits.method import Method, check_residuals, checked_fit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.residual_test import Interval, ResidualTest
-from puncture_twin.planning.registration.weak_points import fit_doubts, odd_marker_of
+from puncture_twin.planning.registration.residual_test import Interval, OddMarker, ResidualTest, odd_marker
+
+
+def fit_doubts(test: ResidualTest, uncertainty: FitUncertainty | None) -> tuple[str, ...]:
+    """Residuals that the noise does not explain and the case accepts: of the rigid fit, or of the declared errors."""
+    if uncertainty is None:
+        return () if test.explained else (f"{test.text()}; accepted by the case",)
+    declared = uncertainty.test
+    if declared.agrees:
+        return ()
+    return (declared.text() + ("; all errors are scaled to them" if declared.explained else "; accepted by the case"),)
+
+
+def odd_marker_of(markers: MarkerPairs, fle_mm: float | None) -> OddMarker | None:
+    """The marker that does not fit the others, if there is one; ``fle_mm`` is the declared noise or None."""
+    return odd_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
+
 
 ALLOWED_RESIDUALS = "names and readings checked, the true errors declared, or registration.accept_residuals = true"
 
@@ -38,6 +59,7 @@ class Registration:
         residuals: Shape (n, 3), T_base_ct markers_ct - markers_base, mm.
         residual_test: The residuals of the rigid fit against the noise.
         conditioning: The three flags of a weak set, for the target given.
+        target_ct: That target, shape (3,), mm.
         uncertainty: What the declared errors make of it; None where none are declared.
         aim: The insertion for which the pose was corrected by what the residuals tell of the arm; None where it was
             not. The residuals are those before.
@@ -49,6 +71,7 @@ class Registration:
     residuals: Floats
     residual_test: ResidualTest
     conditioning: Conditioning
+    target_ct: Floats
     uncertainty: FitUncertainty | None = None
     aim: Aim | None = None
 
@@ -83,10 +106,17 @@ class Registration:
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """What weakens it, in words: the conditioning, residuals that were accepted, a marker that does not fit."""
+        """What weakens it, in words: the conditioning, accepted residuals, an odd marker, lists of two sizes."""
         doubts = fit_doubts(self.residual_test, self.uncertainty)
-        odd = odd_marker_of(self.markers, self.residual_test.declared_fle_mm)
-        return (*self.conditioning.flags, *doubts, *(() if odd is None else (odd.text(),)))
+        odd, deformed = odd_marker_of(self.markers, self.residual_test.declared_fle_mm), self.distortion
+        found = (odd, deformed if deformed is not None and deformed.doubted else None)
+        return (*self.conditioning.flags, *doubts, *(one.text() for one in found if one is not None))
+
+    @cached_property
+    def distortion(self) -> Distortion | None:
+        """By what one list seems deformed against the other, doubted or not; None where the markers cannot show it."""
+        noise = None if self.uncertainty is None else self.uncertainty.noise
+        return distortion(self.T_base_ct, self.markers, noise, self.target_ct)
 
     @property
     def residual_mm(self) -> Floats:
@@ -182,6 +212,8 @@ def register(
         odd = odd_marker_of(markers, fle_mm)
         what = noise_test.text() if odd is None else f"{noise_test.text()}; {odd.text()}"
         what += better_names(markers, target_ct, fre_mm)
+        deformed = distortion(T_base_ct, markers, noise, target_ct)
+        what += f"; {deformed.brief()}" if deformed is not None and deformed.doubted else ""
         raise InputError(what, where=where, allowed=ALLOWED_RESIDUALS)
     weak = conditioning(markers.points_ct, target_ct)
-    return Registration(method, T_base_ct, markers, residuals, test, weak, uncertainty)
+    return Registration(method, T_base_ct, markers, residuals, test, weak, target_ct, uncertainty)

@@ -78,9 +78,9 @@ def ranked_by(found: Candidates, cost: Floats) -> Candidates:
         InputError: Another shape, or a safe candidate whose cost is not finite.
     """
     rows = np.flatnonzero(found.safe)
-    if cost.shape != (len(found),) or not np.isfinite(cost[rows]).all():
-        allowed = f"shape ({len(found)},), finite for the {len(rows)} safe candidates"
-        raise InputError(f"a cost of shape {cost.shape}", where="rerank", allowed=allowed)
+    if cost.shape != (len(found),) or cost.dtype.kind not in "iufb" or not np.isfinite(cost[rows]).all():
+        allowed = f"shape ({len(found)},), real numbers, finite for the {len(rows)} safe candidates"
+        raise InputError(f"a cost of shape {cost.shape}, {cost.dtype}", where="rerank", allowed=allowed, code="cost")
     ranks = np.zeros(len(found), np.int32)
     ranks[rows[np.argsort(cost[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
     ranking = Ranking(np.where(found.safe, cost, np.nan), ranks, found.ranking.pareto)

@@ -21,14 +21,12 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.fits.method import Method
-from puncture_twin.planning.registration.marker_noise import marker_noise
+from puncture_twin.planning.registration.marker_noise import marker_noise, reading_noise
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs
 from puncture_twin.planning.registration.registration import Registration, register
-from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.straight_approach import TIP_MM, ApproachCheckers, why_not
-from puncture_twin.planning.touch.touch_plan import TouchPlan
-from puncture_twin.planning.touch.tour_motions import NoMotionError, Stops, tour_through
+from puncture_twin.planning.touch.tour_motions import NoMotionError, Stops, TouchPlan, tour_through
 from puncture_twin.planning.uncertainty.pose_error import PoseError, expected_error_mm
 from puncture_twin.planning.uncertainty.touch_choice import Candidates, least_error, touch_candidates
 

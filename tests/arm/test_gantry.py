@@ -10,7 +10,7 @@ import trimesh
 from kept_checkers import built
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.arm.gantry import SIDES, gantry_boxes
+from puncture_twin.planning.arm.tool import SIDES, gantry_boxes
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, first_stop, reach_margin
+from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, first_stop, flange_poses, needle_lines, reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import (
     EVERY_BRANCH,
     fill_branches,
@@ -14,7 +14,6 @@ from puncture_twin.planning.arm.inverse_kinematics import (
     wrap_to_pi,
 )
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.needle_line import flange_poses, needle_lines
 from puncture_twin.planning.arm.singularity import singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model

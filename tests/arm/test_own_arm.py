@@ -15,10 +15,10 @@ from own_arms import LENGTHS, LINKS, beside, origin, placed, shipped_as_own, slo
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import collision_links
-from puncture_twin.planning.arm.own_arm import own_arm
+from puncture_twin.planning.arm.model_urdf import own_arm
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.arm.urdf.limits import StatedLimits
+from puncture_twin.planning.arm.urdf.lengths import StatedLimits
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker

@@ -20,9 +20,9 @@ from puncture_twin.planning.budget.what_if import changes, source_costs
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.needle.shaft import GAUGES, Shaft
+from puncture_twin.planning.registration.aim import reached_insertion
+from puncture_twin.planning.registration.marker_noise import reading_noise
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.registration.reached_insertion import reached_insertion
-from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.run_twin import app
 from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms

@@ -7,8 +7,8 @@ import pytest
 from scipy.special import chdtri, ndtri, stdtrit
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.certify.certificate import SAFE, parse_certificate, write_certificate
 from puncture_twin.planning.certify.checker import verify

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 from case_world import write_case
 
-from puncture_twin.planning.arm.gantry import SIDES, gantry_boxes
+from puncture_twin.planning.arm.tool import SIDES, gantry_boxes
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.settings import Gantry
 from puncture_twin.planning.collision.bodies.shapes import surface

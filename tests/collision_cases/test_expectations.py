@@ -38,6 +38,15 @@ def check(explained, **keys):
     return "\n".join(one.line for one in direction_finding(section, explained).differences)
 
 
+@pytest.mark.parametrize("mm", [1e9, 10.1])
+def test_a_tolerance_that_checks_nothing_is_refused(mm):
+    """A clearance may be off by 10 mm at most."""
+    stated = {"theta_deg": 0.0, "beta_deg": 0.0, "verdict": "safe", "clearance_mm": {"liver": 3.0}}
+    assert CheckSection(**stated, tolerance_mm=10.0).tolerance_mm == 10.0
+    with pytest.raises(ValueError, match="less than or equal to 10"):
+        CheckSection(**stated, tolerance_mm=mm)
+
+
 def test_least_clearance_is_of_what_demands_a_margin(carton):
     """The target's own clearance, -1 mm, does not count."""
     context, _ = carton

@@ -86,11 +86,12 @@ def test_rerank_orders_the_safe_ones_alone(context):
     assert sorted(mine.ranking.rank[mine.safe]) == list(range(1, int(mine.safe.sum()) + 1))
 
 
-@pytest.mark.parametrize("cost", [np.zeros(3), "nan"], ids=["another shape", "not a number"])
+@pytest.mark.parametrize("cost", [np.zeros(3), "nan", "complex"], ids=["another shape", "not a number", "complex"])
 def test_rerank_refuses_a_cost_that_orders_nothing(context, cost):
     """One line that says what is allowed."""
     candidates = pt.search(context)
-    cost = np.full(len(candidates), np.nan) if isinstance(cost, str) else cost
+    if isinstance(cost, str):
+        cost = np.full(len(candidates), np.nan if cost == "nan" else 1.0 + 2.0j)
     with pytest.raises(pt.InputError, match=r"rerank: a cost of shape .*; allowed: shape"):
         pt.rerank(candidates, cost)
 
@@ -105,6 +106,13 @@ def test_register_takes_two_lists_and_no_case():
     assert np.allclose(found.T_base_ct[:3, 3], (5, 6, 7))
     with pytest.raises(pt.InputError, match="missing on the"):
         pt.register(ct, {"a": (0, 0, 0), "b": (100, 0, 0), "x": (0, 80, 0)}, target_ct=(0, 0, 0))
+
+
+def test_register_refuses_a_method_that_is_none():
+    """It is not taken for another one."""
+    good = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
+    with pytest.raises(pt.InputError, match="method 'magic'; allowed: triad, rigid"):
+        pt.register(good, good, target_ct=(0, 0, 0), method="magic")
 
 
 def test_register_refuses_points_that_are_none():

@@ -13,6 +13,7 @@ from rtde_server import PERIOD_S, START_S, rtde_server
 
 from puncture_twin import run_twin
 from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import sha256
@@ -218,6 +219,25 @@ def test_recordings_that_cannot_be_read_are_refused(tmp_path, text, match):
         list(mirror.RecordedJoints.read(path).states())
     with pytest.raises(InputError, match="no such file"):
         list(mirror.RecordedJoints.read(tmp_path / "none.csv").states())
+
+
+@pytest.mark.parametrize(("model", "exits"), [("ur3", 0), ("ur3e", 2)])
+def test_an_rtde_recording_is_mirrored_if_it_is_of_the_case_s_arm(drive, tmp_path, capsys, model, exits):
+    """RTDE's own headers; the controller's pose beside its joints tells a UR3e from the case's UR3."""
+    poses = flange_pose(ur_model(model), drive.insertion_q)[:, :3, 3] / 1000.0
+    names = ["timestamp", *(f"actual_q_{k}" for k in range(6)), *(f"actual_TCP_pose_{k}" for k in range(3))]
+    rows = [
+        " ".join(map(repr, [0.008 * i, *map(float, q), *map(float, place)]))
+        for i, (q, place) in enumerate(zip(drive.insertion_q, poses, strict=True))
+    ]
+    path = tmp_path / "robot_data.csv"
+    path.write_text("\n".join([" ".join(names), *rows, ""]))
+    assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path)]) == exits
+    said = capsys.readouterr()
+    if exits:
+        assert "those of a ur3e do not" in said.err and len(said.err.splitlines()) == 1 and not said.out
+    else:
+        assert "to target    0.00 mm" in said.out.splitlines()[-1]
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):

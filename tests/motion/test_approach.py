@@ -11,8 +11,7 @@ from hypothesis import given, settings, strategies as st
 from kept_checkers import built
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, slowed
-from puncture_twin.planning.arm.tip_speed import TipLimit, tip_rates, tip_speeds
+from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed, tip_rates, tip_speeds
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, Tool

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.singularity import farthest_from_singular
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.rigid import apply, pose

@@ -9,8 +9,7 @@ import pytest
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.speed_limits import SpeedLimits
-from puncture_twin.planning.arm.tip_speed import tip_speeds
+from puncture_twin.planning.arm.speed_limits import SpeedLimits, tip_speeds
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.reasons import Reason

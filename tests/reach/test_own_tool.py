@@ -11,8 +11,7 @@ import trimesh
 from case_world import CASE, write_case
 
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
-from puncture_twin.planning.arm.tool import Box, Tool
-from puncture_twin.planning.arm.tool_body import SLABS, ToolBody
+from puncture_twin.planning.arm.tool import SLABS, Box, Tool, ToolBody
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason

@@ -9,11 +9,10 @@ import pytest
 import trimesh
 
 from benchmarks.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
-from puncture_twin.planning.arm.insertion import reach_margin
+from puncture_twin.planning.arm.insertion import flange_poses, needle_lines, reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import collision_links
-from puncture_twin.planning.arm.needle_line import flange_poses, needle_lines
 from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, singularity
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError

@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.needle_line import flange_poses
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.collision.checker import CellChecker, Tool

@@ -18,8 +18,7 @@ from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed, aimed_fit
-from puncture_twin.planning.registration.fits.fit_map import differenced_map
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import differenced_map, fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import register

@@ -7,13 +7,17 @@ from scipy.special import chdtri
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.registration.fits.fit_map import design, differenced_map, least_squares_map
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.weighted import fit_weighted
+from puncture_twin.planning.registration.fits.least_squares import (
+    design,
+    differenced_map,
+    fit_rigid,
+    fit_weighted,
+    least_squares_map,
+)
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residual_test import NoiseTest, noise_test
 
 T_TRUE = pose(exp_rotation(np.array([0.4, -0.2, 1.1])), np.array([300.0, -200.0, 100.0]))
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147], [0, 80, 60]])

@@ -8,8 +8,7 @@ from uncertainty_world import declared, world
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
-from puncture_twin.planning.registration.fits.weighted import fit_joint, fit_weighted
+from puncture_twin.planning.registration.fits.least_squares import fit_joint, fit_rigid, fit_triad, fit_weighted
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.registration import register

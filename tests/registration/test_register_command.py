@@ -91,4 +91,4 @@ def test_joints_that_put_the_tip_elsewhere_are_refused(tmp_path, capfd):
     text = (tmp_path / "case.toml").read_text().replace("length_mm = 210.0", "length_mm = 190.0")
     (tmp_path / "case.toml").write_text(text)
     assert main(["register", str(tmp_path)]) == BAD_INPUT
-    assert "put the tip 20.0 mm away from where it touched" in capfd.readouterr().err
+    assert "put the tool of a ur3 20.0 mm from where it was" in capfd.readouterr().err

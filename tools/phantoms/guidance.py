@@ -12,9 +12,9 @@ from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.marker_noise import reading_noise
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.touch_noise import reading_noise
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.planning.uncertainty.touch_choice import choose_touches
 from tools.phantoms import torso

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.registration.fits.fit_map import design
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits.least_squares import design, fit_rigid
 from puncture_twin.twin.experiment.declarations import Declaration
 from puncture_twin.twin.experiment.printed import READ, SETUPS, rows_of
 

@@ -12,8 +12,8 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.touch_noise import parameter_variances
-from puncture_twin.planning.touch.touch_plan import Touch
+from puncture_twin.planning.registration.marker_noise import parameter_variances
+from puncture_twin.planning.touch.tour_motions import Touch
 from puncture_twin.twin.plant.true_needle import driven_onto
 
 

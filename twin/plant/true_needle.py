@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.erring_arm import dh_step
-from puncture_twin.planning.arm.error_jacobian import FREE_D, N_PARAMETERS, PARAMETERS, error_jacobian
+from puncture_twin.planning.arm.error_jacobian import FREE_D, N_PARAMETERS, PARAMETERS, dh_step, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rotations import exp_rotation

@@ -21,11 +21,16 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_fit
-from puncture_twin.planning.registration.fits.fit_map import design, least_squares_map
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
-from puncture_twin.planning.registration.fits.weighted import fit_joint, fit_weighted
+from puncture_twin.planning.registration.fits.least_squares import (
+    design,
+    fit_joint,
+    fit_rigid,
+    fit_triad,
+    fit_weighted,
+    least_squares_map,
+)
+from puncture_twin.planning.registration.marker_noise import parameter_variances
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.touch_noise import parameter_variances
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.plant.true_needle import TrueNeedle, driven_onto, true_needle
 

@@ -34,7 +34,7 @@ from puncture_twin.planning.touch.straight_approach import (
     line_to,
     why_not,
 )
-from puncture_twin.planning.touch.touch_plan import Touch, TouchTour
+from puncture_twin.planning.touch.tour_motions import Touch, TouchTour
 from puncture_twin.twin.plant.touch_truth import TouchTruth, nominal_tip
 from puncture_twin.twin.world.bodies import load_box, remove, soften
 from puncture_twin.twin.world.contacts import touches

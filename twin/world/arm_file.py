@@ -13,8 +13,7 @@ import trimesh
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.model_urdf import address_file, model_urdf
-from puncture_twin.planning.arm.tool import Tool
-from puncture_twin.planning.arm.tool_body import ToolBody
+from puncture_twin.planning.arm.tool import Tool, ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
 from puncture_twin.planning.base.errors import InputError

@@ -8,11 +8,11 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from puncture_twin.planning.arm.own_arm import own_arm
+from puncture_twin.planning.arm.model_urdf import own_arm
 from puncture_twin.planning.arm.speed_limits import SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.arm.urdf.document import MOST_BYTES
-from puncture_twin.planning.arm.urdf.limits import NOTHING_STATED, JointLimits, StatedLimits, narrowed
+from puncture_twin.planning.arm.urdf.lengths import NOTHING_STATED, JointLimits, StatedLimits, narrowed
 from puncture_twin.planning.base.arrays import read_only
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from pydantic import Field
 
-from puncture_twin.planning.arm.tool_body import ToolBody
+from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.toml_types import Number, Section
 from puncture_twin.planning.formats.meshes import mesh_files as meshes

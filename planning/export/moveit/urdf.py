@@ -8,8 +8,7 @@ from xml.etree import ElementTree
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.model_urdf import address_file, model_urdf
-from puncture_twin.planning.arm.tool import Tool
-from puncture_twin.planning.arm.tool_body import ToolBody
+from puncture_twin.planning.arm.tool import Tool, ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.export.moveit.messages import M_PER_MM
 

@@ -21,6 +21,7 @@ from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.guard import guard_points
+from puncture_twin.planning.formats.joint_readings import JOINTS_DEG, joint_readings
 from puncture_twin.planning.formats.points.points_csv import read_csv_points
 from puncture_twin.planning.formats.points.points_slicer import read_fcsv_points, read_markups_points
 from puncture_twin.planning.formats.points.raw_points import RawPoints
@@ -122,7 +123,9 @@ def parse_points(
     with np.errstate(over="ignore"):  # beyond the range of floats is infinite, which the guard refuses
         points = points * unit.mm if space is None else to_lps(points, space) * unit.mm
     guarded = guard_points(points, raw.names, where=name)
-    joints = None if raw.joints_deg is None else np.radians(np.array(raw.joints_deg))
+    joints = None
+    if raw.joints_deg is not None:
+        joints = joint_readings(raw.joints_deg, "deg", where=name, names=raw.names)
     return NamedPoints(tuple(raw.names), guarded, Space.LPS if space is Space.RAS else space, raw.kinds, joints)
 
 
@@ -143,7 +146,7 @@ def write_points(path: Path, points: NamedPoints) -> None:
     """
     joints = points.joints is not None
     header = ["name", *(["kind"] if points.kinds else []), "x_mm", "y_mm", "z_mm"]
-    header += [f"q{number}_deg" for number in range(1, 7)] if joints else []
+    header += JOINTS_DEG if joints else []
     labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)
     numbers = points.points if points.joints is None else np.hstack([points.points, np.degrees(points.joints)])
     rows = [[*label, *map(repr, row)] for label, row in zip(labels, numbers.tolist(), strict=True)]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import decode_text
-from puncture_twin.planning.formats.points.joint_columns import JOINT_COLUMNS, joints_deg
+from puncture_twin.planning.formats.joint_readings import JOINTS_DEG, row_numbers
 from puncture_twin.planning.formats.points.raw_points import RawPoints, parse_coordinate
 from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.units import Unit, parse_unit
@@ -57,7 +57,9 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
         unit=unit,
         space=None,
         kinds=tuple(f[columns["kind"]].strip() for _, f in rows[1:]) if "kind" in columns else None,
-        joints_deg=[joints_deg(fields, header, f"{where}, line {line}") for line, fields in rows[1:]]
+        joints_deg=[
+            tuple(row_numbers(fields, header, JOINTS_DEG, f"{where}, line {line}")) for line, fields in rows[1:]
+        ]
         if "q1" in columns
         else None,
     )
@@ -80,11 +82,11 @@ def _unit(header: list[str], where: str) -> Unit | None:
         axis = re.fullmatch(r"([xyz])(?:_(\w+))?", name)
         if axis:
             units[axis[1]] = axis[2] or ""
-        elif name not in ("name", "kind", *JOINT_COLUMNS):
+        elif name not in ("name", "kind", *JOINTS_DEG):
             refuse(f"column {name[:40]!r}", f"{where}, header", _ALLOWED)
     if len(set(header)) != len(header) or sorted(units) != ["x", "y", "z"] or "name" not in header:
         refuse(f"columns {header}", f"{where}, header", _ALLOWED)
-    joints = sum(name in JOINT_COLUMNS for name in header)
+    joints = sum(name in JOINTS_DEG for name in header)
     if joints not in (0, 6) or len(header) != 4 + ("kind" in header) + joints:  # such as x_mm beside x_m
         refuse(f"columns {header}", f"{where}, header", _ALLOWED)
     if len(set(units.values())) != 1:

@@ -18,6 +18,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.residual_test import MAX_FRE_MM
 
 MAX_NUMBERS = 20_000_000
 """Of one table of beginnings (160 MB): sets that are more alike than that are tested for swaps of two names only."""
@@ -147,3 +148,30 @@ def angle_between(T: Floats, T_other: Floats) -> float:
     """The angle between two poses, rad."""
     cosine = (np.trace(T[:3, :3] @ T_other[:3, :3].T) - 1) / 2
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+BETTER = 3.0
+"""So many times better than the given names a permutation must fit to be named."""
+
+SHOWN = 3
+"""Permutations that a message lists."""
+
+
+def better_names(markers: MarkerPairs, target_ct: Floats, fre_mm: float) -> str:
+    """All permutations of the names that fit where the given ones do not, the best first; empty for none.
+
+    Args:
+        markers: As the user named them.
+        target_ct: Shape (3,), mm.
+        fre_mm: Of their rigid fit.
+    """
+    found = renamings(markers, target_ct, min(fre_mm / BETTER, MAX_FRE_MM), moving_mm=0.0).found
+    if not found:
+        return ""
+    best = sorted(found, key=lambda one: one.fre_mm)
+    more = f" (and {len(best) - SHOWN} more)" if len(best) > SHOWN else ""
+    return f"; {', or '.join(_text(one) for one in best[:SHOWN])}{more}"
+
+
+def _text(one: Renaming) -> str:
+    return f"with {one.slip} they would fit (FRE {one.fre_mm:.2f} mm)"

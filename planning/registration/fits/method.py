@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
-from puncture_twin.planning.registration.fits.weighted import fit_joint, fit_weighted
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.fits.least_squares import (
+    _least_squares,
+    fit_joint,
+    fit_rigid,
+    fit_triad,
+    fit_weighted,
+)
+from puncture_twin.planning.registration.fits.marker_ambiguity import better_names
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 
@@ -68,6 +75,8 @@ def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path)
             where=where,
             allowed="triad, rigid or weighted; affine only reproduces the paper's Table 6",
         )
+    if method not in get_args(Method):
+        raise InputError(f"method {method!r}", where=where, allowed=", ".join(get_args(Method)), code="method")
     if method in WEIGHING and noise is None:
         raise InputError(
             f"method '{method}' weighs by declared errors", where=where, allowed="[errors], or method rigid"
@@ -87,3 +96,46 @@ def _check_noise(
     if found_in_mm is not None and found_in_mm < LEAST_FOUND_MM:
         message = f"marker_noise = 'found', but the residuals ({found_in_mm:.2g} mm) hold none"
         raise InputError(message, where=where, allowed="markers measured on both sides, or marker_noise = 'declared'")
+
+
+MAX_RESIDUAL_MM = 15.0
+"""A marker that misses by more was swapped, moved or typed wrongly: the paper's worst set misses by 7 mm."""
+
+MIRROR_GAIN = 2.0
+"""A mirrored fit that is better than the proper one by this factor (and 1 mm) says that one side is mirrored."""
+
+
+def _rms(residuals: Floats) -> float:
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+
+
+def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, where: str | Path) -> None:
+    """Refuse a fit that is far better mirrored, or that a marker misses by far.
+
+    Args:
+        markers: As fitted.
+        residuals: Shape (n, 3), mm.
+        target_ct: Shape (3,), mm.
+        where: What errors name.
+
+    Raises:
+        InputError: Naming the markers, and the permutations of their names that would fit.
+    """
+    mirrored = _least_squares(markers.points_ct, markers.points_base, mirrored=True)
+    best = _rms(apply(mirrored, markers.points_ct) - markers.points_base)
+    if _rms(residuals) > MIRROR_GAIN * best + 1.0:
+        raise InputError(
+            f"markers {', '.join(markers.names)} match only mirrored (rms {best:.2f} mm against "
+            f"{_rms(residuals):.2f} mm){better_names(markers, target_ct, _rms(residuals))}",
+            where=where,
+            allowed="both sides right-handed: check LPS/RAS and the marker names",
+        )
+    lengths = np.linalg.norm(residuals, axis=1)
+    worst = int(np.argmax(lengths))
+    if lengths[worst] > MAX_RESIDUAL_MM:
+        raise InputError(
+            f"marker {markers.names[worst]} misses by {lengths[worst]:.1f} mm: swapped, moved or mistyped"
+            f"{better_names(markers, target_ct, _rms(residuals))}",
+            where=where,
+            allowed=f"residuals up to {MAX_RESIDUAL_MM:g} mm",
+        )

@@ -7,7 +7,7 @@ import pytest
 from places import ROOT
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.arm.erring_arm import ErringArm
+from puncture_twin.planning.arm.error_jacobian import ErringArm
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model

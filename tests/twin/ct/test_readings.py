@@ -12,8 +12,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points.point_files import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
-from puncture_twin.twin.guidance.ct.lesion import read_lesion
-from puncture_twin.twin.guidance.ct.markers import find_markers
+from puncture_twin.twin.guidance.ct.markers import find_markers, read_lesion
 from puncture_twin.twin.guidance.ct.needle import find_needle, needle_error
 from puncture_twin.twin.plant.scanner.image import ScanSettings, scan_solids
 from puncture_twin.twin.plant.scanner.solids import Solid, ball, box, rod

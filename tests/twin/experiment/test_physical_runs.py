@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from puncture_twin.twin.jobs.experiment import physical_runs as module
-from puncture_twin.twin.jobs.experiment.drawn_runs import DrawnRuns
-from puncture_twin.twin.jobs.experiment.physical_runs import FOLDER, PhysicalRun, PhysicalRuns, physical_runs
+from puncture_twin.twin.jobs.experiment.physical_runs import FOLDER, DrawnRuns, PhysicalRun, PhysicalRuns, physical_runs
 from puncture_twin.twin.jobs.experiment.touch_job import TouchedOnce
 from puncture_twin.twin.rehearsal.touching import Touched
 

@@ -32,8 +32,7 @@ from puncture_twin.planning.needle.deflection import Bending
 from puncture_twin.planning.needle.shaft import Shaft
 from puncture_twin.planning.needle.tissue import Tissue
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.registration.touch_noise import reading_noise
-from puncture_twin.planning.registration.touch_poses import touching_configuration
+from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.distribution import bend_along
 from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, plan_truth, spread_rows

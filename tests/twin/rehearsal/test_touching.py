@@ -26,8 +26,7 @@ from puncture_twin.planning.plan.plan_check import check_angles, check_geometry
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.selection.choice import Choice
-from puncture_twin.planning.touch.puncture import plan_puncture
-from puncture_twin.planning.touch.straight_approach import line_to
+from puncture_twin.planning.touch.straight_approach import line_to, plan_puncture
 from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers, plan_touches, registered
 from puncture_twin.run_twin import app
 from puncture_twin.twin.jobs.experiment import touch_job

@@ -10,16 +10,17 @@ from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import direction_from_plane, mean_direction
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, covariances
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     direction_residuals,
     directions_image,
     linearised_direction,
+    linearised_tip,
+    tip_residuals,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import linearised_tip, tip_residuals
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, PoseRanges, simulate_recording, with_noise
 
 ALL = active_columns(tip=True, scale=False, direction=False)

@@ -7,8 +7,13 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.ultrasound.image.line_search import brightest_segment
-from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, DetectorSettings, Missed, detect
+from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
+    Detection,
+    DetectorSettings,
+    Missed,
+    brightest_segment,
+    detect,
+)
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleInImage, render
 
 IMAGER = Imager()

@@ -13,19 +13,18 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import arm_errors, corrected, without_play
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import PLAY_SIGN, calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.fitted import weighed
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.found_spreads import found_spreads
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers.robust import plain_fit
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import found_spreads
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, flange_slopes, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Whitening, weighed
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     direction_residuals,
     directions_image,
+    tip_residuals,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import tip_residuals
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.whitening import Whitening
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import drawing
+from puncture_twin.twin.guidance.ultrasound.pose_choice import drawing
 from puncture_twin.twin.guidance.ultrasound.puncture import aim
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording

@@ -8,11 +8,15 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, observe, scaled_jacobian
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import (
+    LEAST_RATIO,
+    Degenerate,
+    observe,
+    scaled_jacobian,
+)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import tip_residuals
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import Degenerate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.simulate import (
     SPEC_NOISE,
     PoseRanges,

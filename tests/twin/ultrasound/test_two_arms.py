@@ -11,14 +11,15 @@ from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.geometry.winding import winding_number
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import (
+from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
+from puncture_twin.twin.guidance.ultrasound.pose_choice import (
+    choose_poses,
     configurations,
     draw_geometry,
     drawing,
+    expected_tre_mm,
     find_candidates,
 )
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
-from puncture_twin.twin.guidance.ultrasound.pose_choice import choose_poses, expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE

@@ -6,14 +6,16 @@ from scipy import stats
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import (
+    RAYLEIGH_SNR,
     Imager,
     Lesion,
     NeedleEcho,
     NeedleInImage,
+    PointSpread,
+    blurred_speckle,
     needle_signal,
     render,
 )
-from puncture_twin.twin.guidance.ultrasound.image.speckle import RAYLEIGH_SNR, PointSpread, blurred_speckle
 
 IMAGER = Imager()
 PLAIN = NeedleEcho(roughness=0.0, tip_gain=1.0, reverberations=0, steep_loss_db=0.0)

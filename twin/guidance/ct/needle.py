@@ -13,7 +13,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.ct.metal import (
+from puncture_twin.twin.guidance.ct.markers import (
     AROUND_MM,
     METAL_HU,
     Metal,

@@ -14,10 +14,9 @@ from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, Missed, detect
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage, render
-from puncture_twin.twin.guidance.ultrasound.pose_choice import choose_poses
+from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, choose_poses, drawing
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth, jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE

@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder
 from puncture_twin.planning.base.input_file import decode_text, read_input
-from puncture_twin.planning.formats.points.raw_points import parse_coordinate
+from puncture_twin.planning.formats.joint_readings import joint_readings, row_numbers
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
@@ -68,20 +68,25 @@ def parse_recording(content: bytes, file: Path) -> Recording:
             allowed=", ".join(columns(False, (3, 1), 24)),
         )
     pixels, (width, shaft), behind = KINDS[header]
-    values = np.array([row_numbers(row, header, f"{file}, row {i}") for i, row in enumerate(rows[1:], start=2)])
+    places = (f"{file}, row {i}" for i in range(2, len(rows) + 1))
+    values = np.array([row_numbers(row, header, header[1:], at) for row, at in zip(rows[1:], places, strict=True)])
     if values.size == 0:
         raise InputError("no pose", where=file, allowed="one row per pose")
     names = tuple(row[0].strip() for row in rows[1:])
     try:
         first = 26 + width + shaft
         v, shaft_mm = values[:, 26 : 26 + width] if width else None, values[:, first - 1] if shaft else None
-        q_probe, q_needle = np.radians(np.split(values[:, first : first + 12], 2, axis=1)) if behind else (None, None)
+        q_probe, q_needle = None, None
+        if behind:
+            parts = np.split(values[:, first : first + 12], 2, axis=1)
+            q_probe, q_needle = (joint_readings(part, "deg", where="joints", names=names) for part in parts)
         turn_probe, turn_needle = np.split(values[:, first + 12 :], 2, axis=1) if behind == 24 else (None, None)
         A, B = (pose(part[:, :9].reshape(-1, 3, 3), part[:, 9:]) for part in (values[:, :12], values[:, 12:24]))
         joints = (q_probe, q_needle, turn_probe, turn_needle)
         return Recording(A, B, values[:, 24:26], v, names, pixels, *joints, shaft_mm)
     except InputError as error:
-        raise InputError(error.what, where=f"{file}: {error.where}", allowed=error.allowed) from error
+        where = f"{file}: {error.where}"
+        raise InputError(error.what, where=where, allowed=error.allowed, code=error.code) from error
 
 
 def write_recording(recording: Recording, path: Path) -> None:
@@ -106,17 +111,6 @@ def write_recording(recording: Recording, path: Path) -> None:
 
 def _row_major(T: Floats) -> Floats:
     return np.column_stack([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]])
-
-
-def row_numbers(row: list[str], header: tuple[str, ...], where: str) -> list[float]:
-    """The numbers behind the name of one row, as many as the header has columns.
-
-    Raises:
-        InputError: More or fewer fields, or one that is no finite number.
-    """
-    if len(row) != len(header):
-        raise InputError(f"{len(row)} fields", where=where, allowed=f"{len(header)} fields, as in the header")
-    return [parse_coordinate(cell, f"{where}, {name}") for name, cell in zip(header[1:], row[1:], strict=True)]
 
 
 def columns(pixels: bool, direction: tuple[int, int], behind: int) -> tuple[str, ...]:

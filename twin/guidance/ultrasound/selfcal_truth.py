@@ -10,8 +10,8 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import needle_flange
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
+from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_flange
 
 JOG_STEPS = 4
 """Of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""

@@ -19,13 +19,21 @@ from puncture_twin.planning.geometry.rigid import inverse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.calibrate_case import calibrate_case
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
+
+
+def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:
+    """Calibrate with what the case says of noise and needle; pixels are solved for where the recording has them."""
+    noise = None if case is None or case.content.noise is None else case.content.noise.noise()
+    length = case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
+    arms = None if case is None or recording.q_probe is None else case.declared_arms
+    return calibrate(recording, noise=noise, needle_length_mm=length, scale=recording.pixels, arms=arms)
+
 
 Reading = Callable[[Recording], Recording]
 
 SUSPECT_MM = 1.5
-"""Residuals (rms) from which on other readings are tried: three times those of a usual recording."""
+"""Residuals (rms) from which on other readings are tried: three times the usual ones."""
 
 SOUND_MM = 5.0
 """Residuals (rms) beyond which nothing was calibrated, whatever the reason."""
@@ -53,8 +61,12 @@ def checked_calibration(recording: Recording, case: SelfcalCase | None, where: P
     _check_reach(recording, where)
     try:
         found = calibrate_case(recording, case)
-    except InputError:
-        _refuse_slip(recording, np.inf, where)
+    except InputError as error:
+        rms_mm = _residual_mm(lambda r: _read(r, r.A, r.B, r.P), recording)
+        if rms_mm > SUSPECT_MM:
+            _refuse_slip(recording, rms_mm, where)
+        if error.code:
+            raise InputError(error.what, where=where, allowed=error.allowed, code=error.code) from error
         raise
     if found.rms_mm > SUSPECT_MM:
         _refuse_slip(recording, found.rms_mm, where)

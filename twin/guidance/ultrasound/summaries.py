@@ -2,15 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, expected_error_mm
-from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
+from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth
+
+
+@dataclass(frozen=True, eq=False)
+class SelfcalTrial:
+    """One seed in the twin: a room, its recording, its calibration, and what came of it.
+
+    Attributes:
+        seed: Of this trial.
+        truth: The room.
+        acquisition: What was recorded.
+        calibration: What was found.
+        unseen_mm: Predicted minus true tip at poses that were not recorded, shape (k,).
+        punctures: One per target.
+    """
+
+    seed: int
+    truth: WorkcellTruth
+    acquisition: Acquisition
+    calibration: Calibration
+    unseen_mm: Floats
+    punctures: tuple[Puncture, ...]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What choosing poses is worth, by the Cramer-Rao bound over all candidates, mm."""
+
+    chosen_mm: float
+    random_mm: tuple[float, ...]
+    """Of random choices of as many poses."""
+
+    @property
+    def median_random_mm(self) -> float:
+        """Median of the random ones."""
+        return float(np.median(self.random_mm))
 
 
 def calibration_summary(found: Calibration, recording: Recording) -> dict[str, Any]:
@@ -24,6 +61,7 @@ def calibration_summary(found: Calibration, recording: Recording) -> dict[str, A
         "poses": len(recording),
         "residual_rms_mm": found.rms_mm,
         "set_aside": list(found.outliers),
+        "findings": [one.document() for one in found.findings],
         "iterations": found.iterations,
         "condition": found.condition,
         "noise": noise_summary(found),
@@ -65,10 +103,10 @@ def arms_summary(found: Calibration) -> dict[str, Any] | None:
 
 
 def predicted_tre(found: Calibration, recording: Recording) -> float:
-    """Expected (rms) error at the recorded tips, from the calibration, and from the arms where declared, mm."""
-    if found.arms is not None:
-        return expected_error_mm(found, recording)
-    return float(np.sqrt(np.mean(found.predicted_tre_mm(recording.P, recording.A) ** 2)))
+    """Expected (rms) error at the recorded tips, mm: from the calibration, the declared arms, an image that errs."""
+    known = _rms(found.predicted_tre_mm(recording.P, recording.A)) if found.arms is None else None
+    image_mm = found.image.rms_mm if found.image is not None and found.image.doubted else 0.0
+    return float(np.hypot(expected_error_mm(found, recording) if known is None else known, image_mm))
 
 
 def choice_summary(choice: Choice) -> dict[str, Any]:

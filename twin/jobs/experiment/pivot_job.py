@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.stated_arm import check_recording
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
+from puncture_twin.planning.formats.joint_readings import parse_joint_recording
+from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES
 from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, check_one_place, pivot_calibration
 
 STANDS_OUT = 2.0
@@ -60,17 +62,16 @@ def pivot_case(case: Case, joints: Path) -> PivotRun:
 
     Args:
         case: For the arm and the declared errors.
-        joints: CSV as `pivot CASE` writes it: a line a pose, with q1_deg to q6_deg.
+        joints: CSV, a line a pose, with q1_deg to q6_deg alone or among other columns, as `pivot CASE` writes it.
 
     Raises:
         InputError: The case declares no errors, or the list has no joints, too few, too much alike, or of several
             places.
     """
     data = read_input(joints, max_bytes=MAX_FILE_BYTES, where=str(joints))
-    read = parse_points(data, joints)
-    if read.joints is None:
-        raise InputError("no joints", where=joints, allowed="columns q1_deg to q6_deg beside name,x_mm,y_mm,z_mm")
-    pivot = calibrated(case, read.names, read.joints, where=str(joints))
+    read = parse_joint_recording(data, joints, timed=False)
+    check_recording(case.robot.model, case.needle.length_mm, read, where=joints)
+    pivot = calibrated(case, read.names, read.q, where=str(joints))
     inputs = (content_input("joints", joints.name, data), *case.inputs)
     return PivotRun(case, pivot, read.names, inputs)
 

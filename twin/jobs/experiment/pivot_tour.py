@@ -17,8 +17,8 @@ from puncture_twin.planning.formats.points.point_files import NamedPoints, write
 from puncture_twin.planning.formats.points.raw_points import parse_coordinate
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.pivot_planner import LEAST_POSES, MOST_POSES, plan_pivot
-from puncture_twin.planning.touch.touch_plan import TouchTour
 from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers
+from puncture_twin.planning.touch.tour_motions import TouchTour
 from puncture_twin.twin.jobs.experiment.pivot_job import PivotRun, calibrated, pivot_text
 from puncture_twin.twin.jobs.experiment.result_file import write_result
 from puncture_twin.twin.plant.touch_truth import TouchTruth, draw_pivot_truth

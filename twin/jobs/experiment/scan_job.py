@@ -21,9 +21,7 @@ from puncture_twin.planning.formats.points.point_files import write_points
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.twin.guidance.ct.lesion import read_lesion
-from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_markers
-from puncture_twin.twin.guidance.ct.metal import METAL_HU
+from puncture_twin.twin.guidance.ct.markers import METAL_HU, READING_MM, Markers, find_markers, read_lesion
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
 from puncture_twin.twin.jobs.experiment.result_file import write_result
 from puncture_twin.twin.jobs.experiment.scan_beside import beside_summary, write_beside

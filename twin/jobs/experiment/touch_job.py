@@ -20,8 +20,7 @@ from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles
-from puncture_twin.planning.touch.puncture import registered_joints
-from puncture_twin.planning.touch.touch_plan import TouchPlan
+from puncture_twin.planning.touch.straight_approach import registered_joints
 from puncture_twin.planning.touch.touch_planner import (
     TOUCHING_PADDING_MM,
     approach_checkers,
@@ -29,6 +28,7 @@ from puncture_twin.planning.touch.touch_planner import (
     plan_touches,
     registered,
 )
+from puncture_twin.planning.touch.tour_motions import TouchPlan
 from puncture_twin.twin.jobs.experiment.result_file import write_result
 from puncture_twin.twin.plant.touch_truth import AtTarget, TouchTruth, draw_at_target, draw_touch_truth, nominal_tip
 from puncture_twin.twin.plant.true_needle import true_needle

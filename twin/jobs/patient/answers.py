@@ -28,7 +28,6 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.advice import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
-from puncture_twin.planning.registration.checks.squareness import Squareness, check_squareness
 from puncture_twin.planning.registration.checks.touching import touchable_points
 from puncture_twin.planning.registration.fits.least_squares import rigid_fre_mm
 from puncture_twin.planning.registration.fits.method import LEAST_FOUND_MM
@@ -104,7 +103,6 @@ def registration_report(path: Path) -> dict[str, Any]:
     report |= one_insertion(registration, case.target_ct, read)
     report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
     report["warnings"] = [*case.warnings, *checked.findings.warnings, *_branch_warning(case, registration)]
-    report["squareness"] = _squareness(check_squareness(registration, case.target_ct))
     report |= _advice(case, registration)
     report["notes"] = list(checked.findings.notes)
     return report
@@ -141,7 +139,6 @@ def lists_report(
     report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(target_ct))
     report |= one_insertion(registration, target_ct, None)
     report["expected_tre_along_shaft_mm"] = []
-    report["squareness"] = _squareness(check_squareness(registration, target_ct))
     report |= _advice_of_lists(registration, target_ct, space)
     report["warnings"] = []
     report["notes"] = ["two lists alone: neither skin nor couch was asked whether axes or names have slipped"]
@@ -211,20 +208,6 @@ def _without(registration: Registration, target_ct: Floats) -> dict[str, Any]:
     return {
         one.name: {"rms_mm": one.rms_mm, "probability": one.probability}
         for one in without_each(registration, target_ct)
-    }
-
-
-def _squareness(found: Squareness | None) -> dict[str, Any] | None:
-    if found is None:
-        return None
-    return {
-        "axes": list(found.axes),
-        "angle_deg": float(np.degrees(found.angle)),
-        "probability": found.probability,
-        "expected_mm": found.rms_mm,
-        "expected_if_square_mm": found.rms_square_mm,
-        "doubted": found.doubted,
-        "text": found.text(),
     }
 
 

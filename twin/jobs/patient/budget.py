@@ -15,7 +15,7 @@ from puncture_twin.planning.budget.what_if import Change, best_change, changes, 
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-from puncture_twin.planning.registration.reached_insertion import reached_insertion
+from puncture_twin.planning.registration.aim import reached_insertion
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.registration.residual_test import INTERVAL
 from puncture_twin.planning.uncertainty.hit import radius_that_holds

@@ -8,6 +8,7 @@ import numpy as np
 
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.registration.fits.distortion import Distortion
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import finite
@@ -38,8 +39,13 @@ def registration_summary(registration: Registration) -> dict[str, Any]:
         "spread_ratio": registration.conditioning.spread_ratio,
         "altitude_mm": registration.conditioning.altitude_mm,
         "leverage": registration.conditioning.leverage,
+        "distortion": _distortion(registration.distortion),
         "flags": list(registration.flags),
     }
+
+
+def _distortion(found: Distortion | None) -> dict[str, Any] | None:
+    return None if found is None else {**vars(found), "doubted": found.doubted, "text": found.text()}
 
 
 def _declared(registration: Registration) -> dict[str, Any]:

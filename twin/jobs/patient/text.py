@@ -244,8 +244,6 @@ def registration_text(report: dict[str, Any]) -> str:
         f"TRE/FLE {report['leverage']:.2f}",
     ]
     lines += _declared_lines(report)
-    if report["squareness"] is not None and report["squareness"]["doubted"]:
-        lines.append(f"  check: {report['squareness']['text']}")
     for kind, key in (("weak", "flags"), ("warning", "warnings"), ("note", "notes")):
         lines += [f"  {kind}: {sentence}" for sentence in report[key]]
     return "\n".join(lines)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import socket
 import time
 from collections.abc import Iterable, Iterator
@@ -13,18 +12,17 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.stated_arm import check_recording
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import decode_text, read_input, unfinished_warnings
+from puncture_twin.planning.base.input_file import read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.formats.joint_readings import joint_readings, parse_joint_recording
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.twin.jobs.extras import require_extra
-
-JOINT_COLUMNS = tuple(f"q{joint}_rad" for joint in range(1, 7))
-"""Of a recording, beside ``time_s``: the columns that ``export --format csv`` writes."""
 
 MAX_RECORDING_BYTES = 200_000_000
 """An hour at 125 states a second is 60 MB."""
@@ -167,7 +165,7 @@ def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -
     """
     start, last, heard = None, 0.0, time.monotonic()
     while True:
-        state = checked(receiver.getTimestamp(), receiver.getActualQ(), "the robot's answer")
+        state = told(receiver.getTimestamp(), receiver.getActualQ())
         if state.time_s != last:
             start = state.time_s if start is None else start
             last, heard = state.time_s, time.monotonic()
@@ -183,7 +181,7 @@ def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -
 
 @dataclass(frozen=True, eq=False)
 class RecordedJoints:
-    """A recording: CSV with ``time_s`` and ``q1_rad`` .. ``q6_rad``; other columns and lines with # do not count."""
+    """A recording of an arm: CSV with times and joints, as ``export --format csv`` or an RTDE client writes it."""
 
     path: Path
     data: bytes
@@ -202,47 +200,31 @@ class RecordedJoints:
         """As an input of what is shown."""
         return content_input("recording", self.path.name, self.data)
 
-    def states(self) -> Iterator[RecordedState]:
-        """One row after the other.
+    def states(self, case: Case | None = None) -> Iterator[RecordedState]:
+        """One row after the other; nothing before all are read.
+
+        Args:
+            case: Whose arm they are to be of, where the controller's own pose is recorded beside them.
 
         Raises:
-            InputError: A column is missing, or something is no number.
+            InputError: A column is missing, something is no number, or no such arm has them.
         """
-        lines = decode_text(self.data, str(self.path)).splitlines()
-        table = csv.DictReader((line for line in lines if line.strip() and not line.startswith("#")), strict=True)
-        try:
-            yield from _states(table, self.path)
-        except csv.Error as error:
-            raise InputError(f"is no CSV ({error})", where=self.path, allowed="a CSV of joint angles") from error
+        read = parse_joint_recording(self.data, self.path, timed=True)
+        assert read.time_s is not None
+        if case is not None:
+            check_recording(case.robot.model, case.needle.length_mm, read, where=self.path)
+        return map(RecordedState, read.time_s.tolist(), read.q)
 
     def warnings(self) -> tuple[str, ...]:
         """What the recording's end leaves open, one sentence each."""
         return unfinished_warnings(self.data, self.path.name)
 
 
-def _states(table: csv.DictReader[str], path: Path) -> Iterator[RecordedState]:
-    wanted = ("time_s", *JOINT_COLUMNS)
-    missing = [name for name in wanted if name not in (table.fieldnames or ())]
-    if missing:
-        raise InputError(f"lacks {', '.join(missing)}", where=path, allowed=", ".join(wanted))
-    for number, row in enumerate(table, start=1):
-        try:
-            t, *q = (float(row[name]) for name in wanted)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"row {number} holds no number", where=path, allowed="numbers: s and rad") from error
-        yield checked(t, q, f"{path}: row {number}")
-
-
-def checked(time_s: float, q: list[float], where: str) -> RecordedState:
-    """Joint angles that are six finite numbers.
-
-    Raises:
-        InputError: They are not.
-    """
-    angles = np.asarray(q, dtype=np.float64)
-    if angles.shape != (6,) or not np.isfinite(angles).all() or not np.isfinite(time_s):
-        raise InputError(f"joint angles {q} at {time_s} s", where=where, allowed="a time and six finite angles, rad")
-    return RecordedState(float(time_s), angles)
+def told(time_s: float, q: list[float]) -> RecordedState:
+    """A controller's word, if it is a time and six angles that an arm can have; else an `InputError`."""
+    if not np.isfinite(time_s):
+        raise InputError(f"a time of {time_s} s", where="the robot's answer", allowed="a finite time")
+    return RecordedState(float(time_s), joint_readings([q], "rad", where="the robot's answer")[0])
 
 
 def mirror_text(shown: Mirrored) -> str:

@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detecti
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, puncture_picture
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.trial import SelfcalTrial
+from puncture_twin.twin.guidance.ultrasound.summaries import SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import head_pose, needle_tool, phantom_mesh, probe_tool, table_box
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.annotate import width_of, write

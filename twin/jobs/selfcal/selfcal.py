@@ -17,15 +17,13 @@ from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, acqu
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.calibrate_case import calibrate_case
-from puncture_twin.twin.guidance.ultrasound.candidate_poses import CandidatePoses, drawing, find_candidates
-from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
+from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, drawing, expected_tre_mm, find_candidates
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
 from puncture_twin.twin.guidance.ultrasound.recording_file import MAX_BYTES, parse_recording, recording_file
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth
-from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
-from puncture_twin.twin.guidance.ultrasound.trial import Choice, SelfcalTrial
+from puncture_twin.twin.guidance.ultrasound.slips import calibrate_case, checked_calibration
+from puncture_twin.twin.guidance.ultrasound.summaries import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 from puncture_twin.twin.plant.true_arm import ArmErrors, draw_true_arm
 
@@ -109,7 +107,7 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
         candidates,
         choice,
         stages,
-        warnings=first.calibration.declaration_doubts(),
+        warnings=first.calibration.doubts(),
     )
 
 
@@ -128,7 +126,7 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     with stages.time("calibrate"):
         calibration = checked_calibration(recording, case, file)
     inputs = (content_input("recording", file.name, content), *(() if case is None else case.inputs))
-    warnings = (*unfinished_warnings(content, file.name), *calibration.declaration_doubts())
+    warnings = (*unfinished_warnings(content, file.name), *calibration.doubts())
     if case is not None and calibration.arms is None:
         warnings += (NO_JOINTS.format(file=file.name),)
     return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings)

@@ -1,10 +1,39 @@
-"""What ``selfcal`` prints for a person."""
+"""What ``selfcal`` found, as one table of plain values (``--json`` and the page read nothing else), and as text."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
-from puncture_twin.twin.jobs.selfcal.facts import Facts
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.twin.guidance.ultrasound.summaries import (
+    calibration_summary,
+    choice_summary,
+    puncture_summary,
+    trial_summary,
+)
+from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
+
+Facts = Mapping[str, Any]
+"""What `selfcal_facts` returns: mm and degrees."""
+
+
+def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
+    """Poses, calibration, trials, punctures, and what was written."""
+    return {
+        **calibration_summary(run.calibration, run.recording),
+        "name": run.name,
+        "inputs": inputs_document(run.inputs),
+        "candidates": None if run.candidates is None else run.candidates.counts,
+        "choice": None if run.choice is None else choice_summary(run.choice),
+        "trials": [trial_summary(trial) for trial in run.trials],
+        "punctures": puncture_summary(run.punctures),
+        "seconds": {stage: round(seconds, 3) for stage, seconds in run.stages.seconds.items()},
+        "files": [str(path) for path in run.files],
+        "warnings": list(run.warnings),
+    }
+
 
 REASON_TEXT = MappingProxyType(
     {
@@ -67,6 +96,7 @@ def _calibration(facts: Facts) -> list[str]:
         lines.append("  chi-squared over freedom {chi2_per_freedom:.2f}".format(**facts["arms"]))
     if facts["set_aside"]:
         lines.append(f"  set aside: {', '.join(facts['set_aside'])}")
+    lines += [f"  note: {one['sentence']}" for one in facts["findings"] if one["severity"] == "note"]
     return lines + [f"  cannot be shown: {line}" for line in facts["cannot_show"]]
 
 

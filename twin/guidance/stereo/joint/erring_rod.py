@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.erring_arm import erring_arm
-from puncture_twin.planning.arm.error_jacobian import FREE_D, PARAMETERS
+from puncture_twin.planning.arm.error_jacobian import FREE_D, PARAMETERS, erring_arm
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod
 

@@ -22,11 +22,11 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
-from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.stated_arm import check_flanges
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
+from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 N_ARM = PARAMETERS["joint"].stop
@@ -34,9 +34,6 @@ N_ARM = PARAMETERS["joint"].stop
 
 PLAY_KNOWN = 0.25
 """Standard deviation of each joint's play, over the declared one."""
-
-FAR_MM, FAR_RAD = 20.0, float(np.radians(3.0))
-"""A recorded flange that is farther from what the joints give belongs to another arm, or is no flange."""
 
 
 class DeclaredArm(NamedTuple):
@@ -128,8 +125,9 @@ def arm_errors(declared: DeclaredArms, recording: Recording) -> ArmErrors:
     q_probe, q_needle = recording.q_probe, recording.q_needle
     if q_probe is None or q_needle is None:
         raise InputError("the arms' errors need the joints", where="recording", allowed="columns A_q1_deg to B_q6_deg")
-    _check_joints(declared.probe.model, q_probe, recording.A, "A", recording.names)
-    _check_joints(declared.needle.model, q_needle, recording.B, "B", recording.names)
+    for arm, q, T, of in ((declared.probe, q_probe, recording.A, "A"), (declared.needle, q_needle, recording.B, "B")):
+        names = [f"{of} in pose {name}" for name in recording.names]
+        check_flanges(arm.model, q, T, names=names, where="recording")
     unknown = np.zeros(q_probe.shape)
     turn_probe = unknown if recording.turn_probe is None else recording.turn_probe
     turn_needle = unknown if recording.turn_needle is None else recording.turn_needle
@@ -154,17 +152,3 @@ def corrected(T_base_flange: Floats, motion: Floats) -> Floats:
 def without_play(recording: Recording, errors: ArmErrors) -> Recording:
     """The recording with its flanges where the declared play leaves them."""
     return replace(recording, A=corrected(recording.A, errors.probe_play), B=corrected(recording.B, errors.needle_play))
-
-
-def _check_joints(model: UrModel, q: Floats, T: Floats, name: str, poses: tuple[str, ...]) -> None:
-    nominal = flange_pose(model, q)
-    shift = np.linalg.norm(nominal[:, :3, 3] - T[:, :3, 3], axis=1)
-    turn = np.linalg.norm(log_rotation(nominal[:, :3, :3].transpose(0, 2, 1) @ T[:, :3, :3]), axis=1)
-    bad = (shift > FAR_MM) | (turn > FAR_RAD)
-    if bad.any():
-        row = int(np.argmax(bad))
-        what = (
-            f"joints of {name} in pose {poses[row]}: a {model.name} with them has its flange {shift[row]:.3g} mm and "
-            f"{np.degrees(turn[row]):.2g} deg from {name}"
-        )
-        raise InputError(what, where="recording", allowed=f"flanges within {FAR_MM:g} mm and 3 deg of their joints")

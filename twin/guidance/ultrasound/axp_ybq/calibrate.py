@@ -7,24 +7,25 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import (
+    Calibration,
+    calibration_of,
+    with_length,
+)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import needle_direction
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.found_spreads import refitted
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers.robust import plain_fit, robust_fit
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import DIRECTION, active_columns
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, needle_direction
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import refitted
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability, require_observable
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit, robust_fit
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, Spread
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.solution import Solution, assembled, solution_of, with_length
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.suggested_poses import require_observable
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit
 
 SHAFT_BIAS = (
     "a constant error of the detected tip along the shaft moves the tip in the needle's flange frame and leaves every "
     "residual as it is; the known needle length would hold it"
 )
-
-SCALE_TAKEN = "the image's mm per pixel was taken as given: 1 % off makes the error at the tip half as large again"
 
 ARMS_TAKEN = (
     "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared with the joints, so "
@@ -77,25 +78,21 @@ def calibrate(
     """
     if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
         raise InputError(f"needle length {needle_length_mm}", where="needle_length_mm", allowed="a positive number, mm")
-    solution = _solve(
-        recording,
-        noise=noise,
-        known_tip=known_tip,
-        scale=scale,
-        robust=robust,
-        direction=direction,
-        start=start,
-        arms=arms,
-    )
-    bias = None
-    if needle_length_mm is not None and known_tip is None:
-        bias = float(solution.estimate.V @ solution.estimate.t_Q) - needle_length_mm
-        solution = with_length(solution, bias)
-    cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None) + [SCALE_TAKEN] * (not scale)
+    _check(recording, known_tip, scale, start)
+    errors = None if arms is None else arm_errors(arms, recording)
+    poses = recording if errors is None else without_play(recording, errors)
+    estimate = start or closed_form(poses, known_tip=known_tip, scale=scale)
+    if start is not None and known_tip is not None:
+        estimate = estimate._replace(t_Q=np.asarray(known_tip, dtype=np.float64))
+    active = active_columns(tip=known_tip is None, scale=scale, direction=False)
+    problem = Problem(poses, noise or UNWEIGHTED, active, arms=errors)
+    solved = _solve(problem, estimate, robust=robust, direction=direction and recording.v is not None)
+    cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None)
     cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
     if arms is not None and recording.turn_probe is None and any(arm.play_rad > 0.0 for arm in arms):
         cannot.append(PLAY_SIGN)
-    return assembled(recording, solution, bias, tuple(cannot), arms)
+    found = calibration_of(*solved, tuple(cannot), arms)
+    return found if needle_length_mm is None or known_tip is not None else with_length(found, needle_length_mm)
 
 
 def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: Estimate | None) -> None:
@@ -112,41 +109,29 @@ def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: E
 
 
 def _solve(
-    recording: Recording,
-    *,
-    noise: Noise | None,
-    known_tip: Floats | None,
-    scale: bool,
-    robust: bool,
-    direction: bool,
-    start: Estimate | None,
-    arms: DeclaredArms | None = None,
-) -> Solution:
-    """The unknowns of a recording; the arguments are those of `calibrate`.
+    problem: Problem, start: Estimate, *, robust: bool, direction: bool
+) -> tuple[Problem, RobustFit, Observability, SeenDirection]:
+    """The tips' fit, then that with the directions and the noise that was found, where they take part.
 
     Raises:
-        InputError: Too few poses, pixels without scale, or most poses disagree.
+        InputError: Most poses disagree, or the directions contradict them.
         Degenerate: The poses cannot show every unknown.
     """
-    _check(recording, known_tip, scale, start)
-    errors = None if arms is None else arm_errors(arms, recording)
-    if errors is not None:
-        recording = without_play(recording, errors)
-    estimate = start or closed_form(recording, known_tip=known_tip, scale=scale)
-    if start is not None and known_tip is not None:
-        estimate = estimate._replace(t_Q=np.asarray(known_tip, dtype=np.float64))
-    active = active_columns(tip=known_tip is None, scale=scale, direction=False)
-    problem = Problem(recording, noise or UNWEIGHTED, active, arms=errors)
-    fit = (robust_fit if robust else plain_fit)(problem, estimate)
-    seen = needle_direction(fit.estimate, recording, fit.tip_kept)
+    recording = problem.recording
+    fit = (robust_fit if robust else plain_fit)(problem, start)
+    try:
+        seen = needle_direction(fit.estimate, recording, fit.tip_kept)
+    except InputError:  # directions say little of poses that show too little
+        require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+        raise
     fit = fit._replace(estimate=fit.estimate._replace(V=seen.V), direction_kept=seen.agrees)
     observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
-    if direction and recording.v is not None:
-        active = np.append(active, [DIRECTION.start, DIRECTION.start + 1])
+    if direction:
+        active = np.append(problem.active, [DIRECTION.start, DIRECTION.start + 1])
         problem = problem._replace(active=active, lean_rad=seen.lean_rad)
-    if noise is None or problem.with_direction:
+    if isinstance(problem.noise, Spread) or problem.with_direction:
         before = fit.tip_kept
         problem, fit = refitted(problem, fit, seen, recheck=robust)
         if not np.array_equal(before, fit.tip_kept):
             observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
-    return solution_of(problem, fit, observability)
+    return problem, fit, observability, seen

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2, f
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.brief import brief
+from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.rotations import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, tangent_basis
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise.small_sample import SmallSample
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import PARAMETERS, T_Q
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, direction_findings
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate, tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.image_errors import ImageErrors, image_errors
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import SmallSample, small_sample
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import linearised_tip, tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit, weighed
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, needle_in_image, tip_residuals
 
 LARGEST_RATIO = 1.1
 """Chi-squared over its freedom from which on a declaration is doubted: arms declared half as large as they are give
@@ -40,6 +45,8 @@ class Calibration:
         rms_mm: Root mean square length of the residuals of the poses that were used.
         weights: One per pose, shape (n,): 1 used, 0 set aside.
         outliers: Names of the poses set aside.
+        image: What errors of the image the residuals show, doubted or not; None where the poses cannot show them.
+        findings: What the recording says against itself.
         iterations: Steps of the refinement, all rounds together.
         condition: Least over largest singular value of the Jacobian, lengths in 100 mm.
         covariance: Shape (p, p), of the parameters named below.
@@ -66,6 +73,8 @@ class Calibration:
     rms_mm: float
     weights: Floats
     outliers: tuple[str, ...]
+    image: ImageErrors | None
+    findings: tuple[Finding, ...]
     iterations: int
     condition: float
     covariance: Floats
@@ -94,13 +103,15 @@ class Calibration:
         """How often a right declaration has residuals as large as these."""
         return float(chi2.sf(self.chi_squared_ratio * self.freedom, self.freedom))
 
-    def declaration_doubts(self) -> tuple[str, ...]:
-        """A sentence where the residuals are larger than a stated noise and the declared arms let expect."""
+    def doubts(self) -> tuple[str, ...]:
+        """A sentence a warning, and one where the residuals are larger than the stated noise and arms let expect."""
+        said = tuple(one.sentence for one in self.findings if one.severity is Severity.WARNING)
         ratio = self.chi_squared_ratio
         if not isinstance(self.noise, Noise) or ratio <= LARGEST_RATIO:
-            return ()
+            return said
         chance = 100.0 * self.chi_squared_chance()
         return (
+            *said,
             f"chi-squared of the residuals is {ratio:.2f} times their freedom ({self.freedom}): noise or arms are "
             f"probably declared too small, and the stated errors with them; a right one gives this in {chance:.2g} %",
         )
@@ -222,3 +233,75 @@ class Calibration:
             return float(chi2.ppf(level, p))
         per_pose = 5 if "V_1_rad" in self.parameters else 3
         return float(p * f.ppf(level, p, max(self.freedom / per_pose, 1.0)))
+
+
+def calibration_of(
+    problem: Problem,
+    fit: RobustFit,
+    observability: Observability,
+    seen: SeenDirection,
+    cannot_show: tuple[str, ...],
+    arms: DeclaredArms | None,
+) -> Calibration:
+    """What is known at a fit, under the noise that was found or declared; its arrays are read-only.
+
+    Args:
+        problem: As it was solved.
+        fit: Its solution.
+        observability: How well the poses show it.
+        seen: The needle's direction before it took part.
+        cannot_show: What the poses cannot show, one sentence each.
+        arms: As declared.
+    """
+    at_fit, estimate, kept, p = weighed(problem, fit), fit.estimate, fit.tip_kept, len(problem.active)
+    freedom = 3 * int(kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction - p
+    residuals, names = at_fit.residuals[:, :3], problem.recording.names
+    image, told = image_errors(problem, fit), direction_findings(names, kept & ~fit.direction_kept, seen)
+    return Calibration(
+        X=read_only(pose(estimate.R_X, estimate.t_X)),
+        Y=read_only(pose(estimate.R_Y, estimate.t_Y)),
+        tip_end2=read_only(estimate.t_Q),
+        needle_direction_end2=read_only(estimate.V),
+        scale=read_only(estimate.scale),
+        residuals=read_only(residuals),
+        rms_mm=float(np.sqrt(np.mean(np.sum(residuals[kept] ** 2, axis=1)))),
+        weights=read_only(1.0 * kept),
+        outliers=tuple(name for name, used in zip(names, kept, strict=True) if not used),
+        image=image,
+        findings=told if image is None or not image.doubted else (*told, image.finding()),
+        iterations=fit.iterations,
+        condition=observability.ratio,
+        covariance=read_only(at_fit.covariance[:p, :p]),
+        parameters=tuple(PARAMETERS[column] for column in problem.active),
+        freedom=freedom,
+        noise=problem.noise,
+        noise_ratio=float(np.sqrt(at_fit.chi_squared / max(freedom, 1))),
+        tip_bias_mm=None,
+        orientations=read_only(needle_in_image(estimate, problem.recording)),
+        cannot_show=cannot_show,
+        arms=arms,
+        arm_errors=read_only(at_fit.shared),
+        joint_covariance=read_only(at_fit.covariance),
+        small_sample=small_sample(problem, fit) if problem.arms is not None else None,
+    )
+
+
+def with_length(found: Calibration, length_mm: float) -> Calibration:
+    """The calibration after t_Q <- t_Q - (V.t_Q - length) V."""
+    V, t_Q, p = found.needle_direction_end2, found.tip_end2, len(found.parameters)
+    bias = float(V @ t_Q) - length_mm
+    full = np.eye(len(PARAMETERS))
+    full[T_Q, T_Q] -= np.outer(V, V)
+    full[T_Q, DIRECTION] = -(bias * np.eye(3) + np.outer(V, t_Q)) @ tangent_basis(V)
+    active = [PARAMETERS.index(name) for name in found.parameters]
+    whole = np.eye(len(found.joint_covariance))
+    whole[:p, :p] = change = full[np.ix_(active, active)]
+    joint, region = np.asarray(whole @ found.joint_covariance @ whole.T), found.small_sample
+    return replace(
+        found,
+        tip_end2=read_only(t_Q - bias * V),
+        covariance=read_only(joint[:p, :p]),
+        tip_bias_mm=bias,
+        joint_covariance=read_only(joint),
+        small_sample=None if region is None else region._replace(covariance=change @ region.covariance @ change.T),
+    )

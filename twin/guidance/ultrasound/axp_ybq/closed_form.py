@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import LENGTH_MM
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import LENGTH_MM, Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 LEAST_POSES = 16

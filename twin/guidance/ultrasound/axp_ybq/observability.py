@@ -4,31 +4,39 @@ Columns are counted in rad and 100 mm, and base 2 turns about the middle of all 
 wherever that origin lies, the same poses show the same. A recording is refused where the least singular value of the
 Jacobian over the largest falls below ``LEAST_RATIO``. The weak motion is then named: each of four families of motions
 has a known cause, and a family (or a line or plane of it) is weak when the Jacobian, restricted to it, is.
+
+Which further poses would make a refused recording usable: what to turn, and by how much.
+
+Simple changes of one recorded pose are tried by computation: the probe turned about an axis of the image through the
+tip, the tip brought elsewhere in the image, the insertion angle changed, the needle turned about itself. Those that add
+most information where there is least are proposed, until the recording would be accepted with room to spare.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rotations import skew
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation, skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import nearest_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     LENGTH_MM,
     T_Q,
     T_X,
     T_Y,
     W_X,
     W_Y,
+    Estimate,
     parameter_units,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import needle_in_image
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import linearised_tip, tip_points
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, needle_in_image, tip_points
 
 LEAST_RATIO = 9e-3
 """Below it the calibration is refused: constant insertion angle 1e-16, with noise 4e-4; 45 +- 1 deg 3.4e-3 to 4.4e-3,
@@ -186,3 +194,199 @@ def _relative(
         return [WeakMotion("needle_roll", 1, text)]
     text = "the needle turns against the image about one axis only: image and tip can slide together along it"
     return [WeakMotion("needle_in_image_axis", weak, text)]
+
+
+TURN_RAD = float(np.radians(25.0))
+"""How far the probe is turned, and the insertion angle changed."""
+ROLL_RAD = float(np.radians(90.0))
+"""How far the needle is turned about itself."""
+SHIFT_MM = 20.0
+"""How far the tip is brought away in the image."""
+SLACK = 1.5
+"""The proposal reaches this many times the limit."""
+IMAGE_AXES = ("image's u axis", "image's v axis", "normal of the image")
+"""As a person calls them."""
+MIN_POSES = 4
+"""Fewer would rest on single measurements."""
+MAX_POSES = 12
+"""No longer list is proposed: whoever needs more should record anew."""
+
+
+class PoseChange(NamedTuple):
+    """One proposed pose, as a change of a recorded one."""
+
+    reference: str
+    """Name of the recorded pose."""
+    probe_turn_image: Floats
+    """Shape (3,), rad: rotation vector of the probe about the tip, axes of the image."""
+    tip_shift_mm: Floats
+    """Shape (2,): where the tip goes in the image."""
+    insertion_change: float
+    """Rad: how much the needle's angle in the image grows."""
+    needle_roll: float
+    """Rad: how far the needle turns about itself."""
+    A: Floats
+    """T_base1_end1, shape (4, 4), mm."""
+    B: Floats
+    """T_base2_end2, shape (4, 4), mm, as far as the refused calibration can say: go slowly, look for the needle."""
+
+
+class SuggestedPoses(NamedTuple):
+    """Proposed poses."""
+
+    poses: tuple[PoseChange, ...]
+    ratio_after: float
+    """Singular value ratio with these poses added, by the present estimate."""
+    text: str
+
+
+class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
+    """The poses cannot show every unknown.
+
+    Attributes:
+        motions: What can move without any residual showing it, in words and with its cause.
+        suggestion: Poses that would mend it.
+    """
+
+    def __init__(self, observability: Observability, suggestion: SuggestedPoses) -> None:
+        self.motions: tuple[WeakMotion, ...] = observability.weak
+        self.ratio = observability.ratio
+        self.suggestion = suggestion
+        what = "; ".join(motion.text for motion in self.motions) + f" (singular value ratio {self.ratio:.1e})"
+        super().__init__(what, where="recording", allowed=suggestion.text)
+
+
+def require_observable(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Observability:
+    """How well the poses show the unknowns; the arguments are those of `observe`.
+
+    Raises:
+        Degenerate: They do not; with poses that would mend it.
+    """
+    found = observe(estimate, recording, active)
+    if found.weak:
+        raise Degenerate(found, propose(estimate, recording, active))
+    return found
+
+
+def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> SuggestedPoses:
+    """Poses that would cure a recording.
+
+    Args:
+        estimate: A solution, unique or not.
+        recording: The poses that were used.
+        active: The free parameters.
+    """
+    active = active[active < 17]
+    reference = _central(recording)
+    cures = []
+    for moves in (_single_moves(), _all_moves()):
+        changes = [_changed(estimate, recording, reference, move) for move in moves]
+        cures.append(_greedy(estimate, recording, active, changes))
+        if cures[-1].ratio_after >= SLACK * LEAST_RATIO:
+            break
+    return max(cures, key=lambda suggestion: suggestion.ratio_after)
+
+
+class _Move(NamedTuple):
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shift: tuple[float, float] = (0.0, 0.0)
+    insertion: float = 0.0
+    roll: float = 0.0
+
+
+def _turns() -> list[tuple[float, float, float]]:
+    return [tuple(row) for row in np.concatenate([TURN_RAD * np.eye(3), -TURN_RAD * np.eye(3)]).tolist()]
+
+
+def _shifts() -> list[tuple[float, float]]:
+    return [(SHIFT_MM, 0.0), (-SHIFT_MM, 0.0), (0.0, SHIFT_MM), (0.0, -SHIFT_MM)]
+
+
+def _single_moves() -> list[_Move]:
+    """One thing changed at a time."""
+    moves = [_Move(turn=turn) for turn in _turns()] + [_Move(shift=shift) for shift in _shifts()]
+    moves += [_Move(insertion=sign * TURN_RAD) for sign in (1, -1)]
+    return moves + [_Move(roll=sign * ROLL_RAD) for sign in (1, -1)]
+
+
+def _all_moves() -> list[_Move]:
+    """Everything with everything."""
+    none = (0.0, 0.0, 0.0)
+    angles, rolls = (0.0, TURN_RAD, -TURN_RAD), (0.0, ROLL_RAD, -ROLL_RAD)
+    return [_Move(*row) for row in product([none, *_turns()], [(0.0, 0.0), *_shifts()], angles, rolls)]
+
+
+def _central(recording: Recording) -> int:
+    """The pose whose tip lies nearest to the middle of all, among those whose probe is turned about as usual."""
+    turns = log_rotation(recording.A[0, :3, :3].T @ recording.A[:, :3, :3])
+    sides = [recording.P - np.median(recording.P, axis=0), (turns - np.median(turns, axis=0)) * 100.0]
+    return int(np.argmin(np.linalg.norm(np.column_stack(sides), axis=1)))
+
+
+def _changed(estimate: Estimate, recording: Recording, row: int, move: _Move) -> PoseChange:
+    """The pose after the move, by the present estimate."""
+    A, p = recording.A[row], np.append(recording.P[row] * estimate.scale, 0.0)
+    R_AX, M = A[:3, :3] @ estimate.R_X, needle_in_image(estimate, recording)[row]
+    tip_base1 = A[:3, :3] @ (estimate.R_X @ p + estimate.t_X) + A[:3, 3]
+    rotated = R_AX @ exp_rotation(np.array(move.turn))
+    new_A, new_B = np.eye(4), np.eye(4)
+    new_A[:3, :3] = rotated @ estimate.R_X.T
+    shifted = p + np.append(move.shift, 0.0)
+    new_A[:3, 3] = tip_base1 - new_A[:3, :3] @ (estimate.R_X @ p + estimate.t_X)
+    new_tip = rotated @ shifted + new_A[:3, :3] @ estimate.t_X + new_A[:3, 3]
+    new_M = exp_rotation(np.array([0.0, 0.0, move.insertion])) @ M @ exp_rotation(move.roll * estimate.V)
+    new_B[:3, :3] = estimate.R_Y.T @ rotated @ new_M
+    new_B[:3, 3] = estimate.R_Y.T @ (new_tip - estimate.t_Y) - new_B[:3, :3] @ estimate.t_Q
+    return PoseChange(
+        recording.names[row], np.array(move.turn), np.array(move.shift), move.insertion, move.roll, new_A, new_B
+    )
+
+
+def _as_recording(estimate: Estimate, recording: Recording, changes: list[PoseChange]) -> Recording:
+    start = dict(zip(recording.names, recording.P, strict=True))
+    P = [start[change.reference] + change.tip_shift_mm / estimate.scale for change in changes]
+    return Recording(np.array([c.A for c in changes]), np.array([c.B for c in changes]), np.array(P))
+
+
+def _greedy(
+    estimate: Estimate, recording: Recording, active: NDArray[np.int_], changes: list[PoseChange]
+) -> SuggestedPoses:
+    """Add the change that helps the least-known combinations most (D-optimal), until the ratio is reached."""
+    J = scaled_jacobian(estimate, recording, active)
+    centre = tips_centre(estimate, recording)
+    offered = scaled_jacobian(estimate, _as_recording(estimate, recording, changes), active, centre)
+    pieces = offered.reshape(len(changes), 3, -1)
+    gains = pieces.transpose(0, 2, 1) @ pieces
+    H, chosen = J.T @ J, list[int]()
+    floor = 1e-9 * np.trace(H) * np.eye(len(H))
+    while len(chosen) < MIN_POSES or (len(chosen) < MAX_POSES and _ratio(H) < SLACK * LEAST_RATIO):
+        chosen.append(int(np.argmax(np.linalg.slogdet(H + gains + floor)[1])))
+        H = H + gains[chosen[-1]]
+    picked = tuple(changes[i] for i in chosen)
+    return SuggestedPoses(picked, _ratio(H), _text(picked))
+
+
+def _ratio(H: Floats) -> float:
+    values = np.linalg.eigvalsh(H)
+    return float(np.sqrt(max(values[0], 0.0) / values[-1]))
+
+
+def _text(poses: tuple[PoseChange, ...]) -> str:
+    counted = Counter(_one(pose) for pose in poses)
+    said = [f"{text} ({count} poses)" if count > 1 else text for text, count in counted.items()]
+    return f"add {len(poses)} poses, each from pose {poses[0].reference}: " + "; ".join(said)
+
+
+def _one(pose: PoseChange) -> str:
+    said = []
+    for axis, angle in zip(IMAGE_AXES, pose.probe_turn_image, strict=True):
+        if angle:
+            said.append(f"turn the probe by {np.degrees(angle):+.0f} deg about the {axis} through the tip")
+    if pose.tip_shift_mm.any():
+        u, v = pose.tip_shift_mm
+        said.append(f"bring the tip to another place of the image, u {u:+.0f} mm, v {v:+.0f} mm")
+    if pose.insertion_change:
+        said.append(f"change the insertion angle in the image by {np.degrees(pose.insertion_change):+.0f} deg")
+    if pose.needle_roll:
+        said.append(f"turn the needle about itself by {np.degrees(pose.needle_roll):+.0f} deg")
+    return " and ".join(said)

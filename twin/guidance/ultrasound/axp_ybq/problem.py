@@ -1,6 +1,6 @@
 """What is estimated from what, and what is expected of the residuals: their covariance, pose by pose and in common.
 
-The residuals themselves, and the letters, are in the folder ``residuals``.
+The residuals themselves, and the letters, are in `residuals`.
 """
 
 from __future__ import annotations
@@ -14,19 +14,16 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.rotations import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import ArmErrors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import HALF_NORMAL
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.parameters import DIRECTION
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.direction_residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+    Linearised,
     across,
     direction_residuals,
     directions_image,
     linearised_direction,
-    needle_in_image,
-)
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals.tip_residuals import (
-    Linearised,
     linearised_tip,
+    needle_in_image,
     tip_points,
     tip_residuals,
 )

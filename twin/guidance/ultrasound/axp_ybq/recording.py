@@ -16,6 +16,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
+from puncture_twin.planning.formats.joint_readings import joint_readings
 
 OPTIONAL = ("v", "shaft_mm", "q_probe", "q_needle", "turn_probe", "turn_needle")
 """What a recording may hold beside both flanges and the tip: arrays with one row per pose."""
@@ -106,7 +107,7 @@ class Recording:
             raise InputError("joints of one arm only", where="recording", allowed="those of both, or none")
         for key in ("q_probe", "q_needle"):
             if getattr(self, key) is not None:
-                object.__setattr__(self, key, _finite(getattr(self, key), key, names, widths=(6,)))
+                object.__setattr__(self, key, _angles(getattr(self, key), key, names))
         if (self.turn_probe is None) != (self.turn_needle is None) or (self.turn_probe is not None and not self.joints):
             raise InputError("turns without joints, or of one arm only", where="recording", allowed="both, with joints")
         for key in ("turn_probe", "turn_needle"):
@@ -163,6 +164,12 @@ def _finite(values: Floats, what: str, names: tuple[str, ...], *, widths: tuple[
         raise InputError(f"{what} has shape {array.shape}", where="recording", allowed=wanted)
     bad = np.asarray(~(np.isfinite(array) & (np.abs(array) <= MAX_COORDINATE_MM)).all(axis=1))
     _refuse_first(bad, names, what, "is not finite or out of range", f"numbers within {MAX_COORDINATE_MM:g}")
+    array.setflags(write=False)
+    return array
+
+
+def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
+    array = joint_readings(_finite(values, what, names, widths=(6,)), "rad", where=f"recording, {what}", names=names)
     array.setflags(write=False)
     return array
 

@@ -1,0 +1,171 @@
+"""Joint angles and times of files: those of a device that exists, in the unit that is stated; nothing else."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.stated_arm import check_arm, check_flanges
+from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.tables.robot_section import RobotSection
+from puncture_twin.planning.formats.joint_readings import (
+    JOINTS_RAD,
+    joint_readings,
+    parse_joint_recording,
+)
+from puncture_twin.planning.formats.points.point_files import parse_points
+
+START = np.array([20.0, -100.0, -95.0, -75.0, 90.0, 10.0])
+POSES = START + 8.0 * np.random.default_rng(0).normal(size=(9, 6))
+FILE = Path("joints.csv")
+NEEDLE = np.array([0.0, 0.0, 210.0])
+
+
+def written(header, rows, comma=","):
+    """A table as a client writes it."""
+    return "\n".join([comma.join(header), *(comma.join(f"{value:.9f}" for value in row) for row in rows), ""]).encode()
+
+
+def rtde(model, q):
+    """A recording with RTDE's own headers: the controller's joints, and its tool in metres."""
+    T = flange_pose(ur_model(model), q)
+    place = T[:, :3, 3] / 1000.0
+    header = ["timestamp", *(f"actual_q_{k}" for k in range(6)), *(f"actual_TCP_pose_{k}" for k in range(6))]
+    return header, np.column_stack([0.008 * np.arange(len(q)), q, place, np.zeros((len(q), 3))])
+
+
+def code_of(call, *arguments, **named):
+    """Of the refusal."""
+    with pytest.raises(InputError) as refused:
+        call(*arguments, **named)
+    return refused.value.code
+
+
+@given(st.lists(st.floats(-359.0, 359.0), min_size=6, max_size=6), st.integers(1, 4))
+def test_what_an_arm_can_read_passes_in_both_units(angles, rows):
+    """Every pose but one that is nearly stretched out along its zero, as degrees."""
+    table = np.tile(angles, (rows, 1))
+    q = joint_readings(np.radians(table), "rad", where="here")
+    np.testing.assert_array_equal(q, np.radians(table))
+    if np.abs(table).max() > 7.0 or not table.any():
+        np.testing.assert_array_equal(joint_readings(table, "deg", where="here"), q)
+
+
+def test_angles_in_the_other_unit_are_refused():
+    """Degrees under rad are beyond any joint; radians under deg all lie within 6.3."""
+    with pytest.raises(InputError, match="degrees\\?;"):
+        joint_readings(POSES, "rad", where="here")
+    assert code_of(joint_readings, POSES, "rad", where="here") == "joints_beyond"
+    assert code_of(joint_readings, np.radians(POSES), "deg", where="here") == "joints_unit"
+
+
+@pytest.mark.parametrize(
+    "wrong", [[[1.0] * 5], [[1j] * 6], [["a"] * 6], [[np.nan] * 6], [[True] * 6], [1.0] * 6, [[400] * 6]]
+)
+def test_what_is_no_reading_is_refused(wrong):
+    """Five of them, complex, text, no number, flags, one row alone, more than a turn."""
+    assert code_of(joint_readings, wrong, "deg", where="here").startswith("joints")
+
+
+def test_rows_are_named_and_wrist_3_may_turn_on():
+    """The joint that is beyond, and the pose by its name."""
+    q = np.radians(POSES)
+    q[3, 5] = np.radians(600.0)
+    joint_readings(q, "rad", where="here")
+    q[4, 1] = 7.0
+    with pytest.raises(InputError, match=r"joint 2 of e at 7 rad.*can read;"):
+        joint_readings(q, "rad", where="here", names=tuple("abcdefghi"))
+
+
+def test_a_recording_is_read_in_every_heading():
+    """Rad, deg, RTDE's; commas or spaces; other columns and comments pass; times and tool where they are there."""
+    q = np.radians(POSES)
+    times = 0.1 * np.arange(len(q))
+    rad = parse_joint_recording(
+        b"# x\n" + written(["time_s", *JOINTS_RAD], np.column_stack([times, q])), FILE, timed=True
+    )
+    deg = parse_joint_recording(written([f"q{k}_deg" for k in range(1, 7)], POSES), FILE, timed=False)
+    assert code_of(parse_joint_recording, b"name,x_mm\na,1\n", FILE, timed=False) == "column_missing"
+    header, rows = rtde("ur3", q)
+    for comma in (",", " "):
+        own = parse_joint_recording(written(header, rows, comma), FILE, timed=True)
+        np.testing.assert_allclose(own.q, q, atol=1e-8)
+        np.testing.assert_allclose(own.tool_base, flange_pose(ur_model("ur3"), q)[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(rad.q, q, atol=1e-8)
+    np.testing.assert_allclose(deg.q, q, atol=1e-9)
+    np.testing.assert_allclose(rad.time_s, times, atol=1e-9)
+    assert deg.time_s is None and deg.tool_base is None and deg.names[:2] == ("1", "2")
+
+
+def test_times_that_run_backwards_are_refused():
+    """One step; a time twice is none."""
+    q = np.radians(POSES)
+    times = 0.1 * np.arange(len(q))
+    times[4] = times[3]
+    parse_joint_recording(written(["time_s", *JOINTS_RAD], np.column_stack([times, q])), FILE, timed=True)
+    times[4] = 0.25
+    table = written(["time_s", *JOINTS_RAD], np.column_stack([times, q]))
+    assert code_of(parse_joint_recording, table, FILE, timed=True) == "times_backwards"
+
+
+def test_a_list_of_touches_has_the_same_gate():
+    """Joints in radians beside touched points, or beyond a turn."""
+    header = ["name", "x_mm", "y_mm", "z_mm", *(f"q{k}_deg" for k in range(1, 7))]
+
+    def table(angles):
+        rows = [",".join([f"m{i}", "1", "2", "3", *map(str, row)]) for i, row in enumerate(angles)]
+        return "\n".join([",".join(header), *rows, ""]).encode()
+
+    np.testing.assert_allclose(parse_points(table(POSES), FILE).joints, np.radians(POSES))
+    assert code_of(parse_points, table(np.radians(POSES)), FILE) == "joints_unit"
+    assert code_of(parse_points, table(5 * POSES), FILE) == "joints_beyond"
+
+
+def test_a_home_in_radians_is_refused_and_one_of_zeros_is_not():
+    """`home_deg` of a case."""
+    assert RobotSection(home_deg=tuple(START)).home_deg == tuple(START)
+    assert RobotSection(home_deg=(0.0,) * 6).home_deg == (0.0,) * 6
+    with pytest.raises(ValueError, match="radians"):
+        RobotSection(home_deg=tuple(np.radians(START)))
+
+
+@pytest.mark.parametrize("tool", [np.zeros(3), NEEDLE, np.array([30.0, -12.0, 95.0])])
+@pytest.mark.parametrize("recorded", UR_MODELS)
+def test_joints_of_another_arm_are_named(recorded, tool):
+    """Whatever the controller's tool is: the tool stays where one arm's joints put it, and moves with another's."""
+    q = np.radians(POSES)
+    T = flange_pose(ur_model(recorded), q)
+    points = T[:, :3, 3] + T[:, :3, :3] @ tool
+    for name, model in UR_MODELS.items():
+        stated = {"names": [str(i) for i in range(9)], "where": "here", "any_tool": True}
+        if name == recorded:
+            check_arm(model, q, points, [np.zeros(3), NEEDLE], **stated)
+        else:
+            with pytest.raises(InputError, match=rf"those of a .*\b{recorded}\b.* do not") as refused:
+                check_arm(model, q, points, [np.zeros(3), NEEDLE], **stated)
+            assert refused.value.code == "joints_of_another_arm"
+
+
+def test_a_controller_s_own_calibration_passes():
+    """Lengths and zeros that differ as those of a calibrated arm do: 1 mm and .1 degrees."""
+    rng = np.random.default_rng(3)
+    model, q = ur_model("ur3"), np.radians(POSES)
+    for _ in range(30):
+        T = flange_pose(model, q + np.radians(rng.normal(0.0, 0.1, 6)))
+        points = T[:, :3, 3] + rng.normal(0.0, 0.7, 3)
+        check_arm(model, q, points, [np.zeros(3)], names=[str(i) for i in range(9)], where="here")
+
+
+def test_flanges_are_held_against_their_axes_too():
+    """A last joint 10 degrees off leaves the flange where it is."""
+    model, q = ur_model("ur3"), np.radians(POSES)
+    T = flange_pose(model, q)
+    check_flanges(model, q, T, names=[str(i) for i in range(9)], where="here")
+    off = q.copy()
+    off[:, 5] += np.radians(10.0)
+    assert (
+        code_of(check_flanges, model, off, T, names=[str(i) for i in range(9)], where="here") == "joints_of_another_arm"
+    )

@@ -1,1 +1,0 @@
-"""Poses that disagree with the others: found, set aside, and the others fitted."""

@@ -1,1 +1,0 @@
-"""What every pose says of the unknowns of A X P = Y B Q: residuals and their Jacobians."""
