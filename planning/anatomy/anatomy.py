@@ -109,13 +109,13 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     structures = [loader.one(section) for section in case.structure if section.role != "skin"]
     for section in case.structures:
         structures.extend(loader.many(section))
-    skin = loader.skin(case.skin_section)
+    skin = loader.skin(case.skin_section, structures)
     _check_count(case, structures)
     _check_demands(case, structures)
     structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
     couch: TriangleMesh | None = None
-    scan, left_out = loader.scan(case.skin_section, skin), loader.unnamed_warnings()
+    scan, left_out = loader.scan(case.skin_section, skin, structures), loader.unnamed_warnings()
     if scan is None:
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:

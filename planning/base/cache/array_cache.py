@@ -37,7 +37,7 @@ MOST_BYTES = 2_000_000_000
 
 LIBRARIES = (
     *("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "llvmlite", "python-fcl", "trimesh"),
-    *("fast-simplification", "pydantic", "pydicom", "python-gdcm", "h5py"),
+    *("pydantic", "pydicom", "python-gdcm", "h5py"),
 )
 """Whose versions decide what is made."""
 

@@ -54,8 +54,8 @@ class StructureSection(Section):
             raise ValueError(f"'{self.name}': unit and space belong to a mesh; a volume says its own")
         if self.ct is not None and self.role != "skin":
             raise ValueError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"")
-        if self.cut is not None and (self.role != "skin" or self.mesh is None):
-            raise ValueError(f"'{self.name}': cut belongs to a skin mesh; a volume shows where it cuts the body")
+        if self.cut is not None and self.role != "skin":
+            raise ValueError(f"'{self.name}': cut belongs to the skin: it says where the body was cut")
         if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
             raise ValueError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"')
         return self
