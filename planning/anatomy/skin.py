@@ -10,15 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, ct_image, filled_slices
-from puncture_twin.planning.anatomy.body.cut_ends import Box, cut_ends, shifted, spacing_of
+from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, filled_slices
+from puncture_twin.planning.anatomy.body.cut_ends import Box, shifted, spacing_of
 from puncture_twin.planning.anatomy.body.field_of_view import SIDES, FieldOfView, cut_warnings, open_to_air
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.orientation import canonical
-from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.creases import split_at_creases
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -59,20 +58,6 @@ class Skin:
     def nbytes(self) -> int:
         """What mesh and flags hold."""
         return self.mesh.nbytes + self.cut_faces.nbytes
-
-
-def skin_from_ct(volume: Volume) -> Skin:
-    """The skin of the body in a CT, as far as the CT alone says where it was cut.
-
-    Args:
-        volume: A CT in Hounsfield units.
-
-    Raises:
-        InputError: See `skin_of_image`.
-    """
-    image = ct_image(volume)
-    content = image.content
-    return skin_of_image(image.within(content.box(cut_ends(content, (), whole=False))))
 
 
 def skin_of_image(image: CtImage) -> Skin:

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from case_world import skin_from_ct
 from places import REAL_CT
 
 from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
-from puncture_twin.planning.anatomy.skin import Skin, skin_from_ct, skin_from_label, skin_from_mesh
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_label, skin_from_mesh
 from puncture_twin.planning.anatomy.skin_entry import view_depth
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
