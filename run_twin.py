@@ -18,7 +18,7 @@ import typer
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import check_writable
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.twin.jobs.batch.commands import batch_app
 from puncture_twin.twin.jobs.call_room import with_room
@@ -109,6 +109,10 @@ def init(
         str | None, typer.Option("--naming", help="Of labels: totalsegmentator-v1, -v2, a table.")
     ] = None,
     unit: Annotated[Unit | None, typer.Option("--unit", help="Of meshes; else told by their extent.")] = None,
+    up: Annotated[
+        Up | None,
+        typer.Option("--up", help="Axis of meshes that is up: y (turned to z) or z; GLB need it.", show_default="z"),
+    ] = None,
     ct: Annotated[str | None, typer.Option("--ct", help="Which file, where FOLDER holds several CTs.")] = None,
     segmentation: Annotated[
         str | None, typer.Option("--segmentation", help="Which file or folder, where FOLDER holds several.")
@@ -128,7 +132,7 @@ def init(
         raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
     if hit_radius is not None and (target is None or not 0 < hit_radius <= 100):
         raise InputError(f"{hit_radius:g}", where="--hit-radius", allowed="mm, above 0, at most 100, beside --target")
-    wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation)
+    wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation, up)
     with progress_display() as progress:
         request = Request(folder, target, target_label, region, wanted, space is not None, hit_radius)
         run = init_case(request, force=force, watcher=progress)

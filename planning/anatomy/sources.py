@@ -24,7 +24,7 @@ from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, refuse_lost_grid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, parse_space
+from puncture_twin.planning.geometry.spaces import Space, Up, parse_space
 from puncture_twin.planning.geometry.units import Unit, parse_unit
 
 EMPTY_MASKS = "{folder}: {count} masks are empty, so that nothing is there: {names}"
@@ -188,14 +188,13 @@ class StructureSources:
         file, by_default = self._file(section.mesh), section.space is None
         space = parse_space(section.space, where=where) if section.space else self._case.space
         unit = parse_unit(section.unit, where=where)
-        key = (__name__, self._case.files.sha256(section.mesh), file.suffix.lower(), unit, space, by_default)
-        return self._cache.memory.get(
-            key, partial(self._parsed, section.mesh, unit, space, by_default), lambda mesh: mesh.nbytes
-        )
+        read_as = unit, space, by_default, section.up
+        key = (__name__, self._case.files.sha256(section.mesh), file.suffix.lower(), *read_as)
+        return self._cache.memory.get(key, partial(self._parsed, section.mesh, *read_as), lambda mesh: mesh.nbytes)
 
-    def _parsed(self, name: str, unit: Unit, space: Space, by_default: bool) -> TriangleMesh:
+    def _parsed(self, name: str, unit: Unit, space: Space, by_default: bool, up: Up | None) -> TriangleMesh:
         content = self._case.files.content(name)
-        return parse_mesh(content, self._file(name), unit=unit, space=space, space_is_default=by_default)
+        return parse_mesh(content, self._file(name), unit=unit, space=space, space_is_default=by_default, up=up)
 
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:
