@@ -95,7 +95,7 @@ class Scan:
         """What is outside of the body, what lies beyond tables, and what beyond each open face."""
         flat, drawn = self._tables
         support = find_support(mask & ~image.unscanned.voxels, image.body, image.spacing_mm, [*flat, *drawn])
-        solids = [outside_surface(image, mask, where=self.source.source.path)]
+        solids = [outside_surface(image, mask, where=self._ct.where)]
         solids += [] if self.skin is None else beyond_body(image)
         supports = beyond_flat_sides(image, flat) + beyond_drawn_sides(image, drawn, edges=True)
         supports += beyond_drawn_sides(image, support.drawn, edges=False)
@@ -120,7 +120,7 @@ class Scan:
             limbs = attached_limbs(ct.hu, self._body, ct.spacing_mm, at)
             if not limbs.any():
                 return None
-            return field_surface(limbs.astype(np.float32) - 0.5, ct.T_ct_index, where=self.source.source.path)
+            return field_surface(limbs.astype(np.float32) - 0.5, ct.T_ct_index, where=self._ct.where)
 
         return self._kept({"what": "attached limbs", "target": target_ct.tolist()}, lambda: [make()])[0]
 
@@ -136,14 +136,14 @@ class Scan:
             ct = self._ct
             slack_mm = 0.0 if self.skin is None else 2.0 * self._tolerance_mm
             image = BodyImage(ct.hu, self._body, ct.T_ct_index, ct.spacing_mm, slack_mm)
-            return unnamed_surfaces(image, structures, dense_hu=dense_hu, where=self.source.source.path)
+            return unnamed_surfaces(image, structures, dense_hu=dense_hu, where=self._ct.where)
 
         named = {"structures": [f"{one.name} {one.mesh.digest}" for one in structures]}
         return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
 
     def contains(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
-        grid = self.source.source.grid
+        grid = self.source.surfaces.source.grid
         index = np.linalg.solve(grid.T_ct_index, np.append(point_ct, 1.0))[:3]
         return bool(np.all((index >= -0.5) & (index <= np.array(grid.shape) - 0.5)))
 

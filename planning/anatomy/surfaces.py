@@ -183,16 +183,6 @@ class Imaged:
     alone: bool
 
     @property
-    def source(self) -> VolumeSource:
-        """The volume's file or files."""
-        return self.surfaces.source
-
-    @property
-    def voxel_mm(self) -> float:
-        """The longest side of its voxels, mm."""
-        return self.surfaces.voxel_mm
-
-    @property
     def voxels(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
         """The CT as it is stored, shape (nx, ny, nz), and the map (4, 4) of an index to LPS mm."""
         whole = canonical(self.surfaces.volume.values, self.surfaces.volume.T_ct_index)

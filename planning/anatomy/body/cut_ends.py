@@ -43,8 +43,8 @@ Box = tuple[tuple[int, int], ...]
 """First voxel and the one after the last, along each axis."""
 
 FILLED = (
-    "behind the body's {names} side the image goes on with nothing but air, {voxels} voxels: it was cut there and "
-    "filled up (cut in the skin's table says otherwise)"
+    "behind the body's {names} side the image goes on with nothing but air, up to {voxels} voxels: it was cut there "
+    "and filled up (cut in the skin's table says otherwise)"
 )
 ENDS_FLAT = (
     "the phantom ends flat at its {names} side, where no structure is cut that does not run through it: it counts as "
@@ -185,7 +185,7 @@ def end_warnings(content: Content, cut: Bools, whole: bool) -> tuple[str, ...]:
     flat = np.array([[False], [False], [whole]]) & content.thick & content.wide & (content.beyond > 0) & ~cut
     said = []
     if filled.any():
-        said.append(FILLED.format(names=_names(filled), voxels=_counts(content.beyond[filled])))
+        said.append(FILLED.format(names=_names(filled), voxels=int(content.beyond[filled].max())))
     if flat.any():
         said.append(ENDS_FLAT.format(names=_names(flat)))
     return tuple(said)
@@ -193,8 +193,3 @@ def end_warnings(content: Content, cut: Bools, whole: bool) -> tuple[str, ...]:
 
 def _names(sides: Bools) -> str:
     return ", ".join(name for name, side in SIDES.items() if sides[side])
-
-
-def _counts(voxels: NDArray[np.int64]) -> str:
-    low, high = int(voxels.min()), int(voxels.max())
-    return f"{low}" if low == high else f"{low} to {high}"
