@@ -18,12 +18,12 @@ import typer
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import check_writable
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.twin.jobs.batch.commands import batch_app
 from puncture_twin.twin.jobs.call_room import with_room
 from puncture_twin.twin.jobs.collector import late_collection
-from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, exit_code_of
+from puncture_twin.twin.jobs.exit_codes import exit_code_of, finish
 from puncture_twin.twin.jobs.extras import require_extra
 from puncture_twin.twin.jobs.first_use import compiling_beside
 from puncture_twin.twin.jobs.leave import leave
@@ -40,7 +40,7 @@ from puncture_twin.twin.jobs.options import (
     with_choice,
 )
 from puncture_twin.twin.jobs.second_process import second_process
-from puncture_twin.twin.jobs.terminal import default_out, print_answer
+from puncture_twin.twin.jobs.terminal import default_out
 from puncture_twin.twin.report.progress import progress_display
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> 
         from puncture_twin.twin.jobs.patient import main_job, text
 
         run = main_job.demo_case(prepare(meshes_folder() / "abdomen", watcher=progress), out_dir, beside)
-    print_answer(run.summary(), text.rehearsal_text(run), as_json)
+    finish("demo", run, run.summary(), text.rehearsal_text(run), as_json)
 
 
 @app.command()
@@ -109,6 +109,10 @@ def init(
         str | None, typer.Option("--naming", help="Of labels: totalsegmentator-v1, -v2, a table.")
     ] = None,
     unit: Annotated[Unit | None, typer.Option("--unit", help="Of meshes; else told by their extent.")] = None,
+    up: Annotated[
+        Up | None,
+        typer.Option("--up", help="Axis of meshes that is up: y (turned to z) or z; GLB need it.", show_default="z"),
+    ] = None,
     ct: Annotated[str | None, typer.Option("--ct", help="Which file, where FOLDER holds several CTs.")] = None,
     segmentation: Annotated[
         str | None, typer.Option("--segmentation", help="Which file or folder, where FOLDER holds several.")
@@ -128,13 +132,13 @@ def init(
         raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
     if hit_radius is not None and (target is None or not 0 < hit_radius <= 100):
         raise InputError(f"{hit_radius:g}", where="--hit-radius", allowed="mm, above 0, at most 100, beside --target")
-    wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation)
+    wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation, up)
     with progress_display() as progress:
         request = Request(folder, target, target_label, region, wanted, space is not None, hit_radius)
         run = init_case(request, force=force, watcher=progress)
     for warning in run.warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    print_answer(run.summary(), init_text(run), as_json)
+    finish("init", run, run.summary(), init_text(run), as_json)
 
 
 @app.command()
@@ -175,9 +179,7 @@ def search(
             certify_deg=(certify_size or CERTIFY_DEG) if certified else None,
             certify_touch=certify_touch,
         )
-    print_answer(run.summary(), text.search_text(run), as_json)
-    if not run.candidates.safe.any():
-        raise typer.Exit(ANSWER_IS_NO)
+    finish("search", run, run.summary(), text.search_text(run), as_json)
 
 
 @app.command()
@@ -192,7 +194,7 @@ def verify(
 
     with progress_display() as progress:
         report = answers.verify_certificate(certificate, prepare(case, arm=False, watcher=progress))
-    print_answer(report, text.certificate_text(report), as_json)
+    finish("verify", report, report, text.certificate_text(report), as_json)
 
 
 @app.command()
@@ -225,9 +227,7 @@ def check(
     if lists_of(entries, targets, choice, picture=picture, out_dir=out_dir):
         with progress_display() as progress:
             listed = check_list(case, entries, targets, choice, out_dir=out_dir, arm=arm, watcher=progress)
-        print_answer(listed.summary(), listed.text(), as_json)
-        if not listed.safe:
-            raise typer.Exit(ANSWER_IS_NO)
+        finish("check", listed, listed.summary(), listed.text(), as_json)
         return
     with progress_display() as progress, compiling_beside():
         context = prepare(case, arm=arm, watcher=progress)
@@ -236,9 +236,7 @@ def check(
             from puncture_twin.twin.jobs.patient.pictures import write_check_picture
 
             write_check_picture(context, explained, picture)
-    print_answer(explained.summary(), explained.text(None if every else NEAREST), as_json)
-    if not explained.safe:
-        raise typer.Exit(ANSWER_IS_NO)
+    finish("check", explained, explained.summary(), explained.text(None if every else NEAREST), as_json)
 
 
 @app.command()
@@ -266,9 +264,7 @@ def compare(
             compared = compare_choices(prepare(source, arm=arm, watcher=progress), choices)
         else:
             compared = compare_plans(plans, None if case is None else prepare(case, watcher=progress))
-    print_answer(compared.summary(), compared.text(), as_json)
-    if not compared.safe:
-        raise typer.Exit(ANSWER_IS_NO)
+    finish("compare", compared, compared.summary(), compared.text(), as_json)
 
 
 @app.command()
@@ -286,7 +282,7 @@ def plan(
     folder = _out(out_dir, case, "plan")
     with progress_display() as progress, compiling_beside():
         run = main_job.plan_case(prepare(case, watcher=progress), folder, choice)
-    print_answer(run.summary(), text.plan_text(run), as_json)
+    finish("plan", run, run.summary(), text.plan_text(run), as_json)
 
 
 @app.command()
@@ -331,7 +327,7 @@ def rehearse(
         else:
             with second_process(get_ready) as beside:
                 run = main_job.rehearse_case(prepare(planned_case, watcher=progress), folder, rooms, choice, beside)
-    print_answer(run.summary(), text.rehearsal_text(run), as_json)
+    finish("rehearse", run, run.summary(), text.rehearsal_text(run), as_json)
 
 
 def _sweep(source: Path, folder: Path, choice: Choice, to: str | None, *, alone: bool, as_json: bool) -> None:
@@ -346,9 +342,7 @@ def _sweep(source: Path, folder: Path, choice: Choice, to: str | None, *, alone:
     end = parse_angles(to)
     with progress_display() as progress:
         run = sweep_case(prepare(source, watcher=progress), folder, choice, end)
-    print_answer(run.summary(), sweep_text(run), as_json)
-    if not run.whole:
-        raise typer.Exit(ANSWER_IS_NO)
+    finish("rehearse --sweep", run, run.summary(), sweep_text(run), as_json)
 
 
 @app.command()
@@ -368,9 +362,7 @@ def touch(
     folder = _out(out_dir, case, "touch")
     with progress_display() as progress:
         run = touch_case(prepare(case, watcher=progress), folder, choice, seed)
-    print_answer(run.summary(), touch_text(run), as_json)
-    if not run.suffices:
-        raise typer.Exit(ANSWER_IS_NO)
+    finish("touch", run, run.summary(), touch_text(run), as_json)
 
 
 @app.command()
@@ -402,8 +394,7 @@ def pivot(
         from puncture_twin.planning.case.read_case import load_case
 
         read = pivot_case(load_case(case), joints)
-        print_answer(read.summary(), pivot_text(read), as_json)
-        large = read.pivot.large
+        finish("pivot", read, read.summary(), pivot_text(read), as_json)
     else:
         require_extra("twin", "pivot")
         from puncture_twin.planning.search.context import prepare
@@ -412,10 +403,7 @@ def pivot(
         place, folder = parse_place(at), _out(out_dir, case, "pivot")
         with progress_display() as progress:
             run = pivot_tour(prepare(case, watcher=progress), folder, 8 if poses is None else poses, place, seed or 0)
-        print_answer(run.summary(), pivot_tour_text(run), as_json)
-        large = run.found.pivot.large
-    if large:
-        raise typer.Exit(ANSWER_IS_NO)
+        finish("pivot", run.found, run.summary(), pivot_tour_text(run), as_json)
 
 
 @app.command()
@@ -434,7 +422,7 @@ def place(
     folder = _out(out_dir, case, "place")
     with progress_display() as progress:
         run = place_case(prepare(case, arm=False, watcher=progress), folder, jobs=jobs, pictures=pictures)
-    print_answer(run.summary(), place_text(run), as_json)
+    finish("place", run, run.summary(), place_text(run), as_json)
 
 
 @app.command()
@@ -473,7 +461,7 @@ def mirror(
         for one in mirrored.follow(states):
             shown.append(one.summary()) if as_json else print(mirror_text(one), flush=True)
     if as_json:
-        print_answer({"case": str(case), "inputs": inputs_document(inputs), "states": shown}, "", as_json)
+        finish("mirror", shown, {"case": str(case), "inputs": inputs_document(inputs), "states": shown}, "", as_json)
 
 
 @app.command()
@@ -525,7 +513,7 @@ def export(
         else:
             done = main_job.export_case(context, format_name, folder, choice)
     checked = context is not None
-    print_answer(export_summary(done, checked), text.export_text(done, checked), as_json)
+    finish("export", done, export_summary(done, checked), text.export_text(done, checked), as_json)
 
 
 def _export_candidates(source: Path, format_name: str, out_dir: Path, choice: Choice, as_json: bool) -> None:
@@ -539,7 +527,7 @@ def _export_candidates(source: Path, format_name: str, out_dir: Path, choice: Ch
             search_case(prepare(source, watcher=progress), out_dir, pictures=False)
             table = out_dir / TABLE
         done = export_candidates(table, format_name, out_dir, progress.note)
-    print_answer(done.summary(), done.text(), as_json)
+    finish("export", done, done.summary(), done.text(), as_json)
 
 
 def _export_to_slicer(source: Path, out_dir: Path, choice: Choice, as_json: bool) -> None:
@@ -552,7 +540,7 @@ def _export_to_slicer(source: Path, out_dir: Path, choice: Choice, as_json: bool
         raise InputError("slicer shows a case", where=source, allowed=allowed)
     with progress_display() as progress:
         done = export_to_slicer(prepare(source, watcher=progress), out_dir, choice)
-    print_answer(done.summary(), done.text(), as_json)
+    finish("export", done, done.summary(), done.text(), as_json)
 
 
 @app.command()
@@ -584,7 +572,7 @@ def register(
         from puncture_twin.twin.jobs.patient.pictures import write_budget_picture
 
         write_budget_picture(report, picture)
-    print_answer(report, text.registration_text(report), as_json)
+    finish("register", report, report, text.registration_text(report), as_json)
 
 
 @app.command()
@@ -603,7 +591,7 @@ def selfcal(
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:
         facts = selfcal_facts(run_selfcal(case, recording, seeds, out_dir, progress))
-    print_answer(facts, selfcal_text(facts), as_json)
+    finish("selfcal", facts, facts, selfcal_text(facts), as_json)
 
 
 @app.command()
@@ -619,9 +607,7 @@ def servo(
 
     with progress_display() as progress:
         job = run_servo(case, _out(out_dir, case, "servo"), seeds, partial(progress.count, "seeds"), progress.note)
-    print_answer(job.summary, job.text, as_json)
-    if not job.passed:
-        raise typer.Exit(ANSWER_IS_NO)
+    finish("servo", job, job.summary, job.text, as_json)
 
 
 @app.command()
@@ -669,7 +655,7 @@ def scan(
     request = ScanRequest(settings, parse_marker(marker), rehearsal, parse_beside(arms, bed, lines))
     with progress_display() as progress:
         run = scan_case(prepare(case, arm=False, watcher=progress), _out(out_dir, case, "scan"), request)
-    print_answer(run.summary(), scan_text(run), as_json)
+    finish("scan", run, run.summary(), scan_text(run), as_json)
 
 
 @app.command()
@@ -698,9 +684,7 @@ def reproduce(
     folder = _out(out_dir, Path(paper), "reproduce")
     with progress_display() as progress:
         result = chen2019_experiment(folder, seeds, runs, progress) if experiment else PAPERS[paper](folder, seeds)
-    print_answer(result.summary, result.text, as_json)
-    if not result.passed:
-        raise typer.Exit(ANSWER_IS_NO)
+    finish("reproduce", result, result.summary, result.text, as_json)
 
 
 def _out(named: Path | None, source: Path, command: str) -> Path:

@@ -5,6 +5,7 @@ from pathlib import Path
 import typer
 
 from puncture_twin.run_twin import app
+from puncture_twin.twin.jobs.exit_codes import RULES
 
 HEAD = """# Command line
 
@@ -41,7 +42,8 @@ def commands(group, before=""):
 
 def main() -> None:
     """Write the page."""
-    lines = [HEAD]
+    lines = [HEAD, "| command | exit code 1, the answer is no, where |", "|---|---|"]
+    lines += [*(f"| `{name}` | {rule.no} |" for name, rule in RULES.items()), ""]
     for name, command in commands(typer.main.get_command(app)):
         lines += [f"## `{name}`", command.help, "", "| | | default |", "|---|---|---|"]
         lines += [*(option_row(one) for one in command.params), ""]

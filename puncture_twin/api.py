@@ -216,27 +216,28 @@ def write_points(points: Points, path: Path | str) -> None:
     write_points(Path(path), _named(points, "write_points"))
 
 
-def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS") -> TriangleMesh:
+def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS", up: str | None = None) -> TriangleMesh:
     """One surface from STL, OBJ, PLY, GLB or VTP, in mm and LPS (or its own frame), checked against its own promises.
 
     Args:
         path: The file; nothing about unit or space is taken from it.
         unit: ``mm``, ``cm`` or ``m``: of its coordinates.
         space: ``LPS``, ``RAS`` or ``local``: of its coordinates.
+        up: ``y`` or ``z``, its axis that is up; of GLB it must be stated.
 
     Raises:
         InputError: It is cut, contradicts itself, is empty, or has coordinates that are no finite numbers.
     """
     from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
-    from puncture_twin.planning.geometry.spaces import Space
+    from puncture_twin.planning.geometry.spaces import Space, Up
     from puncture_twin.planning.geometry.units import Unit
 
     try:
-        known = Unit(unit), Space(space)
+        known, axis = (Unit(unit), Space(space)), None if up is None else Up(up)
     except ValueError as error:
-        allowed = "mm, cm or m; LPS, RAS or local"
-        raise InputError(f"unit {unit!r}, space {space!r}", where=str(path), allowed=allowed) from error
-    return read_mesh(Path(path), unit=known[0], space=known[1])
+        allowed = "mm, cm or m; LPS, RAS or local; y or z"
+        raise InputError(f"unit {unit!r}, space {space!r}, up {up!r}", where=str(path), allowed=allowed) from error
+    return read_mesh(Path(path), unit=known[0], space=known[1], up=axis)
 
 
 def read_volume(path: Path | str) -> Volume:

@@ -10,6 +10,10 @@ import numpy as np
 import SimpleITK
 import trimesh
 
+from puncture_twin.planning.anatomy.body.body_mask import ct_image
+from puncture_twin.planning.anatomy.body.cut_ends import cut_ends
+from puncture_twin.planning.anatomy.skin import skin_of_image
+
 HEAD = """schema = {schema}
 name = "{name}"
 space = "{space}"
@@ -139,3 +143,10 @@ def write_case(folder, *changes, text=CASE, labels=None, spacing=(2.0, 2.0, 2.0)
     write_markers(folder)
     (folder / "case.toml").write_text(changed(text, *changes))
     return folder / "case.toml"
+
+
+def skin_from_ct(volume):
+    """The skin of a CT, as far as the CT alone says where it was cut."""
+    image = ct_image(volume)
+    content = image.content
+    return skin_of_image(image.within(content.box(cut_ends(content, (), whole=False))))

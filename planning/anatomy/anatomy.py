@@ -109,13 +109,13 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     structures = [loader.one(section) for section in case.structure if section.role != "skin"]
     for section in case.structures:
         structures.extend(loader.many(section))
-    skin = loader.skin(case.skin_section)
+    skin = loader.skin(case.skin_section, structures)
     _check_count(case, structures)
     _check_demands(case, structures)
     structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
     couch: TriangleMesh | None = None
-    scan, left_out = loader.scan(case.skin_section, skin), loader.unnamed_warnings()
+    scan, left_out = loader.scan(case.skin_section, skin, structures), loader.unnamed_warnings()
     if scan is None:
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
@@ -138,9 +138,10 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
 def _outside(case: Case, scan: Scan, outside: Outside, warnings: list[str]) -> tuple[Structure, ...]:
     """What the CT shows outside of the body that is not air, and limbs that are pressed against it."""
     warnings.extend(support_warnings(outside.supported, outside.open_faces))
+    voxel_ct = scan.source.surfaces.voxel_ct
     found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
     return tuple(
-        Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", True, scan.source.voxel_ct)
+        Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", True, voxel_ct)
         for name, mesh in found
         if mesh is not None
     )
@@ -154,7 +155,7 @@ def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterato
     unnamed = scan.unnamed(named, case.ct.dense_hu)
     for name, mesh in ((UNNAMED_DENSE, unnamed.dense), (UNNAMED_GAS, unnamed.gas)):
         if mesh is not None:
-            source, voxel_ct = f"{scan.name}: {name}", scan.source.voxel_ct
+            source, voxel_ct = f"{scan.name}: {name}", scan.source.surfaces.voxel_ct
             yield Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, source, voxel_ct=voxel_ct)
 
 

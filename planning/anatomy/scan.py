@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.attached_limbs import attached_limbs
-from puncture_twin.planning.anatomy.body.body_mask import BodyMask, body_mask
+from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
 from puncture_twin.planning.anatomy.body.outside_body import (
@@ -26,16 +26,14 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     outside_surface,
 )
 from puncture_twin.planning.anatomy.body.support import FACES, find_support
-from puncture_twin.planning.anatomy.body.unscanned import measured_hu, unscanned_voxels
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_mesh, mesh_arrays
+from puncture_twin.planning.anatomy.surfaces import Imaged, kept_mesh, mesh_arrays
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.cache.array_cache import Arrays
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.mesh_guard import fits
 from puncture_twin.planning.formats.volumes.nearest_voxel import nearest
-from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 
@@ -69,12 +67,12 @@ class Scan:
 
     Attributes:
         name: As the case writes it.
-        source: The file.
+        source: What the scanner saw, in its file.
         skin: The skin, where it does not come from this CT.
     """
 
     name: str
-    source: VolumeSurfaces
+    source: Imaged
     skin: Skin | None
 
     def outside(self, air_hu: float) -> Outside:
@@ -82,7 +80,7 @@ class Scan:
 
         def make() -> list[TriangleMesh | None]:
             ct = self._ct
-            image = OutsideImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm)
+            image = OutsideImage(ct.hu, self._body, ct.T_ct_index, ct.spacing_mm)
             mask = outside_mask(image, air_hu)
             meshes = self._outside_meshes(image, mask)
             if all(mesh is None or fits(mesh) for mesh in meshes):
@@ -96,12 +94,12 @@ class Scan:
     def _outside_meshes(self, image: OutsideImage, mask: Bools) -> list[TriangleMesh | None]:
         """What is outside of the body, what lies beyond tables, and what beyond each open face."""
         flat, drawn = self._tables
-        support = find_support(mask & ~unscanned_voxels(image.hu), image.body, image.spacing_mm, [*flat, *drawn])
-        solids = [outside_surface(image, mask, where=self.source.path)]
+        support = find_support(mask & ~image.unscanned.voxels, image.body, image.spacing_mm, [*flat, *drawn])
+        solids = [outside_surface(image, mask, where=self._ct.where)]
         solids += [] if self.skin is None else beyond_body(image)
         supports = beyond_flat_sides(image, flat) + beyond_drawn_sides(image, drawn, edges=True)
         supports += beyond_drawn_sides(image, support.drawn, edges=False)
-        near = support.open_faces
+        near = () if self._ct.alone and not support.seen else support.open_faces
         wider = image.beyond_mm[0]
         faces = [beyond_face(image, *face, wider_mm=wider) if face in near else None for face in FACES]
         return [_joined(solids), _joined(supports), *faces]
@@ -109,18 +107,20 @@ class Scan:
     @property
     def _tables(self) -> tuple[tuple[FlatSide, ...], tuple[DrawnSide, ...]]:
         """Sides at which a table holds together with the body that this CT shows."""
-        return ((), ()) if self.skin is not None else (self._found.flat_sides, self._found.drawn_sides)
+        return ((), ()) if self.skin is not None else (self._ct.found.flat_sides, self._ct.found.drawn_sides)
 
     def attached_limbs(self, target_ct: NDArray[np.float64]) -> TriangleMesh | None:
         """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None."""
 
         def make() -> TriangleMesh | None:
             ct = self._ct
+            if ct.alone:
+                return None
             at = np.linalg.solve(ct.T_ct_index, np.append(target_ct, 1.0))[:3]
-            limbs = attached_limbs(self._hu, self._body, ct.spacing_mm, at)
+            limbs = attached_limbs(ct.hu, self._body, ct.spacing_mm, at)
             if not limbs.any():
                 return None
-            return field_surface(limbs.astype(np.float32) - 0.5, ct.T_ct_index, where=self.source.path)
+            return field_surface(limbs.astype(np.float32) - 0.5, ct.T_ct_index, where=self._ct.where)
 
         return self._kept({"what": "attached limbs", "target": target_ct.tolist()}, lambda: [make()])[0]
 
@@ -135,15 +135,15 @@ class Scan:
         def make() -> Unnamed:
             ct = self._ct
             slack_mm = 0.0 if self.skin is None else 2.0 * self._tolerance_mm
-            image = BodyImage(self._hu, self._body, ct.T_ct_index, ct.spacing_mm, slack_mm)
-            return unnamed_surfaces(image, structures, dense_hu=dense_hu, where=self.source.path)
+            image = BodyImage(ct.hu, self._body, ct.T_ct_index, ct.spacing_mm, slack_mm)
+            return unnamed_surfaces(image, structures, dense_hu=dense_hu, where=self._ct.where)
 
         named = {"structures": [f"{one.name} {one.mesh.digest}" for one in structures]}
         return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
 
     def contains(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
-        grid = self.source.source.grid
+        grid = self.source.surfaces.source.grid
         index = np.linalg.solve(grid.T_ct_index, np.append(point_ct, 1.0))[:3]
         return bool(np.all((index >= -0.5) & (index <= np.array(grid.shape) - 0.5)))
 
@@ -154,35 +154,25 @@ class Scan:
             points_ct: Shape (n, 3), LPS mm.
         """
         T_index_ct = np.asarray(np.linalg.inv(self._ct.T_ct_index), dtype=np.float64)
-        return nearest(self._hu, T_index_ct, points_ct)
+        return nearest(self._ct.hu, T_index_ct, points_ct)
 
     @property
     def voxels(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
         """Hounsfield units as they are stored, shape (nx, ny, nz), and the map (4, 4) of an index to LPS mm."""
-        return self._ct.values, self._ct.T_ct_index
+        return self.source.voxels
 
-    @cached_property
-    def _ct(self) -> Oriented:
-        volume = self.source.volume
-        return canonical(volume.values, volume.T_ct_index)
-
-    @cached_property
-    def _hu(self) -> NDArray[np.float32]:
-        return measured_hu(self._ct.values.astype(np.float32))
+    @property
+    def _ct(self) -> CtImage:
+        return self.source.image
 
     @cached_property
     def _body(self) -> Bools:
         """The body's voxels: as found in the CT, or inside the skin that the case gives."""
         ct = self._ct
         if self.skin is None:
-            return self._found.body
-        inside = voxels_inside(self.skin.mesh, ct.T_ct_index, ct.values.shape)
+            return ct.found.body
+        inside = voxels_inside(self.skin.mesh, ct.T_ct_index, ct.hu.shape)
         return np.asarray(scipy.ndimage.distance_transform_edt(~inside, sampling=ct.spacing_mm) <= self._tolerance_mm)
-
-    @cached_property
-    def _found(self) -> BodyMask:
-        """The body that this CT shows by itself."""
-        return body_mask(self._hu, self._ct.spacing_mm, where=self.source.path)
 
     @property
     def _tolerance_mm(self) -> float:

@@ -10,16 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, body_mask, filled_slices
+from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, filled_slices
+from puncture_twin.planning.anatomy.body.cut_ends import Box, shifted, spacing_of
 from puncture_twin.planning.anatomy.body.field_of_view import SIDES, FieldOfView, cut_warnings, open_to_air
-from puncture_twin.planning.anatomy.body.unscanned import measured_hu
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
-from puncture_twin.planning.formats.volumes.orientation import Oriented, canonical
-from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.geometry.creases import split_at_creases
-from puncture_twin.planning.geometry.decimation import decimated
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 
@@ -61,34 +60,31 @@ class Skin:
         return self.mesh.nbytes + self.cut_faces.nbytes
 
 
-def skin_from_ct(volume: Volume, *, max_deviation_mm: float | None = None) -> Skin:
+def skin_of_image(image: CtImage) -> Skin:
     """The body's surface at ``BODY_HU``, between voxels, where air touches the body.
 
     Every vertex lies between the centres of a voxel inside the body mask and one outside, so the surface is
     never more than half a voxel (along any axis) from the mask's boundary, like that of a label.
 
     Args:
-        volume: A CT in Hounsfield units.
-        max_deviation_mm: If given, triangles are merged as long as the two surfaces stay this close (mm).
+        image: A CT, without what was laid around it.
 
     Raises:
         InputError: If no body is found, or no air around it.
     """
-    oriented = canonical(volume.values, volume.T_ct_index)
-    hu = measured_hu(oriented.values.astype(np.float32))
-    found = body_mask(hu, oriented.spacing_mm, where=volume.path)
-    above = hu - BODY_HU
+    found, above = image.found, image.hu - BODY_HU
     inside = np.clip(np.where(above > 0, above, HU_RANGE), HU_LEAST, HU_RANGE)
     outside = np.clip(np.where(above < 0, above, -HU_RANGE), -HU_RANGE, -HU_LEAST)
-    return _skin(np.where(found.body, inside, outside), found, oriented, volume.path, max_deviation_mm)
+    return _skin(np.where(found.body, inside, outside), found, image.T_ct_index, image.where)
 
 
-def skin_from_label(labelmap: LabelMap, label: int) -> Skin:
+def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> Skin:
     """The outer surface of one label, holes filled in each axial slice (a label may be a shell of skin only).
 
     Args:
         labelmap: The map.
         label: Its body or skin label.
+        box: The part of it without what was laid around it.
 
     Raises:
         InputError: If no voxel has this label, or every voxel is inside.
@@ -98,11 +94,12 @@ def skin_from_label(labelmap: LabelMap, label: int) -> Skin:
         allowed = f"the labels present: {', '.join(map(str, labelmap.labels_present()))}"
         raise InputError("no voxel has the label of the skin", where=where, allowed=allowed)
     oriented = canonical(labelmap.labels, labelmap.T_ct_index)
-    body = filled_slices(oriented.values == label)
+    box = box or tuple((0, n) for n in oriented.values.shape)
+    body = filled_slices(oriented.values[tuple(slice(*ends) for ends in box)] == label)
     if body.all():
         raise InputError("no air around the body", where=where, allowed="a label with a border inside the image")
     found = BodyMask(body, np.zeros_like(body), ())
-    return _skin(np.where(body, 0.5, -0.5), found, oriented, where, None)
+    return _skin(np.where(body, 0.5, -0.5), found, shifted(oriented.T_ct_index, box), where)
 
 
 def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
@@ -156,23 +153,20 @@ def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
 def _skin(
     field: NDArray[np.floating],
     found: BodyMask,
-    oriented: Oriented,
+    T_ct_index: Floats,
     where: str | Path,
-    max_deviation_mm: float | None,
 ) -> Skin:
-    mesh = field_surface(field, oriented.T_ct_index, where=where)
-    if max_deviation_mm is not None:
-        mesh = decimated(mesh, max_deviation_mm)
-    view = _field_of_view(found.body, oriented)
+    mesh = field_surface(field, T_ct_index, where=where)
+    view = _field_of_view(found.body, T_ct_index)
     centres = mesh.triangles.mean(axis=1)
-    cut_faces = _on_cut_border(view, oriented.spacing_mm, centres) | _at_unscanned(found, oriented, centres)
+    cut_faces = _on_cut_border(view, spacing_of(T_ct_index), centres) | _at_unscanned(found, T_ct_index, centres)
     return Skin(mesh, cut_faces, view, found.warnings + cut_warnings(view))
 
 
-def _field_of_view(body: NDArray[np.bool_], oriented: Oriented) -> FieldOfView:
+def _field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
     """Up to the outer faces of the border voxels that the body reaches."""
-    spacing = oriented.spacing_mm
-    axes, origin = oriented.T_ct_index[:3, :3], oriented.T_ct_index[:3, 3]
+    spacing = spacing_of(T_ct_index)
+    axes, origin = T_ct_index[:3, :3], T_ct_index[:3, 3]
     T_ct_image = pose(axes / spacing, origin - 0.5 * axes.sum(axis=1))
     cut = [[bool(body.take(side, axis=axis).any()) for side in (0, -1)] for axis in range(3)]
     return open_to_air(T_ct_image, spacing * body.shape, np.array(cut))
@@ -187,9 +181,8 @@ def _on_cut_border(
     return np.asarray(np.any((from_faces < 0.5 * spacing_mm[:, None]) & view.cut, axis=(1, 2)))
 
 
-def _at_unscanned(found: BodyMask, oriented: Oriented, centres_ct: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _at_unscanned(found: BodyMask, T: Floats, centres_ct: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Triangles in whose cell of eight voxels one was not scanned."""
-    T = oriented.T_ct_index
     index = np.linalg.solve(T[:3, :3], (centres_ct - T[:3, 3]).T).T
     low = np.floor(index).astype(int)
     near = np.zeros(len(centres_ct), dtype=np.bool_)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin, flat_ends
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces, kept_skin
+from puncture_twin.planning.anatomy.surfaces import Imaged, VolumeSurfaces, kept_skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
@@ -24,7 +24,7 @@ from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, refuse_lost_grid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, parse_space
+from puncture_twin.planning.geometry.spaces import Space, Up, parse_space
 from puncture_twin.planning.geometry.units import Unit, parse_unit
 
 EMPTY_MASKS = "{folder}: {count} masks are empty, so that nothing is there: {names}"
@@ -38,6 +38,7 @@ class StructureSources:
         self._progress = progress
         self._cache = cache
         self._volumes: dict[str, VolumeSurfaces] = {}
+        self._imaged: dict[tuple[str, int | None], Imaged] = {}
         self.warnings: list[str] = []
         self.ignored: list[str] = []
 
@@ -125,13 +126,16 @@ class StructureSources:
         shown = first_few([f"{label} {names[label]}" if label in names else str(label) for label in others])
         return [f"{name} holds labels that the case does not name, and they count as free: {shown}"]
 
-    def skin(self, section: StructureSection) -> Skin:
-        """The body's surface, from whatever the case names."""
+    def skin(self, section: StructureSection, structures: Sequence[Structure] = ()) -> Skin:
+        """The body's surface, from whatever the case names.
+
+        Args:
+            section: Of the skin.
+            structures: What lies in the body, as far as it was read: where it is cut, the body is too.
+        """
         self._progress(section.name)
-        if section.ct is not None:
-            return self._volume(section.ct).skin_of_ct()
-        if section.labelmap is not None and section.label is not None:
-            return self._labels(section.labelmap).skin_of_label(section.label)
+        if volume := section.ct or section.labelmap:
+            return self._seen(volume, section.label, structures, section.cut).skin()
         mesh, kept = self._mesh(section), self._cache.memory
         local = self._case.space is Space.LOCAL or section.cut is not None
         ends = () if local else kept.get((flat_ends.__name__, mesh.digest), partial(flat_ends, mesh), _no_bytes)
@@ -144,7 +148,17 @@ class StructureSources:
         cut = section.cut or ()
         return kept_skin(mesh, cut, self._cache)
 
-    def scan(self, skin_section: StructureSection, skin: Skin) -> Scan | None:
+    def _seen(
+        self, name: str, label: int | None, structures: Sequence[Structure], stated: Sequence[str] | None
+    ) -> Imaged:
+        """What a CT, or the label of a body, shows of it."""
+        if (name, label) not in self._imaged:
+            volume = self._volume(name) if label is None else self._labels(name)
+            organs, whole = [(one.mesh, one.voxel_mm) for one in structures], self._case.region == "phantom"
+            self._imaged[name, label] = volume.imaged(label, organs, whole=whole, stated=stated)
+        return self._imaged[name, label]
+
+    def scan(self, skin_section: StructureSection, skin: Skin, structures: Sequence[Structure] = ()) -> Scan | None:
         """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
         own, named = skin_section.ct, self._case.ct.file
         if own is not None and named not in {None, own}:
@@ -157,7 +171,8 @@ class StructureSources:
         if name is None:
             return None
         self._progress("CT beside the structures")
-        scan = Scan(name, self._volume(name), None if own else skin)
+        seen = self._seen(name, None, structures, skin_section.cut if own else None)
+        scan = Scan(name, seen, None if own else skin)
         if not scan.contains(self._case.target_ct):
             raise InputError(
                 f"[ct] file '{name}' does not show the target: a slip of file or space?",
@@ -173,14 +188,13 @@ class StructureSources:
         file, by_default = self._file(section.mesh), section.space is None
         space = parse_space(section.space, where=where) if section.space else self._case.space
         unit = parse_unit(section.unit, where=where)
-        key = (__name__, self._case.files.sha256(section.mesh), file.suffix.lower(), unit, space, by_default)
-        return self._cache.memory.get(
-            key, partial(self._parsed, section.mesh, unit, space, by_default), lambda mesh: mesh.nbytes
-        )
+        read_as = unit, space, by_default, section.up
+        key = (__name__, self._case.files.sha256(section.mesh), file.suffix.lower(), *read_as)
+        return self._cache.memory.get(key, partial(self._parsed, section.mesh, *read_as), lambda mesh: mesh.nbytes)
 
-    def _parsed(self, name: str, unit: Unit, space: Space, by_default: bool) -> TriangleMesh:
+    def _parsed(self, name: str, unit: Unit, space: Space, by_default: bool, up: Up | None) -> TriangleMesh:
         content = self._case.files.content(name)
-        return parse_mesh(content, self._file(name), unit=unit, space=space, space_is_default=by_default)
+        return parse_mesh(content, self._file(name), unit=unit, space=space, space_is_default=by_default, up=up)
 
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:

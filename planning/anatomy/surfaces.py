@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.body.body_mask import CtImage, ct_image
+from puncture_twin.planning.anatomy.body.cut_ends import (
+    Box,
+    Content,
+    content_of,
+    cut_ends,
+    end_warnings,
+    shifted,
+    stated_ends,
+)
 from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
-from puncture_twin.planning.anatomy.skin import Skin, skin_from_ct, skin_from_label, skin_from_mesh
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_label, skin_from_mesh, skin_of_image
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
@@ -19,6 +30,7 @@ from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import ROUNDED_BY, LabelMap, labelmap_of, segment_names
 from puncture_twin.planning.formats.labels.mask_folder import refuse_label_map
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
+from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -110,13 +122,37 @@ class VolumeSurfaces:
             f"label {label}", lambda: mesh_arrays(label_mesh(self.labelmap, label, where=self.path)), kept_mesh
         )
 
-    def skin_of_label(self, label: int) -> Skin:
-        """The skin of a label that is the body."""
-        return self._kept(f"skin {label}", lambda: _of_skin(skin_from_label(self.labelmap, label)), _to_skin)
+    @cached_property
+    def ct_image(self) -> CtImage:
+        """All voxels of a CT."""
+        return ct_image(self.volume)
 
-    def skin_of_ct(self) -> Skin:
-        """The skin of the body found in a CT."""
-        return self._kept("skin", lambda: _of_skin(skin_from_ct(self.volume)), _to_skin)
+    def imaged(
+        self,
+        label: int | None = None,
+        organs: Iterable[tuple[TriangleMesh, float]] = (),
+        *,
+        whole: bool = False,
+        stated: Collection[str] | None = None,
+    ) -> Imaged:
+        """What a scanner saw of a body, without what was laid around it.
+
+        Args:
+            label: Of the body, in a label map; None where this is a CT.
+            organs: See `cut_ends`.
+            whole: Whether it is a phantom: see `cut_ends`; where the image shows all of it, it lies on nothing.
+            stated: The sides at which the body was cut, where a person says so.
+        """
+        content = self._kept(f"content {label}", lambda: self._content(label), _to_content)
+        cut = cut_ends(content, organs, whole=whole) if stated is None else stated_ends(stated)
+        notes = end_warnings(content, cut, whole and stated is None)
+        return Imaged(self, content.box(cut), label, notes, alone=whole and content.inside)
+
+    def _content(self, label: int | None) -> Arrays:
+        if label is None:
+            return _of_content(self.ct_image.content)
+        labels = canonical(self.labelmap.labels, self.labelmap.T_ct_index)
+        return _of_content(content_of(labels.values == label, labels.T_ct_index))
 
     def kept(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
@@ -126,6 +162,52 @@ class VolumeSurfaces:
 
     def _kept(self, what: str, make: Callable[[], Arrays], read: Callable[[Arrays], Value]) -> Value:
         return self.kept({"what": what}, make, read, by=__name__)
+
+
+@dataclass(frozen=True)
+class Imaged:
+    """What a scanner saw: a CT, or a label that is the body, without what was laid around it.
+
+    Attributes:
+        surfaces: Of the whole file.
+        box: The part that was seen, voxels of the canonical order.
+        label: Of the body; None where this is a CT.
+        notes: What was left out, one sentence each.
+        alone: See `CtImage`.
+    """
+
+    surfaces: VolumeSurfaces
+    box: Box
+    label: int | None
+    notes: tuple[str, ...]
+    alone: bool
+
+    @property
+    def voxels(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
+        """The CT as it is stored, shape (nx, ny, nz), and the map (4, 4) of an index to LPS mm."""
+        whole = canonical(self.surfaces.volume.values, self.surfaces.volume.T_ct_index)
+        return whole.values[tuple(slice(*ends) for ends in self.box)], shifted(whole.T_ct_index, self.box)
+
+    @cached_property
+    def image(self) -> CtImage:
+        """The CT."""
+        return self.surfaces.ct_image.within(self.box, alone=self.alone)
+
+    def skin(self) -> Skin:
+        """The body's skin."""
+        kept = self.kept({"what": "skin", "label": self.label}, lambda: _of_skin(self._skin()), _to_skin, by=__name__)
+        return replace(kept, warnings=(*self.notes, *kept.warnings))
+
+    def _skin(self) -> Skin:
+        if self.label is None:
+            return skin_of_image(self.image)
+        return skin_from_label(self.surfaces.labelmap, self.label, self.box)
+
+    def kept(
+        self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
+    ) -> Value:
+        """See `VolumeSurfaces.kept`."""
+        return self.surfaces.kept({"box": self.box, "alone": self.alone, **made_from}, make, read, by=by)
 
 
 def kept_skin(mesh: TriangleMesh, cut: Sequence[str], cache: Cache) -> Skin:
@@ -178,6 +260,19 @@ def kept_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
 
 def _of_present(labels: LabelMap) -> Arrays:
     return {"labels": np.array(labels.labels_present(), np.int64), "rounded_by": np.array(labels.rounded_by)}
+
+
+def _of_content(content: Content) -> Arrays:
+    ends = {"last": content.last, "area_mm2": content.area_mm2, "thick": content.thick, "wide": content.wide}
+    return {"shape": np.array(content.shape), "T_ct_index": content.T_ct_index, **ends}
+
+
+def _to_content(stored: Arrays) -> Content:
+    ends = [stored[name] for name in ("last", "area_mm2", "thick", "wide")]
+    shape, T_ct_index = stored["shape"], stored["T_ct_index"]
+    if any(array.shape != (3, 2) for array in ends) or (shape.shape, T_ct_index.shape) != ((3,), (4, 4)):
+        raise ValueError("three axes with two ends")
+    return Content(tuple(shape.tolist()), T_ct_index, *ends)
 
 
 def _to_labels(stored: Arrays) -> Present:

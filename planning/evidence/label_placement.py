@@ -242,7 +242,7 @@ def _assessed(edges: Callable[[], EdgeImage], source: Source) -> Arrays:
 
 def sources(case: Case, anatomy: Anatomy, scan: Scan) -> Iterator[Source]:
     """The structures of a case by what they were written in; none that the CT itself or the case adds."""
-    ct = scan.source.source.grid
+    ct = scan.source.surfaces.source.grid
     middle, origin = apply(ct.T_ct_index, (np.array(ct.shape)[None] - 1) / 2)[0], np.zeros(3)
     skin = [] if scan.skin is None else [("skin", scan.skin.mesh, _skin_source(case))]
     rest = [(one.name, one.mesh, one.source.rpartition(":")[0] or one.source) for one in anatomy.structures] + skin

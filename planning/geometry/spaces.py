@@ -25,6 +25,13 @@ class Space(StrEnum):
     LOCAL = "local"
 
 
+class Up(StrEnum):
+    """Which axis of a mesh file is up, to the patient's head; the other two are as a turn about x leaves them."""
+
+    Y = "y"
+    Z = "z"
+
+
 def to_lps(points: Floats, space: Space) -> Floats:
     """Coordinates in LPS; those of a local frame stay as they are, since such a frame is its own.
 

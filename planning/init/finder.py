@@ -24,7 +24,7 @@ from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.init.file_masks import file_masks
 from puncture_twin.planning.init.label_files import Mask, Masks, label_file, mask_of
@@ -65,6 +65,7 @@ class Wanted:
         space: Of meshes, and of lists that do not say theirs.
         naming: Of label maps without names.
         unit: Of meshes.
+        up: The axis of meshes that is up.
         ct: The CT, where there are several.
         segmentation: The label map or folder, where there are several.
     """
@@ -74,6 +75,7 @@ class Wanted:
     unit: Unit | None = None
     ct: str | None = None
     segmentation: str | None = None
+    up: Up | None = None
 
     def takes(self, kind: str, name: str) -> bool:
         """Whether a file may be the CT (``ct``), or a segmentation (``labels``)."""
@@ -276,7 +278,8 @@ class _Looker:
         if not names:
             return
         try:
-            found = mesh_folder(self._place, self._source, names, self._wanted.space, self._wanted.unit)
+            wanted = self._wanted
+            found = mesh_folder(self._place, self._source, names, wanted.space, wanted.unit, wanted.up)
             self._found.segmentations.append(found)
         except InputError as error:
             self._found.problems.append(error)

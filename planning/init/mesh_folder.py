@@ -13,9 +13,9 @@ import numpy as np
 from puncture_twin.planning.anatomy.skin import Skin, flat_ends, skin_from_mesh
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, mesh_extent, read_mesh
+from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, UP_NOT_STATED, mesh_extent, read_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.init.outlines import named_like_body
 from puncture_twin.planning.init.segmentation import Assigned, Place, Segmentation, margin_line, quoted
@@ -38,6 +38,7 @@ class MeshFolder:
         files: By number, relative to the case's folder.
         unit: Of all of them.
         space: Of all of them that do not state one.
+        up: The axis of all of them that is up; None where nobody says.
         voxel_ct: None: meshes do not tell what they were made of.
     """
 
@@ -46,6 +47,7 @@ class MeshFolder:
     files: Mapping[int, str]
     unit: Unit
     space: Space
+    up: Up | None = None
     notes: tuple[str, ...] = ()
     voxel_ct: Floats | None = None
     names: Mapping[int, str] = field(init=False)
@@ -58,7 +60,7 @@ class MeshFolder:
         """Each mesh in LPS mm."""
         files = {number: self.place.folder / file for number, file in self.files.items()}
         return {
-            number: read_mesh(file, unit=self.unit, space=self.space, space_is_default=True)
+            number: read_mesh(file, unit=self.unit, space=self.space, space_is_default=True, up=self.up)
             for number, file in files.items()
         }
 
@@ -80,9 +82,10 @@ class MeshFolder:
         cut = (
             f"cut = [{', '.join(map(quoted, ends))}]  # flat there: the scan ended, the body did not\n" if ends else ""
         )
+        up = "" if self.up is None else f'up = "{self.up}"\n'
         return (
             f"[[structure]]\nname = {quoted(row.name)}\nmesh = {quoted(self.files[row.label])}\n"
-            f'unit = "{self.unit}"\nrole = "{row.kind}"\n{margin_line(row)}{cut}'
+            f'unit = "{self.unit}"\n{up}role = "{row.kind}"\n{margin_line(row)}{cut}'
         )
 
 
@@ -95,7 +98,9 @@ def mesh_name(file: str) -> str:
     return file.rpartition("/")[2].rpartition(".")[0]
 
 
-def mesh_folder(place: Place, source: str, names: Sequence[str], space: Space, stated: Unit | None) -> MeshFolder:
+def mesh_folder(
+    place: Place, source: str, names: Sequence[str], space: Space, stated: Unit | None, up: Up | None
+) -> MeshFolder:
     """The meshes of a folder, in the unit that their extent tells.
 
     Args:
@@ -104,12 +109,16 @@ def mesh_folder(place: Place, source: str, names: Sequence[str], space: Space, s
         names: Of the files in it.
         space: Of their coordinates.
         stated: Their unit where the user says it, or None.
+        up: Their axis that is up where the user says it; of GLB it must.
 
     Raises:
         InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
     """
     if len({mesh_name(one) for one in names}) < len(names):
         raise InputError("two meshes have one name", where=place.folder / source, allowed="one mesh a structure")
+    if up is None and any(name.lower().endswith(".glb") for name in names):
+        what = f"GLB: {UP_NOT_STATED} (--up y turns them to z up, --up z keeps them)"
+        raise InputError(what, where=place.folder / source, allowed="--up y or --up z", code="up_not_stated")
     extents = [mesh_extent(place.folder / name) for name in names]
     boxes = np.stack([one.box for one in extents])
     diagonal = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
@@ -122,7 +131,7 @@ def mesh_folder(place: Place, source: str, names: Sequence[str], space: Space, s
         f"{source}: {len(names)} meshes in {unit} ({guess}) and {_spaces([one.space for one in extents], space)}, "
         f"together {diagonal * unit.mm:.0f} mm from corner to corner; no mesh file says its unit"
     )
-    return MeshFolder(place, source, dict(enumerate(sorted(names), start=1)), unit, space, (said,))
+    return MeshFolder(place, source, dict(enumerate(sorted(names), start=1)), unit, space, up, (said,))
 
 
 def _spaces(stated: Sequence[Space | None], space: Space) -> str:

@@ -87,7 +87,7 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     ct = body if isinstance(body, Ct) else None
     if point is not None and ct is not None:
         _refuse_outside(point, ct, space)
-    skin = body.surfaces.skin_of_ct() if isinstance(body, Ct) else body.skin()
+    skin = body.surfaces.imaged().skin() if isinstance(body, Ct) else body.skin()
     outlines = Outlines(found.segmentations, skin)
     target = _target(request, point, outlines)
     names = [name for one in found.segmentations for name in one.names.values()]
@@ -196,7 +196,7 @@ def _refuse_outside(point: Floats, ct: Ct, space: Space) -> None:
     grid = ct.surfaces.source.grid
 
     def in_body(one: Floats) -> bool:
-        return _contains(grid, one) and side_of(ct.surfaces.skin_of_ct().mesh, one) is not Side.OUTSIDE
+        return _contains(grid, one) and side_of(ct.surfaces.imaged().skin().mesh, one) is not Side.OUTSIDE
 
     if not in_body(point):
         place = "the body in" if _contains(grid, point) else "the CT"

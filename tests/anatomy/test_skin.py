@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from case_world import skin_from_ct
 from places import REAL_CT
 
 from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
-from puncture_twin.planning.anatomy.skin import Skin, skin_from_ct, skin_from_label, skin_from_mesh
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_label, skin_from_mesh
 from puncture_twin.planning.anatomy.skin_entry import view_depth
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
@@ -176,18 +177,6 @@ def test_a_ct_without_a_plausible_body_is_refused(hu: np.ndarray, match: str) ->
     """Air alone, tissue alone, and something far smaller than a patient."""
     with pytest.raises(InputError, match=match):
         skin_from_ct(ct_of(hu))
-
-
-def test_decimated_skin_keeps_its_marks(skin: Skin) -> None:
-    """Fewer triangles, still closed, and the marked area is the same within 1 %."""
-    smaller = skin_from_ct(ct_of(cylinder_ct()), max_deviation_mm=0.5)
-    assert smaller.mesh.closed
-    assert len(smaller.mesh.faces) < 0.6 * len(skin.mesh.faces)
-    areas = []
-    for each in (skin, smaller):
-        a, b, c = each.mesh.triangles[each.cut_faces].swapaxes(0, 1)
-        areas.append(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    assert areas[1] == pytest.approx(areas[0], rel=0.01)
 
 
 def test_skin_from_a_label_that_is_only_a_shell_is_solid() -> None:

@@ -22,9 +22,7 @@ from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.formats.volumes.volume_source import VolumeFile
-from puncture_twin.planning.geometry.decimation import decimated
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 REAL = REAL_CT
 needs_real = pytest.mark.skipif(not REAL.is_dir(), reason=f"the real CT is not at {REAL}")
@@ -150,28 +148,6 @@ def test_a_label_that_is_not_there_is_refused_with_those_that_are() -> None:
     assert map_of(labels).labels_present() == (3, 9)
     with pytest.raises(InputError, match=r"no voxel has label 5.*present: 3, 9"):
         label_mesh(map_of(labels), 5, where="case.toml")
-
-
-def test_decimation_stays_closed_within_its_bound() -> None:
-    """A ball loses triangles; every vertex of either mesh stays within the bound of the other surface."""
-    grid = np.indices((24, 24, 24)) - 11.5
-    labels = (np.linalg.norm(grid, axis=0) < 10.3).astype(np.int32)
-    mesh = label_mesh(map_of(labels, np.eye(4)), 1, where="test")
-    smaller = decimated(mesh, 0.4)
-    assert smaller.closed
-    assert len(smaller.faces) <= 0.6 * len(mesh.faces)
-    for one, other in ((mesh, smaller), (smaller, mesh)):
-        squares = squared_distance(one.vertices[:, None], other.triangles[None])
-        assert squares.min(axis=1).max() ** 0.5 <= 0.4
-
-
-def test_a_mesh_that_cannot_lose_a_triangle_within_the_bound_stays(
-    ball: Callable[..., TriangleMesh],
-) -> None:
-    """On a sphere every collapse moves the surface, so a bound of a nanometre leaves the mesh itself."""
-    mesh = ball(20.0)
-    assert decimated(mesh, 1e-6) is mesh
-    assert len(decimated(mesh, 1.0).faces) < len(mesh.faces)
 
 
 def test_labels_are_read_from_integers_and_from_whole_floats(tmp_path: Path) -> None:

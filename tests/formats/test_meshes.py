@@ -23,7 +23,7 @@ from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.meshes.mesh_warnings import kept_mesh_warnings, mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import Unit
 
 BALL = trimesh.creation.icosphere(1, 30.0)
@@ -35,7 +35,23 @@ def read(folder: Path, suffix: str, data: bytes, unit: Unit = Unit.MM, space: Sp
     """The mesh in the given bytes, through a file."""
     path = folder / f"mesh{suffix}"
     path.write_bytes(data)
-    return read_mesh(path, unit=unit, space=space)
+    return read_mesh(path, unit=unit, space=space, up=Up.Z if suffix == ".glb" else None)
+
+
+def test_a_glb_says_nothing_of_its_axes_so_the_case_must(tmp_path: Path) -> None:
+    """By glTF's rule y is up, and trimesh writes any axes; a quarter about x makes them one."""
+    for suffix, kind in ((".glb", "glb"), (".stl", "stl")):
+        path = tmp_path / f"mesh{suffix}"
+        path.write_bytes(BALL.export(file_type=kind))
+        kept, turned = (read_mesh(path, unit=Unit.MM, space=Space.LPS, up=up).vertices for up in (Up.Z, Up.Y))
+        x, y, z = kept.T
+        assert np.array_equal(turned, np.stack([x, -z, y], axis=1))
+        ras = read_mesh(path, unit=Unit.MM, space=Space.RAS, up=Up.Y).vertices
+        assert np.array_equal(ras, turned * [-1.0, -1.0, 1.0])
+    assert np.array_equal(kept, read_mesh(path, unit=Unit.MM, space=Space.LPS).vertices)
+    with pytest.raises(InputError) as error:
+        read_mesh(tmp_path / "mesh.glb", unit=Unit.MM, space=Space.LPS)
+    assert error.value.code == "up_not_stated"
 
 
 def same_triangles(mesh: TriangleMesh, corners: np.ndarray, tolerance: float = 1e-5) -> bool:
@@ -747,7 +763,7 @@ needs_vh_male = pytest.mark.skipif(not VH_MALE.is_dir(), reason="the hubmap_vh_m
 @needs_vh_male
 def test_the_visible_human_skin_is_whole_and_watertight() -> None:
     """107,334 triangles, closed, 96.2 litres, facing outward."""
-    mesh = read_mesh(VH_MALE / "VH_M_Skin.v1.1.glb", unit=Unit.M, space=Space.LOCAL)
+    mesh = read_mesh(VH_MALE / "VH_M_Skin.v1.1.glb", unit=Unit.M, space=Space.LOCAL, up=Up.Z)
     assert len(mesh.faces) == 107_334 and mesh.closed and mesh_warnings(mesh, "skin") == ()
     litres = np.linalg.det(mesh.triangles).sum() / 6.0 / 1e6
     assert litres == pytest.approx(96.22, abs=0.01)
@@ -759,7 +775,7 @@ def test_all_visible_human_organs_read_as_trimesh_reads_them() -> None:
     paths = sorted(VH_MALE.glob("*.glb"))
     assert len(paths) == 12
     for path in paths:
-        mesh = read_mesh(path, unit=Unit.M, space=Space.LOCAL)
+        mesh = read_mesh(path, unit=Unit.M, space=Space.LOCAL, up=Up.Z)
         other = trimesh.load_scene(path, process=False, skip_materials=True).to_mesh()
         assert len(mesh.faces) == len(other.faces), path.name
         ours, theirs = mesh.triangles.mean(axis=1), other.triangles.mean(axis=1) * 1000.0

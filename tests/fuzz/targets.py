@@ -23,7 +23,7 @@ from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.meshes.mesh_warnings import mesh_warnings
 from puncture_twin.planning.formats.points.point_files import read_points
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.registration.placement import load_placement
@@ -159,7 +159,7 @@ def read_case(path):
 
 def read_own_mesh(path):
     """A mesh in mm, LPS."""
-    return read_mesh(path, unit=Unit.MM, space=Space.LPS)
+    return read_mesh(path, unit=Unit.MM, space=Space.LPS, up=Up.Z)
 
 
 def read_own_points(path):

@@ -330,8 +330,11 @@ def test_place_from_the_command_line(case_folder, tmp_path, capsys):
     """Table, document and pictures agree; the share is the search's own from there."""
     here = case_folder(more=FEW)
     out = tmp_path / "out"
+    assert run_twin.main(["place", str(here), "--out", str(out), "--no-pictures"]) == 0
+    printed = capsys.readouterr().out
     assert run_twin.main(["place", str(here), "--out", str(out), "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
+    assert said["warnings"] and all(f"warning: {one}" in printed for one in said["warnings"])
     best, own = said["placements"][0], said["placements"][-1]
     assert own["placement"] == "as in the case" and own["rank"] is None
     shares = [one["share"] for one in said["placements"][:-1]]

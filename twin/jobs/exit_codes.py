@@ -1,12 +1,13 @@
-"""How a command ends: its exit code, and one line for what went wrong."""
+"""How a command ends: what it found, its exit code, and one line for what went wrong."""
 
 from __future__ import annotations
 
 import sys
 import traceback
 import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import typer
 from typer._click.exceptions import ClickException  # typer carries its own click and re-exports no base class
@@ -20,11 +21,88 @@ from puncture_twin.planning.base.errors import (
     one_line,
 )
 from puncture_twin.twin.jobs.interrupt import insistent_ctrl_c
-from puncture_twin.twin.jobs.terminal import flush_output, leave_unread, reader_is_gone, refusal_of
+from puncture_twin.twin.jobs.terminal import flush_output, leave_unread, print_answer, reader_is_gone, refusal_of
 from puncture_twin.twin.jobs.usage import allowed_text
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 130, 141
 """The last two as the shell gives them for a program that Ctrl-C, or a closed pipe, has ended."""
+
+
+class Rule(NamedTuple):
+    """When a command that is done has the answer no.
+
+    Attributes:
+        no: Where, in words; also where it finds nothing to answer with (`NoAnswerError`).
+        code: The exit code of what it found.
+    """
+
+    no: str
+    code: Callable[[Any], int] = lambda _: OK
+
+
+def _unless(yes: Callable[[Any], bool]) -> Callable[[Any], int]:
+    return lambda found: OK if yes(found) else ANSWER_IS_NO
+
+
+def _code_of_batch(counts: Any) -> int:
+    failed = counts.ended[PROGRAM_FAILED] > 0
+    return OK if counts.whole else PROGRAM_FAILED if failed else ANSWER_IS_NO
+
+
+NEVER = "never: it shows what is there"
+REHEARSED = (
+    "the tip misses the target or the true needle or the arm touches what it must not, in the room that is executed; "
+    "of many (`--seeds`) also where fewer hit, or more touch, than `search.min_hit`, `max_touch`, `max_touch_of` allow"
+)
+
+RULES: Mapping[str, Rule] = MappingProxyType(
+    {
+        "demo": Rule("as `rehearse`", _unless(lambda run: not run.failures)),
+        "init": Rule("never: a case is written, or refused"),
+        "search": Rule("no direction is safe", _unless(lambda run: run.candidates.safe.any())),
+        "verify": Rule("never: a cell that does not hold is refused, as a certificate that is none"),
+        "check": Rule("the candidate, or a row of the list, is rejected", _unless(lambda found: found.safe)),
+        "compare": Rule("one of the two is rejected", _unless(lambda found: found.safe)),
+        "plan": Rule("nothing is safe, the named direction is rejected, or the arm finds no way to it"),
+        "rehearse": Rule(f"there is no plan; {REHEARSED}", _unless(lambda run: not run.failures)),
+        "rehearse --sweep": Rule("the sweep ends before its end", _unless(lambda run: run.whole)),
+        "touch": Rule("too few markers were touched for a registration", _unless(lambda run: run.suffices)),
+        "pivot": Rule("the touches contradict each other", _unless(lambda found: not found.pivot.large)),
+        "place": Rule("no direction is safe for the organs, or no placement holds one"),
+        "mirror": Rule(NEVER),
+        "export": Rule("there is no plan to write, or its case rejects it now"),
+        "register": Rule("never: markers that contradict each other are refused"),
+        "selfcal": Rule("never: a recording that determines nothing is refused"),
+        "servo": Rule("a servo has not converged", _unless(lambda job: job.passed)),
+        "scan": Rule(NEVER),
+        "reproduce": Rule("one of the paper's numbers does not hold", _unless(lambda result: result.passed)),
+        "batch plan": Rule(NEVER),
+        "batch run": Rule("a case of the part has no verdict (3 where the program failed at one)", _code_of_batch),
+        "batch status": Rule(NEVER),
+        "batch merge": Rule("a case has no row, or differs from `--expect`", _unless(lambda found: found.as_expected)),
+        "batch compare": Rule(NEVER),
+    }
+)
+"""One for each command, by its name; a test holds them beside the command line."""
+
+
+def finish(command: str, found: Any, summary: dict[str, Any], text: str, as_json: bool) -> None:
+    """Print what a command found, and end it with the code that its rule gives.
+
+    Args:
+        command: Its name in `RULES`.
+        found: What its rule is about.
+        summary: For ``--json``.
+        text: For a person.
+        as_json: Which of them is printed.
+
+    Raises:
+        typer.Exit: The code is not 0.
+    """
+    print_answer(summary, text, as_json)
+    if code := RULES[command].code(found):
+        raise typer.Exit(code)
+
 
 PrintLine = Callable[[str], None]
 """Shows one line, on stderr."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.body.cut_ends import Box, Content, content_of, shifted, spacing_of
 from puncture_twin.planning.anatomy.body.detached_parts import (
     detached_limbs,
     largest_component,
@@ -18,9 +20,11 @@ from puncture_twin.planning.anatomy.body.detached_parts import (
 )
 from puncture_twin.planning.anatomy.body.drawn_side import LEAST_LENGTH_MM, TOO_SHORT, DrawnSide, drawn_sides
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide, flat_sides
-from puncture_twin.planning.anatomy.body.unscanned import find_unscanned
-from puncture_twin.planning.base.arrays import Bools
+from puncture_twin.planning.anatomy.body.unscanned import find_unscanned, measured_hu
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.volumes.orientation import canonical
+from puncture_twin.planning.formats.volumes.volume_files import Volume
 
 BODY_HU = -500.0
 """Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
@@ -63,7 +67,56 @@ class BodyMask:
     drawn_sides: tuple[DrawnSide, ...] = ()
 
 
-def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path) -> BodyMask:
+@dataclass(frozen=True, eq=False)
+class CtImage:
+    """A CT, and the body that it shows by itself.
+
+    Attributes:
+        hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head.
+        T_ct_index: Shape (4, 4), voxel index to LPS mm.
+        where: The file.
+        alone: Whether the body lies on nothing: a phantom in air, all of which the image shows.
+    """
+
+    hu: NDArray[np.float32]
+    T_ct_index: Floats
+    where: Path
+    alone: bool = False
+
+    @property
+    def spacing_mm(self) -> Floats:
+        """Voxel size along each axis, shape (3,)."""
+        return spacing_of(self.T_ct_index)
+
+    @cached_property
+    def found(self) -> BodyMask:
+        """The body.
+
+        Raises:
+            InputError: See `body_mask`.
+        """
+        return body_mask(self.hu, self.spacing_mm, where=self.where, alone=self.alone)
+
+    @property
+    def content(self) -> Content:
+        """Where what is as dense as a body ends."""
+        return content_of(self.hu > BODY_HU, self.T_ct_index)
+
+    def within(self, box: Box, *, alone: bool = False) -> CtImage:
+        """The part of it in a box, and whether the body there lies on nothing."""
+        part = self.hu[tuple(slice(*ends) for ends in box)]
+        return CtImage(part, shifted(self.T_ct_index, box), self.where, alone)
+
+
+def ct_image(volume: Volume) -> CtImage:
+    """A CT in Hounsfield units, whichever way its file runs."""
+    oriented = canonical(volume.values, volume.T_ct_index)
+    return CtImage(measured_hu(oriented.values.astype(np.float32)), oriented.T_ct_index, volume.path)
+
+
+def body_mask(
+    hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path, alone: bool = False
+) -> BodyMask:
     """Finds the patient in a CT.
 
     Threshold, opening, largest component, and every other component that looks like a limb; then air that each of
@@ -74,6 +127,7 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
         spacing_mm: Shape (3,).
         where: For messages.
+        alone: Whether it lies on nothing, so that no table is looked for.
 
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
@@ -101,6 +155,8 @@ def body_mask(hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where
         warnings.append(PADDED)
     if (ends & ~padded).any():
         warnings.append(CIRCLE)
+    if alone:
+        return BodyMask(body, unscanned, tuple(warnings))
     flat = flat_sides(hu - BODY_HU, body, spacing_mm)
     drawn = drawn_sides(hu - BODY_HU, trunk, spacing_mm)
     warnings.extend(_table_warnings(flat, drawn, body.shape[2] * float(spacing_mm[2])))

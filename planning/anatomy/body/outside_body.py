@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,11 @@ class OutsideImage:
     spacing_mm: Floats
     beyond_mm: tuple[float, float, float] = BEYOND_MM
 
+    @cached_property
+    def unscanned(self) -> Unscanned:
+        """What was not measured."""
+        return find_unscanned(self.hu)
+
 
 def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     """Voxels outside of the body that are not air.
@@ -87,7 +93,7 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
         air_hu: Voxels whose surroundings are denser than this are not air.
     """
     hu, body = image.hu, image.body
-    unscanned = find_unscanned(hu)
+    unscanned = image.unscanned
     size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(int)
     mean = scipy.ndimage.uniform_filter(np.maximum(hu, -1024.0), size=tuple(size), mode="nearest")
     dense = (mean > air_hu) | (hu > max(DENSE_HU, air_hu))
@@ -114,7 +120,7 @@ def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> T
     layered = np.pad(mask.astype(np.float32) - 0.5, [(len(layers), len(layers)) for layers in beyond], mode="edge")
     T_ct_layered = image.T_ct_index @ pose(np.eye(3), [-float(len(layers)) for layers in beyond])
     drawn = _drawn_out(field_surface(layered, T_ct_layered, where=where), image)
-    return joined([drawn, *_hulls_beyond(mask & ~find_unscanned(image.hu).padded, image)])
+    return joined([drawn, *_hulls_beyond(mask & ~image.unscanned.padded, image)])
 
 
 def beyond_body(image: OutsideImage) -> list[TriangleMesh]:

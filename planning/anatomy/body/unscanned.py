@@ -62,11 +62,6 @@ def measured_hu(hu: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(dense, np.float32(BLANK_HU), hu) if dense.any() else hu
 
 
-def unscanned_voxels(hu: NDArray[np.float32]) -> Bools:
-    """Voxels that the scanner did not measure; see `find_unscanned`."""
-    return find_unscanned(hu).voxels
-
-
 def find_unscanned(hu: NDArray[np.float32]) -> Unscanned:
     """Find what the scanner did not measure.
 

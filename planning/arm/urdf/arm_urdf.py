@@ -20,7 +20,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, parse_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import Unit
 
 ROUND_SIDES = 48
@@ -95,7 +95,7 @@ def _file(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> Tr
         raise InputError(what, where=here, allowed=f"a file ending in {', '.join(MESH_SUFFIXES)}, for contacts")
     path = document.where.parent / shape.address
     try:
-        return parse_mesh(read(shape.address), path, unit=Unit.M, space=Space.LOCAL, stretch=shape.size)
+        return parse_mesh(read(shape.address), path, unit=Unit.M, space=Space.LOCAL, up=Up.Z, stretch=shape.size)
     except InputError as error:
         what = f"mesh '{shape.address}': {error.what}"
         raise InputError(

@@ -19,7 +19,14 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from puncture_twin.planning.base.cache.cache_folder import StoredFile, store, touch
-from puncture_twin.planning.base.cache.entry_file import Arrays, DamagedError, packed, read_plain_file, unpacked
+from puncture_twin.planning.base.cache.entry_file import (
+    Arrays,
+    DamagedError,
+    check_own,
+    packed,
+    read_plain_file,
+    unpacked,
+)
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.cache.source_stamp import library_versions, module_unedited, source_stamp
 from puncture_twin.planning.base.errors import CacheWarning, InputError
@@ -185,7 +192,12 @@ def _generation(by: str) -> str:
 
 
 def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value] | None:
-    """What an entry holds, or None where it is not there or, which is said, not to be trusted."""
+    """What an entry holds, or None where it is not there or, which is said, not whole.
+
+    Raises:
+        InputError: Another user owns it, or may write it.
+    """
+    check_own(path)
     try:
         arrays = unpacked(read_plain_file(path), key)
         found = _Read(arrays, read(arrays))

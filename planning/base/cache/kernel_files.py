@@ -24,7 +24,7 @@ from typing import Any
 from numba.core import caching
 from numba.core.environment import Environment, _rebuild_env, lookup_environment
 
-from puncture_twin.planning.base.cache.entry_file import DamagedError, read_plain_file
+from puncture_twin.planning.base.cache.entry_file import DamagedError, check_own, read_plain_file
 from puncture_twin.planning.base.errors import CacheWarning
 
 NumbasFiles: Any = caching.IndexDataCacheFile
@@ -95,7 +95,12 @@ class CheckedFiles(NumbasFiles):
         self._write(self._index_name, self._dump(overloads))
 
     def _content(self, file: Path, *, report: bool = True) -> bytes | None:
-        """The content of a file, or None where it is not there, of other sources or, which is said, not whole."""
+        """The content of a file, or None where it is not there, of other sources or, which is said, not whole.
+
+        Raises:
+            InputError: Another user owns it, or may write it.
+        """
+        check_own(file)
         try:
             stored = read_plain_file(file)
         except FileNotFoundError:
@@ -132,7 +137,7 @@ class CheckedFiles(NumbasFiles):
 
     def _current(self, index: Path) -> bool:
         try:
-            return _split(read_plain_file(index))[0] == self._stamp
+            return _split(read_plain_file(index))[0] == self._stamp  # nothing is unpickled
         except (FileNotFoundError, DamagedError):
             return False
 

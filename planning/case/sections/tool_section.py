@@ -14,7 +14,7 @@ from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.toml_types import Number, Section
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import parse_unit
 
 TOOL_ROLE = "tool mesh"
@@ -29,6 +29,7 @@ class ToolSection(Section):
 
     mesh: str
     unit: str
+    up: Up | None = None
     position_mm: tuple[Beside, Beside, Beside] = (0.0, 0.0, 0.0)
     rotation_deg: tuple[Turn, Turn, Turn] = (0.0, 0.0, 0.0)
 
@@ -50,5 +51,5 @@ def tool_of(section: ToolSection | None, files: InputFiles, path: Path) -> ToolB
     data = files.read(TOOL_ROLE, section.mesh, max_bytes=meshes.MAX_FILE_BYTES, key="tool.mesh", where=path)
     turn = scipy.spatial.transform.Rotation.from_euler("xyz", section.rotation_deg, degrees=True).as_matrix()
     T = pose(turn, np.array(section.position_mm))
-    mesh = meshes.parse_mesh(data, file, unit=unit, space=Space.LOCAL).transformed(T)
+    mesh = meshes.parse_mesh(data, file, unit=unit, space=Space.LOCAL, up=section.up).transformed(T)
     return ToolBody(mesh, file, unit.mm, T, f"{path}: tool")

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from puncture_twin.planning.case.toml_types import Label, Margin, Number, Section, StructureName, Text
+from puncture_twin.planning.geometry.spaces import Up
 
 MAX_STRUCTURES = 1000
 """Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree."""
@@ -35,6 +36,7 @@ class StructureSection(Section):
     mesh: str | None = None
     unit: str | None = None
     space: str | None = None
+    up: Up | None = None
     labelmap: str | None = None
     label: Label | None = None
     ct: str | None = None
@@ -50,12 +52,12 @@ class StructureSection(Section):
             raise ValueError(f"'{self.name}': labelmap and label go together")
         if self.mesh is not None and self.unit is None:
             raise ValueError(f'\'{self.name}\': a mesh needs unit = "mm", "cm" or "m"; no mesh file says it')
-        if self.mesh is None and (self.unit or self.space):
-            raise ValueError(f"'{self.name}': unit and space belong to a mesh; a volume says its own")
+        if self.mesh is None and (self.unit or self.space or self.up):
+            raise ValueError(f"'{self.name}': unit, space and up belong to a mesh; a volume says its own")
         if self.ct is not None and self.role != "skin":
             raise ValueError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"")
-        if self.cut is not None and (self.role != "skin" or self.mesh is None):
-            raise ValueError(f"'{self.name}': cut belongs to a skin mesh; a volume shows where it cuts the body")
+        if self.cut is not None and self.role != "skin":
+            raise ValueError(f"'{self.name}': cut belongs to the skin: it says where the body was cut")
         if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
             raise ValueError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"')
         return self

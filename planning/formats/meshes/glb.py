@@ -217,7 +217,7 @@ _VERTEX_BYTES, _TRIANGLE_BYTES = 12, 3
 
 
 def read_glb(data: bytes, where: str) -> RawMesh:
-    """The triangles of a GLB file's scene, in the unit of the file and its axes (y up by the standard).
+    """The triangles of a GLB file's scene, in the unit of the file and its axes, y up by the standard (section 3.4).
 
     Args:
         data: The whole file.

@@ -28,7 +28,7 @@ from puncture_twin.planning.formats.meshes.vtk_legacy import read_vtk
 from puncture_twin.planning.formats.meshes.vtp import read_vtp
 from puncture_twin.planning.formats.raw_mesh import RawMesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.spaces import Space, Up, to_lps
 from puncture_twin.planning.geometry.units import Unit
 
 MAX_FILE_BYTES = 2_000_000_000
@@ -45,6 +45,8 @@ _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
     {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": _read_glb, ".vtp": read_vtp, ".vtk": read_vtk}
 )
 
+UP_NOT_STATED = "glTF's rule says that y is up, some programs write z up, and the file does not tell"
+
 _STATEMENT = re.compile(rb"\bSPACE=(LPS|RAS)\b")
 
 _STATEMENT_BYTES = 1000
@@ -54,26 +56,29 @@ MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """The file name endings that ``read_mesh`` takes, in lower case; upper case is the same."""
 
 
-def read_mesh(path: Path, *, unit: Unit, space: Space, space_is_default: bool = False) -> TriangleMesh:
+def read_mesh(
+    path: Path, *, unit: Unit, space: Space, space_is_default: bool = False, up: Up | None = None
+) -> TriangleMesh:
     """One mesh file, checked against its own promises, in mm and LPS (or its own local frame).
 
     The caller declares the unit, also for GLB, whose standard says metres, and the space. A file that Slicer wrote
     states its space, which must be the declared one. All parts of a file become one surface, placed by their node
-    transforms, in the file's order; nothing is welded and no triangle dropped. The axes stay as in the file: GLB is
-    y-up by its standard and is not turned.
+    transforms, in the file's order; nothing is welded and no triangle dropped. Axes of a file whose y is up are turned
+    about x, so that z is; of a GLB it must be stated.
 
     Args:
         path: An STL, OBJ, PLY, GLB, VTP or VTK file.
         unit: The unit of its coordinates.
         space: Their space.
         space_is_default: Whether a patient space that the file states holds instead of ``space``.
+        up: Its axis that is up in the file; without it, z of all but GLB.
 
     Raises:
         InputError: If it is missing, cut, contradicts itself or the caller, is empty, or fails the guard.
     """
     _reader(path)  # an unknown ending is refused before anything is read
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
-    return parse_mesh(data, path, unit=unit, space=space, space_is_default=space_is_default)
+    return parse_mesh(data, path, unit=unit, space=space, space_is_default=space_is_default, up=up)
 
 
 def parse_mesh(
@@ -83,6 +88,7 @@ def parse_mesh(
     unit: Unit,
     space: Space,
     space_is_default: bool = False,
+    up: Up | None = None,
     stretch: NDArray[np.float64] | None = None,
 ) -> TriangleMesh:
     """The same of a file that has been read; it is not opened again.
@@ -93,6 +99,7 @@ def parse_mesh(
         unit: The unit of its coordinates.
         space: Their space.
         space_is_default: As in `read_mesh`.
+        up: As in `read_mesh`.
         stretch: Shape (3,): factors of the file's axes on top of its unit, as a URDF states them.
 
     Raises:
@@ -105,8 +112,16 @@ def parse_mesh(
         raw = reader(data, name)
         stated = raw.space or in_text
         actual = space if stated is None else _actual_space(stated, space, default=space_is_default, where=name)
-        vertices = to_lps(raw.vertices, actual) * (unit.mm if stretch is None else unit.mm * stretch)
+        vertices = to_lps(_z_up(raw.vertices, up, path), actual) * (unit.mm if stretch is None else unit.mm * stretch)
     return guard_mesh(vertices, raw.faces, where=name)
+
+
+def _z_up(vertices: NDArray[np.float64], up: Up | None, path: Path) -> NDArray[np.float64]:
+    """Points (n, 3) of a file, turned by a quarter about x where its y is up."""
+    if up is None and path.suffix.lower() == ".glb":
+        allowed = 'up = "y" (turned to z up) or up = "z" (kept as it is), or another format'
+        raise InputError(UP_NOT_STATED, where=path, allowed=allowed, code="up_not_stated")
+    return vertices if up is not Up.Y else vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
 
 
 def _stated_space(data: bytes) -> Space | None:

@@ -8,9 +8,8 @@ from typing import Annotated
 
 import typer
 
-from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, PROGRAM_FAILED
+from puncture_twin.twin.jobs.exit_codes import finish
 from puncture_twin.twin.jobs.options import CohortOption, JobsOption, JsonOption
-from puncture_twin.twin.jobs.terminal import print_answer
 from puncture_twin.twin.report.progress import progress_display
 
 batch_app = typer.Typer(
@@ -33,7 +32,7 @@ def _plan(
 
     with progress_display() as progress:
         run = plan_cohort(cohort, out_dir, arm=False if no_arm else None, dry=dry_run, watcher=progress)
-    print_answer(run.summary(jobs), plan_text(run, jobs), as_json)
+    finish("batch plan", run, run.summary(jobs), plan_text(run, jobs), as_json)
 
 
 @batch_app.command("run")
@@ -59,9 +58,7 @@ def _run(
     where = Where(part, scheduler, jobs, pages, Limits(memory_mb, timeout_s))
     with progress_display() as progress:
         counts = run_part(out_dir, where, progress)
-    print_answer(run_summary(out_dir, counts), run_text(out_dir, counts), as_json)
-    if not counts.whole:
-        raise typer.Exit(PROGRAM_FAILED if counts.ended[PROGRAM_FAILED] else ANSWER_IS_NO)
+    finish("batch run", counts, run_summary(out_dir, counts), run_text(out_dir, counts), as_json)
 
 
 @batch_app.command("status")
@@ -72,7 +69,7 @@ def _status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
 
     with progress_display() as progress:
         state = cohort_state(out_dir, partial(progress.count, "cases"))
-    print_answer(state.summary(), state_text(state), as_json)
+    finish("batch status", state, state.summary(), state_text(state), as_json)
 
 
 @batch_app.command("merge")
@@ -92,9 +89,7 @@ def _merge(
 
     with progress_display() as progress:
         merged = merge_cohort(out_dir, expect, tolerance, progress)
-    print_answer(merged.summary(), merge_text(merged), as_json)
-    if not merged.as_expected:
-        raise typer.Exit(ANSWER_IS_NO)
+    finish("batch merge", merged, merged.summary(), merge_text(merged), as_json)
 
 
 @batch_app.command("compare")
@@ -110,4 +105,4 @@ def _compare(
 
     found = compare(read_cases(before), read_cases(after))
     summary = {"counts": dict(found.counts), "cases": [change_summary(one) for one in found.changes]}
-    print_answer(summary, compare_text(found), as_json)
+    finish("batch compare", found, summary, compare_text(found), as_json)

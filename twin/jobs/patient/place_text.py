@@ -30,6 +30,7 @@ def place_text(run: PlaceRun) -> str:
         lines += ["the best, for the case (in place of its [registration] or [robot.mount]):", ""]
         lines += [f"  {line}" for line in str(best).splitlines()]
         lines += ["", "a proposal: where the arm then really stands, markers must say ([registration])"]
+    lines += [f"warning: {warning}" for warning in run.document["warnings"]]
     seconds = ", ".join(f"{stage} {spent:.1f}" for stage, spent in run.context.stages.seconds.items())
     return "\n".join([*lines, f"seconds: {seconds}", "look at:", *(f"  {path}" for path in run.files)])
 

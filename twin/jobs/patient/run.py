@@ -16,7 +16,13 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
-from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary, window_summary
+from puncture_twin.twin.jobs.patient.summaries import (
+    plan_summary,
+    rehearsal_failures,
+    rehearsal_summary,
+    trial_failures,
+    window_summary,
+)
 
 if TYPE_CHECKING:
     from puncture_twin.twin.rehearsal.distribution import Distribution
@@ -73,6 +79,14 @@ class Run:
         found, row = pick
         return self.context.entry_facts(found.path.entry_ct[row], found.outward_ct[row])
 
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """How the rehearsed needle missed or touched, and where more trials did than the case allows; "" for none."""
+        if self.rehearsal is None:
+            return ()
+        of_many = () if self.distribution is None else trial_failures(self.context.case, self.distribution)
+        return (*rehearsal_failures(self.context, self.rehearsal), *of_many)
+
     def with_files(self, *files: Path) -> Run:
         """The run with files more."""
         return replace(self, files=(*self.files, *files))
@@ -93,6 +107,7 @@ class Run:
             "safe_cone_from": found.cone_source,
             "plan": None if self.plan is None else plan_summary(self.plan) | at_patient,
             "rehearsal": None if self.rehearsal is None else rehearsal_summary(self.rehearsal),
+            **({} if self.rehearsal is None else {"failures": list(self.failures)}),
             **({} if self.distribution is None else {"distribution": self.distribution.summary()}),
             "cross_check": None if self.checked is None else asdict(self.checked),
             "certificate": None if self.certificate is None else self.certificate.summary(),

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.fits.distortion import Distortion
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.search.selection.windows import Window
+from puncture_twin.planning.uncertainty.chances import touch_limit
 
 if TYPE_CHECKING:  # they bring export and simulator with them
     from puncture_twin.planning.export.exporter import Exported
+    from puncture_twin.twin.rehearsal.distribution import Distribution
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
 
@@ -118,6 +124,35 @@ def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
         "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
         **({} if rehearsal.standing is None else rehearsal.standing.summary()),
     }
+
+
+def rehearsal_failures(context: CaseContext, rehearsal: Rehearsal) -> tuple[str, ...]:
+    """How the needle of one room missed its target, and what it or the arm touched, one sentence each."""
+    avoided = (one.name for one in context.anatomy.checked if one.demands_margin)
+    touched = [name for name in avoided if np.min(rehearsal.clearance_mm.get(name, np.inf)) < 0.0]
+    case, tip_ct = context.case, rehearsal.tip_true_ct[-1:]
+    if case.hit_radius_mm is not None:
+        hit = bool(np.linalg.norm(tip_ct[0] - rehearsal.target_true_ct) < case.hit_radius_mm)
+    else:
+        hit = bool(inside_each(context.anatomy.structure(case.target_structure).mesh, tip_ct)[0])
+    return (
+        *([] if hit else ["the tip missed the target"]),
+        *(f"the needle touched {name}" for name in touched),
+        *sorted({f"the arm's {one.link} touched {one.body}" for one in rehearsal.contacts}),
+    )
+
+
+def trial_failures(case: Case, found: Distribution) -> Iterator[str]:
+    """Where more of many rooms missed or touched than the case's limits of the chances allow, one sentence each."""
+    if not len(found):
+        yield "in no trial did the arm reach the pose"
+        return
+    least, hit, touched = case.search.min_hit or 0.0, float(found.hit.mean()), found.touched.mean(axis=0)
+    if hit < least:
+        yield f"{100 * hit:.2f} % of the trials hit the target; search.min_hit demands {100 * least:.2f} %"
+    for name, share in zip(found.structures, touched.tolist(), strict=True):
+        if share > (most := touch_limit(case, name)):
+            yield f"{100 * share:.2f} % of the trials touched {name}; the case allows {100 * most:.2f} %"
 
 
 def export_summary(done: Exported, case_checked: bool) -> dict[str, Any]:

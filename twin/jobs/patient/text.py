@@ -129,6 +129,7 @@ def _rehearsal(run: Run) -> list[str]:
         f"  {run.rehearsal.force_text}",
         f"  {_true_needle(*nearest)}",
         f"  arm contacts: {'; '.join(done['contacts']) or 'none'}",
+        *(f"  the answer is no: {failure}" for failure in run.failures),
     ]
 
 

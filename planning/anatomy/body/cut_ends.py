@@ -1,0 +1,195 @@
+"""Where an image was cut through the body, and filled up with air behind the face at which it was cut.
+
+Resampling, padding to a common size and some exports lay air around an image, with the noise of a scanner or without.
+Then no face of the file cuts the body, and the face at which it was cut looks like skin. But no body ends by itself as
+wide as it is a few millimetres before, across the bed; and no organ ends where all else does. Such a face is a cut,
+whatever lies behind it, and what lies behind it is left out: the image ends there, as it once did.
+
+What cannot be told: where the case says that it shows a phantom, one that ends flat is taken to be whole, unless a
+structure ends there that does not run through it from end to end; and a face at one of the bed's sides that cuts no
+organ may as well be pressed on something (`puncture_twin.planning.anatomy.body.flat_side`). The key ``cut`` of the skin
+says what is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.body.field_of_view import SIDES
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+SPECK_MM2 = 100.0
+"""What is dense in a slice and smaller is noise, a line or a sheet."""
+THICK_MM = 12.0
+"""A ball of this radius fits into a body where it was cut, and into no board, sheet or cushion's skin."""
+WIDE = 0.75
+"""A ball's outermost slice is at most half as large as the next one, and a lying cylinder's at most 0.71 of it."""
+ROUND_MM = 150.0
+"""No head, foot or stump is flatter than a ball of this radius: its outermost slice is no larger than such a cap."""
+CAP_MM2 = 100.0
+"""An organ that was cut has a flat end of this area at least."""
+WALL = 0.5
+"""What ends there over so much of the face is the body itself, or a phantom's wall, and no organ that was cut."""
+AT_PLANE = 0.75
+"""Of a voxel: so near to the face ends what was cut there."""
+
+Box = tuple[tuple[int, int], ...]
+"""First voxel and the one after the last, along each axis."""
+
+FILLED = (
+    "behind the body's {names} side the image goes on with nothing but air, up to {voxels} voxels: it was cut there "
+    "and filled up (cut in the skin's table says otherwise)"
+)
+ENDS_FLAT = (
+    "the phantom ends flat at its {names} side, where no structure is cut that does not run through it: it counts as "
+    "whole (cut in the skin's table says otherwise)"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What an image holds that is denser than air, by the slices across each axis.
+
+    Attributes:
+        shape: Of the image, voxels.
+        T_ct_index: Shape (4, 4), voxel index to LPS mm.
+        last: Shape (3, 2), the outermost slice that holds something at the low and the high end of each axis.
+        area_mm2: Shape (3, 2), how much that is.
+        thick: Shape (3, 2), whether it is thick enough for a body.
+        wide: Shape (3, 2), whether it is wider than any round body is that ends there by itself.
+    """
+
+    shape: tuple[int, int, int]
+    T_ct_index: Floats
+    last: NDArray[np.int64]
+    area_mm2: Floats
+    thick: Bools
+    wide: Bools
+
+    @property
+    def beyond(self) -> NDArray[np.int64]:
+        """Shape (3, 2), how many slices without content lie outside of it."""
+        return np.stack([self.last[:, 0], np.array(self.shape) - 1 - self.last[:, 1]], axis=1)
+
+    @property
+    def inside(self) -> bool:
+        """Whether the image shows all of it."""
+        return bool((self.beyond > 0).all())
+
+    def box(self, cut: Bools) -> Box:
+        """The image without what lies behind the faces at which it was cut, those of shape (3, 2)."""
+        low = np.where(cut[:, 0], self.last[:, 0], 0)
+        high = np.where(cut[:, 1], self.last[:, 1] + 1, self.shape)
+        return tuple((int(a), int(b)) for a, b in zip(low, high, strict=True))
+
+
+def content_of(dense: Bools, T_ct_index: Floats) -> Content:
+    """Where what is denser than air ends in an image, and how.
+
+    Args:
+        dense: Shape (nx, ny, nz), axes running to the left, back and head.
+        T_ct_index: Shape (4, 4), voxel index to LPS mm.
+    """
+    spacing_mm = spacing_of(T_ct_index)
+    last, area = np.zeros((3, 2), np.int64), np.zeros((3, 2))
+    thick, wide = np.zeros((3, 2), bool), np.zeros((3, 2), bool)
+    for axis in range(3):
+        step_mm, across_mm = float(spacing_mm[axis]), np.delete(spacing_mm, axis)
+        areas = np.count_nonzero(dense, axis=tuple(k for k in range(3) if k != axis)) * float(np.prod(across_mm))
+        held = np.flatnonzero(areas >= SPECK_MM2)
+        for end, k in enumerate(held[[0, -1]] if len(held) else (0, len(areas) - 1)):
+            next_area = areas[np.clip(k + (1, -1)[end], 0, len(areas) - 1)]
+            last[axis, end], area[axis, end] = k, areas[k]
+            thick[axis, end] = _is_thick(dense.take(k, axis=axis), across_mm)
+            wide[axis, end] = areas[k] > min(WIDE * next_area, 2.0 * np.pi * ROUND_MM * step_mm)
+    return Content((dense.shape[0], dense.shape[1], dense.shape[2]), T_ct_index, last, area, thick, wide)
+
+
+def _is_thick(section: Bools, spacing_mm: Floats) -> bool:
+    """Whether a disc of `THICK_MM` fits into a section; beyond the image it goes on."""
+    if not section.any():
+        return False
+    reach = np.ceil(THICK_MM / spacing_mm).astype(int)
+    padded = np.pad(section, [(r, r) for r in reach], mode="edge")
+    return bool(scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm).max() > THICK_MM)
+
+
+def cut_ends(content: Content, organs: Iterable[tuple[TriangleMesh, float]], *, whole: bool) -> Bools:
+    """The sides at which an image was cut and then filled up, shape (3, 2).
+
+    A side without anything to tell by, behind which lie as many slices as behind one that was cut, counts as cut too;
+    but not of a whole phantom, in the middle of its image.
+
+    Args:
+        content: Of the image.
+        organs: Structures inside the body, LPS mm, and the longest side of the voxels that they were made of.
+        whole: Whether the body may end flat by itself, and what runs through it too, as phantoms do.
+    """
+    filled = content.thick & (content.beyond > 0)
+    across_bed = np.array([[False], [False], [not whole]])
+    cut = filled & across_bed & content.wide
+    found = list(organs) if (filled & ~cut).any() else []
+    for axis, end in np.argwhere(filled & ~cut):
+        sides = [axis, end], [axis, 1 - end]
+        cut[axis, end] = any(
+            _ends_flat(content, organ, *sides[0]) and not (whole and _ends_flat(content, organ, *sides[1]))
+            for organ in found
+        )
+    alike = (content.beyond > 0) & np.isin(content.beyond, content.beyond[cut])
+    return np.asarray(cut if whole else cut | alike)
+
+
+def _ends_flat(content: Content, organ: tuple[TriangleMesh, float], axis: int, end: int) -> bool:
+    """Whether an organ has a flat end in the outer face of the outermost slice, and is not all of what ends there."""
+    mesh, voxel_mm = organ
+    to_index = np.linalg.inv(content.T_ct_index)[axis] * (1.0 if end else -1.0)
+    face = (content.last[axis, end] + 0.5) if end else (0.5 - content.last[axis, end])
+    near = AT_PLANE * max(1.0, voxel_mm / float(spacing_of(content.T_ct_index)[axis]))
+    at = mesh.vertices @ to_index[:3] + to_index[3]
+    if abs(at.max() - face) > near:
+        return False
+    a, b, c = np.moveaxis(mesh.triangles[np.all(at[mesh.faces] > at.max() - near / 3.0, axis=1)], 1, 0)
+    area_mm2 = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
+    return bool(CAP_MM2 < area_mm2 < WALL * content.area_mm2[axis, end])
+
+
+def spacing_of(T_ct_index: Floats) -> Floats:
+    """Voxel size along each axis, shape (3,), mm."""
+    return np.asarray(np.linalg.norm(T_ct_index[:3, :3], axis=0))
+
+
+def shifted(T_ct_index: Floats, box: Box) -> Floats:
+    """Shape (4, 4), voxel index in a box of an image to LPS mm."""
+    T_ct_box = T_ct_index.copy()
+    T_ct_box[:3, 3] += T_ct_box[:3, :3] @ [low for low, _ in box]
+    return T_ct_box
+
+
+def stated_ends(names: Iterable[str]) -> Bools:
+    """Sides by their names, shape (3, 2)."""
+    cut = np.zeros((3, 2), bool)
+    for name in names:
+        cut[SIDES[name]] = True
+    return cut
+
+
+def end_warnings(content: Content, cut: Bools, whole: bool) -> tuple[str, ...]:
+    """What was left out behind cut faces, and which flat ends of a phantom were taken for its own."""
+    filled = cut & (content.beyond > 0)
+    flat = np.array([[False], [False], [whole]]) & content.thick & content.wide & (content.beyond > 0) & ~cut
+    said = []
+    if filled.any():
+        said.append(FILLED.format(names=_names(filled), voxels=int(content.beyond[filled].max())))
+    if flat.any():
+        said.append(ENDS_FLAT.format(names=_names(flat)))
+    return tuple(said)
+
+
+def _names(sides: Bools) -> str:
+    return ", ".join(name for name, side in SIDES.items() if sides[side])

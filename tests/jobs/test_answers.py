@@ -1,0 +1,138 @@
+"""Done, and the answer is no: one rule for each command, and where a rehearsal has it."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import typer
+
+from puncture_twin.run_twin import app
+from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, OK, PROGRAM_FAILED, RULES, finish
+from puncture_twin.twin.jobs.patient.run import Run
+from puncture_twin.twin.jobs.patient.summaries import rehearsal_failures, trial_failures
+
+ROOT = Path(__file__).parents[2]
+
+
+def commands(group, before=""):
+    """Every command by its whole name."""
+    for name, command in group.commands.items():
+        below = hasattr(command, "commands")
+        yield from commands(command, f"{before}{name} ") if below else [f"{before}{name}"]
+
+
+def test_every_command_has_its_rule_and_the_page_says_it():
+    """No command without one, no rule of another; the page of the command line lists them as they are."""
+    named = [name.partition(" --")[0] for name in RULES]
+    assert set(named) == set(commands(typer.main.get_command(app)))
+    page = (ROOT / "docs" / "reference" / "command-line.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `([^`]+)` \| (.+) \|$", page.split("## `demo`")[0], re.MULTILINE))
+    assert rows == {name: rule.no for name, rule in RULES.items()}
+
+
+def test_no_command_ends_by_another_rule():
+    """Where commands are parsed, nothing else gives an exit code, and what is printed is what a rule is asked about."""
+    for file in (ROOT / "run_twin.py", *(ROOT / "twin" / "jobs").rglob("*commands.py")):
+        text = file.read_text(encoding="utf-8")
+        assert re.findall(r"typer\.Exit\(|print_answer\(|ANSWER_IS_NO", text) == [], file
+
+
+CASES = {
+    "demo": (SimpleNamespace(failures=()), SimpleNamespace(failures=("missed",))),
+    "rehearse": (SimpleNamespace(failures=()), SimpleNamespace(failures=("missed",))),
+    "rehearse --sweep": (SimpleNamespace(whole=True), SimpleNamespace(whole=False)),
+    "search": tuple(
+        SimpleNamespace(candidates=SimpleNamespace(safe=np.array(safe))) for safe in ([False, True], [False])
+    ),
+    "check": (SimpleNamespace(safe=True), SimpleNamespace(safe=False)),
+    "compare": (SimpleNamespace(safe=True), SimpleNamespace(safe=False)),
+    "touch": (SimpleNamespace(suffices=True), SimpleNamespace(suffices=False)),
+    "pivot": tuple(SimpleNamespace(pivot=SimpleNamespace(large=large)) for large in (False, True)),
+    "servo": (SimpleNamespace(passed=True), SimpleNamespace(passed=False)),
+    "reproduce": (SimpleNamespace(passed=True), SimpleNamespace(passed=False)),
+    "batch run": tuple(SimpleNamespace(whole=whole, ended=Counter({2: 1})) for whole in (True, False)),
+    "batch merge": (SimpleNamespace(as_expected=True), SimpleNamespace(as_expected=False)),
+}
+
+
+@pytest.mark.parametrize("command", sorted(RULES))
+def test_a_command_ends_with_the_code_of_its_rule(command, capsys):
+    """0 for yes, 1 for no; what never says no ends with 0, or with an error of its own."""
+    yes, no = CASES.get(command, (None, None))
+    finish(command, yes, {"a": 1}, "found", False)
+    assert capsys.readouterr().out == "found\n"
+    if no is not None:
+        with pytest.raises(typer.Exit) as ended:
+            finish(command, no, {"a": 1}, "found", True)
+        assert ended.value.exit_code == ANSWER_IS_NO
+        assert capsys.readouterr().out == '{"a": 1}\n'
+    assert RULES[command].code(yes) == OK
+
+
+def test_a_batch_in_which_the_program_failed_ends_with_3():
+    """It says nothing about a case."""
+    counts = SimpleNamespace(whole=False, ended=Counter({PROGRAM_FAILED: 1}))
+    assert RULES["batch run"].code(counts) == PROGRAM_FAILED
+
+
+def context(radius_mm=5.0, **limits):
+    """A case whose target is a ball, with two structures that must not be touched and one that may."""
+    settings = SimpleNamespace(min_hit=None, max_touch=None, max_touch_of={})
+    vars(settings).update(limits)
+    kinds = (("vessel", True), ("rib", True), ("fat", False))
+    checked = [SimpleNamespace(name=name, demands_margin=demands) for name, demands in kinds]
+    case = SimpleNamespace(hit_radius_mm=radius_mm, search=settings)
+    return SimpleNamespace(case=case, anatomy=SimpleNamespace(checked=checked))
+
+
+def room(off_mm=1.0, contacts=(), **clearance_mm):
+    """A rehearsal that ended so far from its target, with the least clearances."""
+    return SimpleNamespace(
+        tip_true_ct=np.array([[9.0, 9.0, 9.0], [off_mm, 0.0, 0.0]]),
+        target_true_ct=np.zeros(3),
+        clearance_mm={name: np.array([20.0, mm]) for name, mm in clearance_mm.items()},
+        contacts=contacts,
+    )
+
+
+def test_a_room_says_no_where_it_misses_or_touches():
+    """The tip outside of the target, the needle in what must not be touched, the arm against anything."""
+    assert rehearsal_failures(context(), room(vessel=0.1, fat=-3.0)) == ()
+    assert rehearsal_failures(context(), room(5.1)) == ("the tip missed the target",)
+    assert rehearsal_failures(context(), room(vessel=-0.1, rib=2.0)) == ("the needle touched vessel",)
+    met = [SimpleNamespace(link="forearm", body="patient")] * 2
+    assert rehearsal_failures(context(), room(contacts=met)) == ("the arm's forearm touched patient",)
+
+
+class Trials(SimpleNamespace):
+    """Some of many rooms."""
+
+    def __len__(self):
+        """How many."""
+        return len(self.hit)
+
+
+def test_trials_say_no_where_more_miss_or_touch_than_the_case_allows():
+    """Without limits they say nothing; with them, a share above one does, a share at it does not."""
+    touched = np.array([[True, False], [False, False], [False, True], [False, True]])
+    found = Trials(hit=np.array([True, True, True, False]), structures=("vessel", "rib"), touched=touched)
+
+    def failures(**limits):
+        return len(list(trial_failures(context(**limits).case, found)))
+
+    assert failures() == 0
+    assert (failures(min_hit=0.75), failures(min_hit=0.76)) == (0, 1)
+    assert (failures(max_touch=0.5), failures(max_touch=0.3), failures(max_touch=0.2)) == (0, 1, 2)
+    assert failures(max_touch=0.2, max_touch_of={"rib": 0.6}) == 1
+    assert len(list(trial_failures(context().case, Trials(hit=np.zeros(0))))) == 1
+
+
+def test_a_run_without_rehearsal_has_nothing_to_fail_by():
+    """Of a search, a plan."""
+    run = Run(None, None, ())
+    assert run.failures == ()
