@@ -1,0 +1,127 @@
+"""Small inputs that once were read wrongly, or refused for a wrong reason: each is made anew, and what is right is asked.
+
+The programs that make them lie beside the real data, where there is any. By code and by numbers; `init` of a target in
+the lesion, unless it says otherwise.
+"""
+
+import importlib.util
+import json
+import sys
+
+import pytest
+from places import DATA
+
+from puncture_twin.run_twin import main
+
+CASES = DATA.parent / "cases"
+pytestmark = pytest.mark.skipif(
+    not (CASES / "make_cases.py").is_file(), reason="the small cases are not on this machine"
+)
+
+T1 = "70,10,10"
+T2 = "25,25,-40"
+REAL = "70,185,365"
+
+READ = ["labels_off_1e-5", "labels_off_1e-2", "labels_4d", "label_ignore", "mesh_header_lps", "dicom_class_in_meta"]
+"""Equal to what is right but for their writing."""
+
+REFUSED = {
+    "real_shift_y15": (REAL, "own grid, whose matrix it has: moved by (0.0, 15.0, 0.0) mm"),
+    "real_scaled": (REAL, "scaled by 1.11"),
+    "reversed_y": (T2, "mirrored in y"),
+    "reversed_z": (T2, "mirrored in z"),
+    "mesh_mirrored_y": (T2, "mirrored in y"),
+    "mesh_mirrored_z": (T2, "mirrored in z"),
+    "mesh_lps_as_ras": (T1, "x and y negated"),
+    "labels_grid_lost": (T1, "where its voxels lie was lost"),
+    "mesh_glb_y_up": (T1, "--up y"),
+    "mask_link_dangles": (T2, "portal_vein.nii.gz"),
+    "ct_offset_1024": (T1, "-1024"),
+    "labels_blended": (T1, "interpolation"),
+    "label_without_name": (T1, "labels.csv lacks 9"),
+    "labels_of_regions": (T1, "'liver' is a list of labels"),
+    "dicom_big_endian": (T1, "Big Endian"),
+    "dicom_no_rescale": (T1, "RescaleSlope"),
+}
+"""Target, and what of the cause the line must hold."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A function: the folder of one case, made at first use."""
+    sys.path.insert(0, str(CASES))
+    try:
+        spec = importlib.util.spec_from_file_location("make_cases", MAKER)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(CASES))
+    root = tmp_path_factory.mktemp("cases")
+
+    def make(name):
+        folder = root / name
+        if not folder.is_dir():
+            folder.mkdir()
+            module.CASES[name](folder)
+        return folder
+
+    return make
+
+
+def init(folder, target):
+    """The exit code of `init` on a folder."""
+    return main(["init", str(folder), "--space", "RAS", "--force", "--target", target, "--hit-radius", "5"])
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_wrong_is_refused_by_its_cause(made, capsys, name):
+    """Exit code 2, one line, nothing written."""
+    target, cause = REFUSED[name]
+    folder = made(name)
+    assert init(folder, target) == 2
+    assert cause in capsys.readouterr().err
+    assert not (folder / "case.toml").exists()
+
+
+def test_frames_of_a_seg_that_lie_elsewhere_are_refused(made, capsys):
+    """By 12 mm, which the line says."""
+    assert init(made("seg_off_12mm"), "25,25,-36") == 2
+    assert "12." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["trunk", *READ])
+def test_what_is_right_is_read(made, name):
+    """And one direction gets an answer."""
+    folder = made(name)
+    assert init(folder, T1) == 0
+    assert main(["check", str(folder), "--no-arm", "--theta", "40", "--beta", "90"]) in (0, 1)
+
+
+@pytest.mark.parametrize("name", ["mask_npz", "mask_part", "mask_zst", "mask_subfolder"])
+def test_a_mask_that_is_not_read_is_named(made, capsys, name):
+    """The vessel in the path was passed over in silence."""
+    assert main(["check", str(made(name)), "--no-arm", "--theta", "0", "--beta", "0"]) == 2
+    assert "vessel" in capsys.readouterr().err
+
+
+def test_what_a_device_cannot_read_is_refused(made, capsys):
+    """Degrees under rad, radians under deg."""
+    joints = made("joints_in_degrees") / "joints.csv"
+    assert main(["mirror", "--case", "meshes/abdomen", "--from", str(joints)]) == 2
+    assert main(["plan", str(made("home_in_radians")), "--theta", "0", "--beta", "0"]) == 2
+    assert capsys.readouterr().err.count("?") >= 2
+
+
+def test_a_scale_between_two_lists_is_named(made, capsys):
+    """1.6 %, which noise does not explain."""
+    folder = made("scale_1.6_percent")
+    command = [
+        "register",
+        str(folder / "markers_ct.csv"),
+        str(folder / "markers_base.csv"),
+        "--target",
+        "0,0,0",
+        "--json",
+    ]
+    assert main(command) == 0
+    assert "1.016" in json.dumps(json.loads(capsys.readouterr().out)["flags"])
