@@ -1,4 +1,4 @@
-"""Small inputs that once were read wrongly, or refused for a wrong reason: each is made anew, and what is right is asked.
+"""Small inputs that once were read wrongly, or refused for a wrong reason: made anew, and what is right is asked.
 
 The programs that make them lie beside the real data, where there is any. By code and by numbers; `init` of a target in
 the lesion, unless it says otherwise.
