@@ -8,7 +8,7 @@ from puncture_twin.twin.plant.scanner.nifti_writer import write_nifti
 PHANTOMS = dict(phantoms())
 
 CASE = """schema = 2
-region = "phantom"
+region = "{region}"
 name = "trunk"
 space = "LPS"
 [target]
@@ -35,7 +35,7 @@ role = "target"
 ORGANS = {"liver": 1, "spleen": 2, "kidney_right": 3, "kidney_left": 4, "colon": 5, "aorta": 7, "vertebrae": 8}
 
 
-def write_trunk(folder, T_slip, more=""):
+def write_trunk(folder, T_slip, more="", region="abdomen"):
     """The phantom's CT, and its labels at a map's grid that was moved by a slip (4, 4)."""
     patient = PHANTOMS["trunk"]
     write_nifti(folder / "ct.nii.gz", patient.hu.astype(np.int16), patient.T)
@@ -45,7 +45,7 @@ def write_trunk(folder, T_slip, more=""):
         + ('role = "traverse"\n' if name == "liver" else 'role = "avoid"\nmargin_mm = 2.0\n')
         for name, label in ORGANS.items()
     ]
-    (folder / "case.toml").write_text(CASE.format(more=more) + "".join(rows) + "[end]\nstructures = 9\n")
+    (folder / "case.toml").write_text(CASE.format(more=more, region=region) + "".join(rows) + "[end]\nstructures = 9\n")
     return folder / "case.toml"
 
 

@@ -40,14 +40,16 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
     Raises:
         InputError: Everything that is refused, in one line; its code and numbers are those of the first.
     """
+    places = tuple(label_placement(case, anatomy))
+    on_edges = {one.code for one in places} == {"labels_on_edges"}
     placed = (
-        *label_placement(case, anatomy),
+        *places,
         *target_place(case, anatomy),
         *target_in_vessel(case),
         *target_in_other_space(case, anatomy),
         *order_of_organs(case, anatomy),
         *inside_out(case, anatomy),
-        *densities(anatomy),
+        *densities(case, anatomy, on_edges=on_edges),
     )
     _refuse(case, placed)  # what follows looks from the target, which must lie in the body
     rest = (

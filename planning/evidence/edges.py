@@ -49,6 +49,9 @@ MOST_SHIFT_MM = 50.0
 
 SCALES = (0.9, 0.95, 1.05, 1.1)
 
+TURNS = np.radians([-24.0, -12.0, -6.0, 6.0, 12.0, 24.0])
+"""About each axis: what was resampled in another pose lies turned on the CT's own grid."""
+
 LEAST_SEEN = 0.5
 """A placement that leaves less than this in the image, of the points that are in it as they are, says nothing."""
 
@@ -65,7 +68,7 @@ class Placement(NamedTuple):
     """Another place of the surfaces.
 
     Attributes:
-        kind: ``shift``, ``scale``, ``axes``, ``grid`` or ``unit``.
+        kind: ``shift``, ``turn``, ``scale``, ``axes``, ``grid`` or ``unit``.
         T: Shape (4, 4), maps the surfaces as they are to where they would lie, LPS mm.
     """
 
@@ -193,15 +196,18 @@ def sample_surfaces(meshes: Sequence[TriangleMesh], count: int = POINTS) -> Samp
     return Sample(where, np.concatenate(normals), structure, patch)
 
 
-def shifts(axes: Floats, voxel_mm: Floats) -> Iterator[Placement]:
+def shifts(axes: Floats, voxel_mm: Floats, most_mm: Floats | float = MOST_SHIFT_MM) -> Iterator[Placement]:
     """Moved along each axis, doubling from the least shift that counts.
 
     Args:
         axes: Shape (3, 3), unit columns.
         voxel_mm: Shape (3,), of the coarser of image and labels along these axes.
+        most_mm: The largest shift, of all axes or of each (3,); the least is tried whatever it is.
     """
-    for axis, step in zip(axes.T, least_shift_mm(voxel_mm), strict=True):
-        while step <= MOST_SHIFT_MM:
+    largest = np.broadcast_to(np.minimum(most_mm, MOST_SHIFT_MM), 3)
+    for axis, least, most in zip(axes.T, least_shift_mm(voxel_mm), largest, strict=True):
+        step = least
+        while step <= max(least, most):
             for along in (step, -step):
                 T = np.eye(4)
                 T[:3, 3] = along * axis
@@ -218,6 +224,12 @@ def scalings(about: Sequence[Floats], factors: Sequence[float] = SCALES, kind: s
     """Made larger and smaller about points (3,)."""
     for point, factor in itertools.product(about, factors):
         yield Placement(kind, _about(point, np.eye(3) * factor))
+
+
+def turns(about: Floats, axes: Floats) -> Iterator[Placement]:
+    """Turned about each axis (unit columns (3, 3)) through a point (3,)."""
+    for axis, angle in itertools.product(axes.T, TURNS):
+        yield Placement("turn", _about(about, exp_rotation(axis * angle)))
 
 
 def axis_slips(about: Sequence[Floats], axes: Floats) -> Iterator[Placement]:

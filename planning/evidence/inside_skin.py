@@ -162,7 +162,10 @@ def outside_skin(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding
     for structure, part in zip(
         placed, kept_inside_skin(meshes, anatomy.skin, case.target_ct, tolerances, cache), strict=True
     ):
-        if part.fraction < USUAL_INSIDE:
+        if part.inside + part.outside == 0:
+            said = f"structure '{structure.name}' lies wholly beyond a side at which the skin was cut"
+            yield Finding("beyond_skin", Severity.WARNING, said)
+        elif part.fraction < USUAL_INSIDE:
             outside = f"{100 * (1 - part.fraction):.1f} % of its surface lies outside the skin"
             said = f"structure '{structure.name}': {outside}: {CAUSES}"
             severity = Severity.REFUSAL if part.fraction < LEAST_INSIDE else Severity.WARNING
@@ -172,6 +175,8 @@ def outside_skin(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding
 def _wholly_outside(skin: Skin, structure: Structure) -> bool:
     """Also where the skin is open, or its cut sides say nothing: no box of an organ lies beside the body's."""
     (low, high), (below, above) = skin.mesh.bounds, structure.mesh.bounds
+    if _beyond_cut(structure.mesh.bounds, skin.field_of_view, np.zeros(2)).all():
+        return False
     return bool(np.any(below > high) or np.any(above < low))
 
 

@@ -30,7 +30,7 @@ ORDER = (
     ("liver", 0, "spleen"), ("liver", 0, "stomach"), ("inferior_vena_cava", 0, "aorta"), ("gallbladder", 0, "spleen"),
     ("liver", 1, "vertebrae"), ("stomach", 1, "vertebrae"), ("aorta", 1, "vertebrae"), ("heart", 1, "vertebrae"),
     ("sternum", 1, "vertebrae"), ("urinary_bladder", 1, "sacrum"), ("liver", 1, "spine"), ("heart", 1, "spine"),
-    ("urinary_bladder", 2, "liver"), ("urinary_bladder", 2, "kidney"), ("hip", 2, "liver"), ("sacrum", 2, "liver"),
+    ("urinary_bladder", 2, "liver"), ("hip", 2, "liver"), ("sacrum", 2, "liver"),
     ("liver", 2, "heart"), ("kidney", 2, "heart"), ("femur", 2, "hip"), ("prostate", 2, "kidney"), ("hip", 2, "rib"),
     ("heart", 2, "brain"), ("lung", 2, "brain"), ("mandible", 2, "brain"),
 )  # fmt: skip
@@ -89,25 +89,33 @@ TISSUES = (
 
 
 def order_of_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
-    """Whether left lies left of right, and organs lie to each other as in a body; of surfaces, whatever they come from.
+    """Whether left lies left of right, and organs lie to each other as in a body; of all surfaces.
 
-    Refused where two and more pairs contradict each other along an axis and none agrees.
+    Refused where two and more pairs of different organs contradict each other along an axis and none agrees. Things of
+    a phantom may lie to any side.
     """
-    if case.space is Space.LOCAL:
+    if case.space is Space.LOCAL or case.region == "phantom":
         return
-    middles = {plain_name(one.name): one.mesh.bounds.mean(axis=0) for one in _named(anatomy)}
+    boxes = {plain_name(one.name): one.mesh.bounds for one in _named(anatomy)}
+    middles = {name: box.mean(axis=0) for name, box in boxes.items()}
     for axis, (one, other) in enumerate((("right", "left"), ("front", "back"), ("feet", "head"))):
-        pairs = [(a, b) for a, b in _pairs(middles, axis) if abs(middles[b][axis] - middles[a][axis]) >= CLEARLY_MM]
+        pairs = [
+            (a, b)
+            for a, b in _pairs(middles, axis)
+            if abs(middles[b][axis] - middles[a][axis]) >= CLEARLY_MM
+            and (axis == 2 or _at_one_level(boxes[a], boxes[b]))
+        ]
         wrong = [(a, b) for a, b in pairs if middles[a][axis] > middles[b][axis]]
         if not wrong:
             continue
         said = ", ".join(f"{a} lies nearer to the {other} than {b}" for a, b in wrong[:3])
-        all_wrong = len(wrong) == len(pairs) >= 2 and not case.ct.trust_labels
+        facts = max(len({_whole(pair[end]) for pair in wrong}) for end in range(2))
+        all_wrong = len(wrong) == len(pairs) and facts >= 2 and not case.ct.trust_labels
         yield Finding(
             "organs_out_of_order",
             Severity.REFUSAL if all_wrong else Severity.WARNING,
-            f"{said}: {len(wrong)} of {len(pairs)} pairs of organs lie to each other as in no body ({one} to {other}); "
-            "mirrored, turned, or names exchanged?",
+            f"{said}: {len(wrong)} of {len(pairs)} pairs of organs lie to each other as in few bodies ({one} to "
+            f"{other}); mirrored, turned, or names exchanged?",
             {"wrong": float(len(wrong)), "pairs": float(len(pairs))},
             ALLOWED,
         )
@@ -115,6 +123,16 @@ def order_of_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
 
 def _named(anatomy: Anatomy) -> list[Structure]:
     return [one for one in anatomy.structures if one.source != OWN_TARGET]
+
+
+def _whole(name: str) -> str:
+    """A vertebra's name as the spine's: one organ beside many levels of it is one fact."""
+    return "vertebrae" if name.startswith("vertebrae") else name
+
+
+def _at_one_level(box: Floats, other: Floats) -> bool:
+    """Whether two boxes (2, 3) share a height along the bed: a neck tells nothing of a belly's spine."""
+    return bool(box[0, 2] <= other[1, 2] and other[0, 2] <= box[1, 2])
 
 
 def _pairs(middles: dict[str, Floats], axis: int) -> Iterator[tuple[str, str]]:
@@ -138,11 +156,15 @@ def _is(name: str, organ: str) -> bool:
     )
 
 
-def densities(anatomy: Anatomy) -> Iterator[Finding]:
-    """Whether bones, lungs and solid organs have the Hounsfield units of such, in the case's CT."""
+def densities(case: Case, anatomy: Anatomy, *, on_edges: bool) -> Iterator[Finding]:
+    """Whether bones, lungs and solid organs have the Hounsfield units of such, in the case's CT.
+
+    Where the edges say that all lies right it is a note: lungs are then full, a liver fat, a kidney full of contrast.
+    """
     scan = anatomy.scan
-    if scan is None:
+    if scan is None or case.region == "phantom":
         return
+    severity = Severity.NOTE if on_edges else Severity.WARNING
     for tissue in TISSUES:
         meshes = [one.mesh for one in _named(anatomy) if tissue.has(one.name)]
         if not meshes:
@@ -158,7 +180,7 @@ def densities(anatomy: Anatomy) -> Iterator[Finding]:
             said = f"{100 * within:.0f} % of what the structures call {tissue.name} has the Hounsfield units of such"
             yield Finding(
                 "densities",
-                Severity.WARNING,
+                severity,
                 f"{scan.name}: {said} (at least {100 * tissue.least:.0f} % is usual): do they belong together?",
                 {"within": round(within, 3), "least": tissue.least},
             )
@@ -180,9 +202,10 @@ def _outward(mesh: TriangleMesh) -> float:
 
 
 def inside_out(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
-    """That every closed mesh is inside out: who mirrors points and keeps the triangles leaves that behind."""
+    """That closed meshes are inside out: who mirrors points and keeps the triangles leaves that behind."""
     files = {section.mesh for section in case.structure if section.mesh is not None}
     closed = [one for one in anatomy.structures if one.source in files and one.mesh.closed]
-    if len(closed) >= 2 and all(_outward(one.mesh) < 0.0 for one in closed):
-        said = f"all {len(closed)} closed meshes are inside out ({closed[0].name}, ...): were they mirrored?"
+    turned = [one.name for one in closed if _outward(one.mesh) < 0.0]
+    if len(turned) >= 2:
+        said = f"{len(turned)} of {len(closed)} closed meshes are inside out ({', '.join(turned)}): were they mirrored?"
         yield Finding("meshes_inside_out", Severity.WARNING, said)

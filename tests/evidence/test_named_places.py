@@ -51,13 +51,17 @@ def test_one_pair_of_several_is_a_warning(trunk):
 
 def test_bones_that_are_none_are_doubted(trunk):
     """The vertebrae 40 mm in front of where the CT shows them; in place, nothing is said."""
-    assert list(densities(trunk.anatomy)) == []
+    assert list(densities(trunk.case, trunk.anatomy, on_edges=False)) == []
     off = tuple(
         replace(one, mesh=one.mesh.transformed(moved(0.0, -40.0, 0.0))) if one.name == "vertebrae" else one
         for one in trunk.anatomy.structures
     )
-    found = list(densities(replace(trunk.anatomy, structures=off)))
-    assert [one.code for one in found] == ["densities"]
+    anatomy = replace(trunk.anatomy, structures=off)
+    found = list(densities(trunk.case, anatomy, on_edges=False))
+    assert [(one.code, one.severity) for one in found] == [("densities", Severity.WARNING)]
+    assert [one.severity for one in densities(trunk.case, anatomy, on_edges=True)] == [Severity.NOTE]
+    phantom = replace(trunk.case, region="phantom")
+    assert list(densities(phantom, anatomy, on_edges=False)) == []
     assert found[0].numbers["within"] < 0.5
 
 
@@ -92,3 +96,19 @@ def test_meshes_that_are_all_inside_out_are_told(trunk, ball):
 
     assert [one.code for one in inside_out(case, anatomy(inner, inner))] == ["meshes_inside_out"]
     assert list(inside_out(case, anatomy(inner, right))) == []
+
+
+def test_things_of_a_phantom_have_no_side(trunk):
+    """Rods named as who looks at them sees them: a phantom is no patient."""
+    phantom = replace(trunk.case, region="phantom")
+    assert list(order_of_organs(phantom, mirrored(trunk, 0))) == []
+
+
+def test_one_organ_beside_many_levels_is_one_fact(trunk, ball):
+    """A neck on a pillow: an aorta behind five vertebrae is warned of, not refused, and only at their height."""
+    spine = [Structure(f"vertebrae_C{n}", Role.AVOID, 1.0, ball(8, (0, -20, 20 * n)), "v") for n in range(1, 6)]
+    aorta = Structure("aorta", Role.AVOID, 1.0, ball(60, (0, 20, 60)), "a")
+    found = list(order_of_organs(trunk.case, replace(trunk.anatomy, structures=(*spine, aorta))))
+    assert [one.severity for one in found] == [Severity.WARNING]
+    below = replace(aorta, mesh=ball(10, (0, 20, -200)))
+    assert list(order_of_organs(trunk.case, replace(trunk.anatomy, structures=(*spine, below)))) == []

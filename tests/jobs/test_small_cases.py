@@ -14,9 +14,8 @@ from places import DATA
 from puncture_twin.run_twin import main
 
 CASES = DATA.parent / "cases"
-pytestmark = pytest.mark.skipif(
-    not (CASES / "make_cases.py").is_file(), reason="the small cases are not on this machine"
-)
+MAKER = CASES / "make_cases.py"
+pytestmark = pytest.mark.skipif(not MAKER.is_file(), reason="the small cases are not on this machine")
 
 T1 = "70,10,10"
 T2 = "25,25,-40"
