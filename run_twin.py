@@ -117,6 +117,9 @@ def init(
     segmentation: Annotated[
         str | None, typer.Option("--segmentation", help="Which file or folder, where FOLDER holds several.")
     ] = None,
+    trust_labels: Annotated[
+        bool, typer.Option("--trust-labels", help="You have looked: structures lie right where a check refuses them.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace a case.toml that is there.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -134,7 +137,7 @@ def init(
         raise InputError(f"{hit_radius:g}", where="--hit-radius", allowed="mm, above 0, at most 100, beside --target")
     wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation, up)
     with progress_display() as progress:
-        request = Request(folder, target, target_label, region, wanted, space is not None, hit_radius)
+        request = Request(folder, target, target_label, region, wanted, space is not None, hit_radius, trust_labels)
         run = init_case(request, force=force, watcher=progress)
     for warning in run.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -87,8 +87,8 @@ AS_IT_IS = Placement("shift", np.eye(4))
 
 CODE = "labels_beside_image"
 ALLOWED = (
-    "structures that lie where the CT shows them; [search] trust_labels = true where a person has looked at both and "
-    "knows that they do"
+    "structures that lie where the CT shows them; init --trust-labels, or [search] trust_labels = true, where a person "
+    "has looked at both and knows that they do"
 )
 
 

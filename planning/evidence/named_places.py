@@ -44,7 +44,8 @@ CLEARLY_MM = 10.0
 """Middles nearer to each other along the axis say nothing: a field of view may cut off most of an organ."""
 
 ALLOWED = (
-    "structures whose names, sides and places agree; [search] trust_labels = true where a person knows that they do"
+    "structures whose names, sides and places agree; init --trust-labels, or [search] trust_labels = true, where a "
+    "person knows that they do"
 )
 
 INWARD_MM = 2.0

@@ -7,6 +7,7 @@ end or in a folder of its own. A reader that looks for what it knows passes it o
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Collection
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -23,15 +24,30 @@ NOT_READ = "of a kind that is not read"
 
 HARMLESS = (
     *(".ds_store", "thumbs.db", "desktop.ini", ".directory", ".git*", ".datalad", ".dvc", ".dvcignore"),
-    *("statistics.json", "statistics_radiomics.json", "dataset.json", "plans.json", "preview*.png"),
-    *("readme", "readme.*", "license", "license.*", "*.txt", "*.md", "*.log"),
-    *("*.toml", "*.csv", "*.fcsv", "*.mrk.json"),
+    *(".nfs*", ".~lock.*", ".ipynb_checkpoints"),
+    *("statistics.json", "statistics_radiomics.json", "dataset.json", "plans.json"),
+    *("predict_from_raw_data_args.json", "postprocessing.pkl"),
+    *("readme", "readme.*", "license", "license.*", "*.txt", "*.md", "*.log", "*.html", "*.pdf"),
+    *("*.jpg", "*.jpeg", "*.png", "*.bmp", "*.mtl", "*.yaml", "*.yml", "*.py", "*.sh", "*.ipynb", "*.cff"),
+    *("*.toml", "*.csv", "*.tsv", "*.fcsv", "*.mrk.json", "*.mrml", "*.itksnap", "*.label", "*.ctbl"),
+    *("*sums", "*.sha256", "*.md5"),
 )
-"""Names of what holds no organ, in lower case: of file managers, of versions, what segmentation programs write beside
-their masks, cases, lists of points and plain text."""
+"""Names of what can hold no organ, in lower case: of file managers, of versions, what segmentation programs write
+beside their masks, cases, scenes, tables, lists of points, pictures and plain text."""
 
-BESIDE = (".dvc", ".json", ".md5", ".sha256")
+STRUCTURE_LIKE = re.compile(
+    r"\.(nii|nrrd|nhdr|mha|mhd|hdr|img|mgz|mgh|mnc|npz|npy|dcm|stl|obj|ply|glb|gltf|vtp|vtk|vtu|3mf|wrl)(\.|$)", re.I
+)
+"""Names of what may be a structure: of volumes and meshes, also those that are not read, packed, cut or renamed."""
+
+BESIDE = (".dvc", ".json")
 """Endings of files about a file that lies beside them, whose name they have with or without its own ending."""
+
+PROBABILITIES, VOLUMES = (".npz", ".pkl"), (".nii.gz", ".nii", ".nrrd")
+"""Endings of what nnU-Net writes about each mask, and of the mask beside it."""
+
+THUMBNAILS = "@eaDir"
+"""The folder in which a file server keeps previews, each named like the file that it shows."""
 
 APPLE_DOUBLE = "._"
 """How the name of a file begins in which macOS keeps what another file system cannot, beside the file itself."""
@@ -87,7 +103,7 @@ def _what(one: os.DirEntry[str]) -> str:
 def unaccounted(folder: Path, found: tuple[Entry, ...], known: Callable[[Path], bool], depth: int = 0) -> list[Entry]:
     """The entries of a folder that are neither known nor harmless.
 
-    A folder in it is accounted for if this program wrote it, or if it holds something and all of that is accounted for.
+    A folder in it is accounted for if it is passed over, or if all that it holds is accounted for.
 
     Args:
         folder: Where they lie.
@@ -106,16 +122,43 @@ def unaccounted(folder: Path, found: tuple[Entry, ...], known: Callable[[Path], 
 
 
 def is_harmless(name: str, names: Collection[str]) -> bool:
-    """Whether a name is that of something that holds no organ, among the names of its folder."""
+    """Whether a name is that of something that holds no organ, among the names of its folder.
+
+    A volume's or mesh's name with something behind it is so only beside that volume or mesh itself.
+    """
+    stem, _, _ = name.rpartition(".")
+    if name.endswith(PROBABILITIES) and any(stem + end in names for end in VOLUMES):
+        return True
     about = next((name.removesuffix(end) for end in BESIDE if name.endswith(end)), name)
     about = about.removeprefix(APPLE_DOUBLE)
     if about != name and any(f"{one}.".startswith(f"{about}.") and not one.endswith(BESIDE) for one in names):
         return True
-    return any(fnmatchcase(name.lower(), pattern) for pattern in HARMLESS)
+    told = not STRUCTURE_LIKE.search(name) or stem in names
+    return told and any(fnmatchcase(name.lower(), pattern) for pattern in HARMLESS)
+
+
+def is_passed_over(folder: Path) -> bool:
+    """Whether a folder is this program's output, or holds previews or versions: nothing in it is a patient's."""
+    versions = folder.name.startswith(".") and is_harmless(folder.name, ())
+    return versions or folder.name == THUMBNAILS or is_output_folder(folder)
 
 
 def _holds_known(folder: Path, known: Callable[[Path], bool], depth: int) -> bool:
-    if is_output_folder(folder):
+    if is_passed_over(folder):
         return True
-    found = entries(folder, most=MOST_INSIDE) if depth <= MOST_DEPTH else ()
-    return bool(found) and not unaccounted(folder, found, known, depth)
+    if depth > MOST_DEPTH or STRUCTURE_LIKE.search(folder.name):
+        return False
+    return not unaccounted(folder, entries(folder, most=MOST_INSIDE), known, depth)
+
+
+def structure_below(folder: Path) -> str:
+    """What is named like a volume or mesh below a folder, at any depth; "" if nothing is, and all of it was seen."""
+    seen, closed = 0, list[OSError]()
+    for top, folders, files in os.walk(folder, onerror=closed.append, followlinks=True):
+        folders[:] = [one for one in folders if not is_passed_over(Path(top, one))]
+        seen += len(folders) + len(files)
+        if named := [one for one in (*folders, *files) if STRUCTURE_LIKE.search(one)]:
+            return str(Path(top, min(named)).relative_to(folder))
+        if closed or seen > MOST_INSIDE:
+            return "what cannot be listed" if closed else f"more than {MOST_INSIDE} files"
+    return "what cannot be listed" if closed else ""

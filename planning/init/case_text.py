@@ -36,8 +36,9 @@ diameter_mm = 1.2
 theta_deg = [0, 90]
 step_deg = 2.0
 max_skin_angle_deg = 60.0
-
+{trust}
 """
+TRUSTED = "trust_labels = true  # a person has looked at CT and structures, and knows that these lie right\n"
 OWN_TARGET = "hit_radius_mm = {radius!r}  # it lies in no structure: what is hit is this ball about it"
 SKIN_OF_CT = """[[structure]]
 name = "skin"
@@ -78,6 +79,7 @@ class CaseParts:
         ct: The CT whose body is the skin, or None where a mesh is.
         sources: Each segmentation with what the case says of its structures.
         markers: Lists of points.
+        trust_labels: Whether a person has seen that the structures lie right.
     """
 
     name: str
@@ -89,6 +91,7 @@ class CaseParts:
     ct: str | None
     sources: tuple[tuple[Segmentation, Sequence[Assigned]], ...]
     markers: tuple[Markers, ...]
+    trust_labels: bool
 
     @property
     def rows(self) -> list[Assigned]:
@@ -106,6 +109,7 @@ def case_text(parts: CaseParts) -> str:
         space=parts.space,
         position=", ".join(repr(float(one)) for one in position),
         structure=own if parts.structure is None else f"structure = {quoted(parts.structure)}",
+        trust=TRUSTED if parts.trust_labels else "",
     )
     skin = "" if parts.ct is None else SKIN_OF_CT.format(ct=quoted(parts.ct))
     count = sum(row.kind != "ignore" for row in parts.rows) + (parts.ct is not None)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -13,12 +13,21 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.output.manifest import is_output_folder
 from puncture_twin.planning.formats.dicom.recognise import list_folder
 from puncture_twin.planning.formats.dicom.storage import Kind
-from puncture_twin.planning.formats.folder import FILE, FOLDER, NOT_READ, Entry, entries, unaccounted
+from puncture_twin.planning.formats.folder import (
+    FILE,
+    FOLDER,
+    NOT_READ,
+    STRUCTURE_LIKE,
+    Entry,
+    entries,
+    is_passed_over,
+    structure_below,
+    unaccounted,
+)
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of, whole_labels
-from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, not_read
+from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, not_read, refuse_one_name, structure_name
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS
 from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING
 from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
@@ -27,7 +36,7 @@ from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, N
 from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.init.file_masks import file_masks
-from puncture_twin.planning.init.label_files import Mask, Masks, label_file, mask_of
+from puncture_twin.planning.init.label_files import Mask, Masks, is_named_by_table, label_file, mask_of
 from puncture_twin.planning.init.mesh_folder import is_mesh, mesh_folder
 from puncture_twin.planning.init.segmentation import Place, Segmentation
 
@@ -42,12 +51,6 @@ MANY_PAIRS, LEAST_ALIKE = 1000, 0.5
 MOST_AIR = 200
 """Up to here the most frequent value of an image without Hounsfield units is taken for air that is stored from 0 on."""
 OTHER = "other"
-BESIDE = {"": NAME_ENDINGS, "meshes": (".mtl", ".png", ".jpg", ".jpeg", ".bmp")}
-"""Endings of what may lie beside meshes alone, or in a folder of several things: materials, and tables of names."""
-STRUCTURE_LIKE = re.compile(
-    r"\.(nii|nrrd|nhdr|mha|mhd|hdr|img|mgz|mgh|mnc|npz|npy|dcm|stl|obj|ply|glb|gltf|vtp|vtk|vtu|3mf|wrl)(\.|$)"
-)
-"""Names of what may be a structure: of volumes and meshes, also those that are not read, packed or cut."""
 DRAWN = {Kind.SEGMENTATION: "seg", Kind.STRUCTURE_SET: "rtstruct"}
 """DICOM files of structures, and the key of the case for each."""
 POINT_ENDINGS = (".csv", ".mrk.json", ".fcsv")
@@ -143,11 +146,11 @@ def find(place: Place, wanted: Wanted) -> Found:
 
 
 def _folders(folder: Path, depth: int) -> Iterator[tuple[Path, tuple[Entry, ...], frozenset[str]]]:
-    """A folder, what lies in it and which folders in it are entered, and those below it; none of this program's."""
+    """A folder, what lies in it and which folders in it are entered, and those below it; none passed over."""
     allowed = f"a readable folder of one patient, with up to {MOST_ENTRIES} files"
     listed = entries(folder, most=MOST_ENTRIES, allowed=allowed)
     below = [folder / one.name for one in listed if one.what == FOLDER] if depth > 0 else []
-    entered = [one for one in below if not is_output_folder(one)]
+    entered = [one for one in below if not is_passed_over(one)]
     yield folder, listed, frozenset(one.name for one in entered)
     for one in entered:
         yield from _folders(one, depth - 1)
@@ -190,13 +193,23 @@ class _Looker:
 
         def known(path: Path) -> bool:
             name = path.relative_to(self._place.folder).as_posix()
-            return name in self._read or path.name.lower().endswith(BESIDE.get(self._only, ()))
+            table = not self._only and path.name.lower().endswith(NAME_ENDINGS)
+            return name in self._read or (table and not STRUCTURE_LIKE.search(path.name))
 
-        left = unaccounted(self._folder, self._listed, known)
+        images = {structure_name(one) for one in (*(ct.source for ct in self._found.cts), *dict(self._found.passed))}
+        of_image = [one for one in self._listed if one.name.endswith(".npz") and one.name[:-4] in images]
+        left = [*unaccounted(self._folder, self._listed, known), *of_image]  # nnU-Net's stand beside labels
         wanted = [one for one in left if self._wanted.takes("labels", self._name(one.name))]
-        if lost := [one for one in wanted if self._only or STRUCTURE_LIKE.search(one.name.lower())]:
-            self._found.problems.append(not_read(lost, self._only or "files", self._folder))
-        self._found.passed += [(self._name(one.name), one.what or NOT_READ) for one in left if one not in lost]
+        lost = {one.name: said for one in wanted if (said := one if self._only else self._like_structure(one))}
+        if lost:
+            self._found.problems.append(not_read([*lost.values()], self._only or "files", self._folder))
+        self._found.passed += [(self._name(one.name), one.what or NOT_READ) for one in left if one.name not in lost]
+
+    def _like_structure(self, one: Entry) -> Entry | None:
+        """An entry that is named like a structure, or a folder too deep to be looked through that holds one."""
+        if one.what == FOLDER and (below := structure_below(self._folder / one.name)):
+            return one._replace(what=f"is a folder too deep to be looked through, with {below}")
+        return one if STRUCTURE_LIKE.search(one.name) else None
 
     def _dicom(self) -> None:
         """Each CT series of the folder: it is named by the folder, or where there are several by a file of each."""
@@ -219,17 +232,32 @@ class _Looker:
         others = Counter(one.sop_class for one in files if one.kind not in {Kind.CT, *DRAWN})
         self._found.passed += [(self._source, f"{count} {kind}") for kind, count in sorted(others.items())]
 
+    @contextmanager
+    def _noting(self) -> Iterator[None]:
+        """What is refused within is a problem, one of all."""
+        try:
+            yield
+        except InputError as error:
+            self._found.problems.append(error)
+
     def _volumes(self, names: Sequence[str]) -> None:
         """CTs and label maps one by one; masks together, as a folder of masks where it holds nothing else."""
         masks: list[Mask] = []
         empty: list[str] = []
         for name in names:
-            try:
+            with self._noting():
                 self._volume(name, masks, empty)
-            except InputError as error:
-                self._found.problems.append(error)
+        aside = {one.source for one in self._found.cts} | {name for name, _ in self._found.passed}
+        only = len(set(names) - aside) == 1
+        for mask in tuple(masks):
+            with self._noting():
+                if is_named_by_table(self._place, mask.file, mask.label, only):
+                    masks.remove(mask)
+                    self._label_file(mask.file, self._place.volume(mask.file))
         if not masks:
             return
+        with self._noting():
+            refuse_one_name([one.file for one in masks], where=self._folder)
         alone = len(masks) + len(empty) == len(names) and all(one.lower().endswith(MASK_ENDINGS) for one in names)
         self._only = "masks" if alone else ""
         numbered = dict(enumerate(masks, start=1))
@@ -277,12 +305,10 @@ class _Looker:
     def _meshes(self, names: Sequence[str]) -> None:
         if not names:
             return
-        try:
+        with self._noting():
             wanted = self._wanted
             found = mesh_folder(self._place, self._source, names, wanted.space, wanted.unit, wanted.up)
             self._found.segmentations.append(found)
-        except InputError as error:
-            self._found.problems.append(error)
 
     def _points(self, name: str) -> None:
         """Other tables are no lists of points, and no problem; a list of Slicer's is nothing else."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
 from puncture_twin.planning.formats.labels.mask_folder import MAX_ENTRIES, structure_name
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES, names_for
-from puncture_twin.planning.formats.labels.numbering import label_centres, likely_numbering, plausibility
+from puncture_twin.planning.formats.labels.numbering import likely_numbering
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.init.segmentation import Assigned, Place, margin_line, quoted, rules_text
@@ -178,13 +178,9 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
 
 
 def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence[int]) -> tuple[str, tuple[str, ...]]:
-    table, others = _one_table(place, source, present)
+    table, others = _one_table(place, source, present, _tables_beside(place.folder, source))
     if table is not None:
-        name, names = table
-        if plausibility(names, label_centres(labels)).fails:
-            what = f"its organs do not lie where {name} names them"
-            raise InputError(what, where=place.folder / source, allowed="--naming with the table that is right")
-        return name, (f"{source}: names from {name}",)
+        return table[0], (f"{source}: names from {table[0]}",)
     naming = likely_numbering(labels)
     if naming is None:
         passed = f"no table beside it names all of its labels: {first_few(others)}"
@@ -198,8 +194,22 @@ def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence
     return naming, (NUMBERING_FOUND.format(source=source, naming=naming), *(f"{source}: {one}" for one in others))
 
 
+def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool:
+    """Whether a table beside a map of one label names that: not one that names the file itself otherwise.
+
+    Args:
+        place: The case's folder.
+        source: The file.
+        label: The only one in it.
+        only: Whether no other map or mask lies beside it, so that the table may have any name.
+    """
+    tables = [one for one in _tables_beside(place.folder, source) if only or _is_named_like(one, source)]
+    table, _ = _one_table(place, source, [label], tables)
+    return table is not None and structure_name(source) not in table[1].values()
+
+
 def _one_table(
-    place: Place, source: str, present: Sequence[int]
+    place: Place, source: str, present: Sequence[int], tables: Iterable[str]
 ) -> tuple[tuple[str, dict[int, str]] | None, list[str]]:
     """The table beside a map that names all of its labels: the one named like the map, else the only one.
 
@@ -210,7 +220,7 @@ def _one_table(
         InputError: Several tables name them in other ways.
     """
     found, others = [], []
-    for table in _tables_beside(place.folder, source):
+    for table in tables:
         try:
             names = parse_names(_table(place.folder / table), place.folder / table)
         except InputError as error:

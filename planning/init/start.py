@@ -43,6 +43,7 @@ class Request:
         space_stated: Whether the user said in which space the target is.
         hit_radius_mm: Of the ball that the target is, if the user says that it lies in no structure; else None.
         wanted: What the user says of the files.
+        trust_labels: Whether a person has seen that the structures lie right.
     """
 
     folder: Path
@@ -52,6 +53,7 @@ class Request:
     wanted: Wanted
     space_stated: bool = True
     hit_radius_mm: float | None = None
+    trust_labels: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +108,7 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         ct=None if ct is None else ct.source,
         sources=tuple(zip(found.segmentations, rows, strict=True)),
         markers=tuple(_markers_of_ct(found.markers, ct)),
+        trust_labels=request.trust_labels,
     )
     notes = (*_notes(request, found, target, parts), *outlines.notes(target.point_ct))
     return Start(case_text(parts), parts, notes)
@@ -184,7 +187,7 @@ def _contains(grid: VolumeGrid, point_ct: Floats) -> bool:
 
 def _doubled(segmentations: Sequence[Segmentation]) -> Iterator[str]:
     """Names that two segmentations have: one of the two is meant."""
-    counts = Counter(name for one in segmentations for name in one.names.values())
+    counts = Counter(name for one in segmentations for name in set(one.names.values()))
     twice = [name for name, count in counts.items() if count > 1]
     if twice:
         sources = ", ".join(one.source for one in segmentations if set(one.names.values()) & set(twice))

@@ -407,8 +407,8 @@ def test_a_mask_in_another_format_is_not_passed_over(tmp_path, capfd, ending):
         assert code == 0 and roles(tmp_path)["vein.nhdr"] == ("avoid", 3.0)
 
 
-def test_tables_that_contradict_each_other_or_the_body_are_not_guessed(tmp_path, capfd):
-    """The first by name was taken: its aorta was fat, or its liver lay on the left."""
+def test_tables_that_contradict_each_other_are_not_guessed(tmp_path, capfd):
+    """The first by name was taken: its aorta was fat."""
     write_ct(tmp_path / "scan.nii.gz")
     sitk.WriteImage(image_of(labels(), SPACING), str(tmp_path / "map.nii.gz"))
     (tmp_path / "a.csv").write_text("id,name\n1,muscle\n2,torso_fat\n3,rib_left_7\n")
@@ -416,10 +416,21 @@ def test_tables_that_contradict_each_other_or_the_body_are_not_guessed(tmp_path,
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert code == 2 and "map.nii.gz: several tables name its labels in other ways: a.csv, b.csv" in said[0]
     assert init(capfd, tmp_path, "--target", TARGET, "--naming", "b.csv")[0] == 0
-    (tmp_path / "a.csv").unlink()
-    (tmp_path / "b.csv").write_text("id,name\n1,spleen\n2,liver\n3,aorta\n")
-    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--force")
-    assert code == 2 and "its organs do not lie where b.csv names them" in said[0]
+
+
+@pytest.mark.parametrize(("third", "refused"), [("aorta", False), ("gallbladder", True)])
+def test_organs_on_the_other_side_are_taken_where_a_person_has_looked(tmp_path, capfd, third, refused):
+    """Situs inversus: one pair is warned of, two are refused with a way out that is there, at this command too."""
+    write_ct(tmp_path / "scan.nii.gz")
+    sitk.WriteImage(image_of(labels(), SPACING), str(tmp_path / "map.nii.gz"))
+    (tmp_path / "map.csv").write_text(f"id,name\n1,spleen\n2,liver\n3,{third}\n")
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == (2 if refused else 0), said
+    if refused:
+        assert "--trust-labels" in said[0] and not (tmp_path / "case.toml").exists()
+        code, _, said = init(capfd, tmp_path, "--target", TARGET, "--trust-labels")
+        assert "trust_labels = true  # a person has looked" in (tmp_path / "case.toml").read_text()
+    assert code == 0 and any("as in no body" in line for line in said)
 
 
 def test_a_target_in_no_structure_is_a_ball_of_its_own(tmp_path, capfd):

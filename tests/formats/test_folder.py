@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 from pathlib import Path
 
 import dicom_world as world
@@ -20,12 +21,25 @@ from puncture_twin.planning.init.segmentation import Place
 
 HARMLESS = (
     *("statistics.json", "preview_total.png", ".DS_Store", "._liver.nii.gz", "README.md", "liver.nii.gz.dvc"),
-    *("liver.json", "markers.csv", "case.toml", ".gitattributes"),
+    *(
+        "liver.json",
+        "markers.csv",
+        "case.toml",
+        ".gitattributes",
+        "report.html",
+        "view.PNG",
+        "scene.mrml",
+        "SHA256SUMS",
+    ),
+    *("predict_from_raw_data_args.json", "postprocessing.pkl", "liver.npz", "colon.pkl", "liver.nii.gz.txt"),
+    *(".nfs0000a1", ".~lock.notes.odt#"),
 )
 LOST = (
     *("vessel.npz", "vessel.nii.gz.part", "vessel.nii.zst", "vessel.mha", "vessel.stl", "vessel.dcm", "vessel"),
-    *("vessel.nii.bz2", "vessel.nrrd.crdownload", ".vessel.nii.gz", "vessel.nii.gz.dvc", "vessel.json", "vessel.png"),
+    *("vessel.nii.bz2", "vessel.nrrd.crdownload", ".vessel.nii.gz", "vessel.nii.gz.dvc", "vessel.json"),
     *("._vessel.nii.gz", "vessel.nii.gz~", ".liver.nii.gz.Xy12Za", "vessel.h5", "vessel.mat"),
+    *("vessel.nii.gz.txt", "liver_vessels.nii.gz.txt", "vessel.nrrd.log", "vessel.stl.csv", "readme.mha", "vessel.pkl"),
+    *("liver.nii.gz.npz", "vessel.NII.GZ.md5", "vessel.dcm.png"),
 )
 """What programs leave behind, and formats that nobody reads here."""
 
@@ -72,7 +86,7 @@ def test_what_holds_no_organ_may_lie_beside_masks(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_no_entry_of_any_kind_is_lost(tmp_path: Path, seed: int) -> None:
-    """Of files, links to nothing, links in a circle, pipes and folders each is a mask, harmless, or refused."""
+    """Of files, links to nothing, links in a circle, pipes, empty folders each is a mask, harmless, or refused."""
     rng = np.random.default_rng(seed)
     folder = masks(tmp_path / "seg")
     endings = (*MASK_ENDINGS, ".part", ".npz", ".txt", "", ".json", ".nii.gz.tmp")
@@ -91,20 +105,27 @@ def test_no_entry_of_any_kind_is_lost(tmp_path: Path, seed: int) -> None:
             (folder / name).mkdir()
     sound = [one.name for one in folder.iterdir() if one.is_file() and one.name.endswith(MASK_ENDINGS)]
     text = [one.name for one in folder.iterdir() if one.is_file() and one.name.endswith(".txt")]
-    rest = {one.name for one in folder.iterdir()} - {*sound, *text}
+    volume_like = (".nii", ".nrrd", ".npz")
+    empty = [one.name for one in folder.iterdir() if one.is_dir() and not any(end in one.name for end in volume_like)]
+    rest = {one.name for one in folder.iterdir()} - {*sound, *text, *empty}
     try:
         assert set(mask_files(folder, nothing_else, where="case")) == set(sound) and not rest
     except InputError as error:
         assert error.code == "entries_not_read" and all(name in str(error) for name in rest), (rest, error)
-        assert rest and not any(f" {name} (" in str(error) for name in (*sound, *text))
+        assert rest and not any(f" {name} (" in str(error) for name in (*sound, *text, *empty))
 
 
 def test_a_folder_in_a_folder_is_known_by_what_is_in_it(tmp_path: Path) -> None:
-    """One with what is known, or of this program's outputs, is no loss; an empty one may be what was not fetched."""
+    """One with what is known, of previews, of this program's outputs or with nothing in it is no loss."""
     folder = masks(tmp_path / "seg")
+    (folder / "@eaDir" / "liver.nii.gz").mkdir(parents=True)
+    (folder / ".ipynb_checkpoints").mkdir()
     (folder / "notes").mkdir()
-    with pytest.raises(InputError, match=r"notes \(is a folder\)"):
+    assert len(mask_files(folder, nothing_else, where="case")) == 2
+    (folder / "vessel.nii.gz").mkdir()  # unpacked, or not fetched
+    with pytest.raises(InputError, match=r"vessel.nii.gz \(is a folder\)"):
         mask_files(folder, nothing_else, where="case")
+    (folder / "vessel.nii.gz").rmdir()
     (folder / "notes" / "a.txt").write_text("x")
     (folder / "out").mkdir()
     (folder / "out" / "manifest.json").write_text('{"format": "puncture-twin output set"}')
@@ -200,6 +221,76 @@ def test_a_folder_that_is_too_deep_is_told(tmp_path: Path) -> None:
     (folder / "a" / "b" / "c").mkdir(parents=True)
     (folder / "a" / "b" / "c" / "x.dat").write_text("x")
     assert ("a/b/c", "is a folder") in found(folder).passed
+
+
+@pytest.mark.parametrize("name", ["vessel.nii.gz", "d/e/f/g/h/vessel.stl", "d/vessel.nrrd.txt", "d/link"])
+def test_an_organ_in_a_folder_that_is_too_deep_is_no_organ_left_out(tmp_path: Path, name: str) -> None:
+    """At any depth; previews and versions hold none, and the user may say which folder is meant."""
+    folder = patient(tmp_path / "p")
+    path = folder / "a" / "b" / "c" / name
+    (path.parent).mkdir(parents=True)
+    (folder / "a" / "b" / "c" / ".git" / "annex.nii.gz").mkdir(parents=True)
+    (folder / "a" / "b" / "c" / "x.dat").write_text("x")
+    assert not found(folder).problems
+    if name == "d/link":
+        path.symlink_to(folder / "seg")
+    else:
+        path.write_text("x")
+    (error,) = found(folder).problems
+    assert error.code == "entries_not_read" and error.where == str(folder / "a" / "b")
+    assert (name if name != "d/link" else "d/link/colon.nii.gz") in str(error)
+    assert not found(folder, segmentation="seg").problems
+
+
+def test_probabilities_lie_beside_labels_and_not_beside_a_ct(tmp_path: Path) -> None:
+    """As nnU-Net writes them; what is called like the CT may be its labels."""
+    folder = patient(tmp_path)
+    (folder / "seg" / "liver.npz").write_text("x")
+    assert not found(folder).problems
+    (folder / "ct.npz").write_text("x")
+    (error,) = found(folder).problems
+    assert error.code == "entries_not_read" and "ct.npz" in str(error)
+
+
+def test_two_masks_of_one_name_are_both_named(tmp_path: Path) -> None:
+    """No option can choose between them."""
+    folder = patient(tmp_path)
+    volume(folder / "seg" / "liver.nii", np.eye(12, dtype=np.uint8)[None].repeat(12, axis=0))
+    (error,) = found(folder).problems
+    assert error.code == "masks_of_one_name" and "'seg/liver.nii'" in str(error) and "'seg/liver.nii.gz'" in str(error)
+
+
+def one_label(folder: Path, *names: str) -> Path:
+    """A CT, and beside it maps of one label."""
+    patient(folder)
+    for name in names:
+        shutil.copy(folder / "seg" / "liver.nii.gz", folder / name)
+    shutil.rmtree(folder / "seg")
+    return folder
+
+
+TABLES = {"labels.csv": "id,name\n1,aorta\n2,vessels\n", "own.csv": "id,name\n1,aorta\n2,colon\n"}
+
+
+@pytest.mark.parametrize(
+    ("maps", "tables", "names"),
+    [
+        (["labels.nii.gz"], ["labels.csv"], {"aorta"}),
+        (["map.nii.gz"], ["own.csv"], {"aorta"}),
+        (["map.nii.gz"], [], {"map"}),
+        (["vessels.nii.gz"], ["labels.csv"], {"vessels"}),
+        (["labels.nii.gz", "vein.nii.gz"], ["labels.csv"], {"aorta", "vein"}),
+        (["map.nii.gz", "vein.nii.gz"], ["own.csv"], {"map", "vein"}),
+    ],
+)
+def test_a_map_of_one_label_is_named_by_its_table(tmp_path: Path, maps: list, tables: list, names: set) -> None:
+    """A liver was called "labels" and unknown. A table of several masks, or one that names the file, names no file."""
+    folder = one_label(tmp_path, *maps)
+    for table in tables:
+        (folder / table).write_text(TABLES[table])
+    seen = found(folder)
+    assert not seen.problems
+    assert {name for one in seen.segmentations for name in one.names.values()} == names
 
 
 def test_among_meshes_alone_nothing_else_lies(tmp_path: Path) -> None:

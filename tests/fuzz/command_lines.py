@@ -35,6 +35,7 @@ OPTIONS = {
     "--target-label": "word",
     "--hit-radius": "number",
     "--space": "word",
+    "--trust-labels": None,
     "--force": None,
     "--cross-check": "number",
     "--engine": "word",

@@ -52,11 +52,22 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
         raise not_read(left, "masks", where)
     if not 1 <= len(files) <= MAX_MASKS:
         raise InputError(f"'{folder.name}' holds {len(files)} masks", where=where, allowed=allowed)
+    refuse_one_name(files, where)
+    return tuple(files)
+
+
+def refuse_one_name(files: Sequence[str], where: str | Path) -> None:
+    """Whether each mask of a folder is of another structure: ``liver.nii`` beside ``liver.nii.gz`` is not.
+
+    Raises:
+        InputError: Two are of one; names both.
+    """
     names: dict[str, str] = {}
     for file in files:
         if (other := names.setdefault(structure_name(file), file)) is not file:
-            raise InputError(f"'{other}' and '{file}' are masks of one name", where=where, allowed=allowed)
-    return tuple(files)
+            what = f"'{other}' and '{file}' are masks of one name"
+            allowed = "one mask a structure: move one of the two out of the folder"
+            raise InputError(what, where=where, allowed=allowed, code="masks_of_one_name")
 
 
 def is_mask(entry: Entry) -> bool:
