@@ -36,7 +36,8 @@ HARMLESS = (
 beside their masks, cases, scenes, tables, lists of points, pictures and plain text."""
 
 STRUCTURE_LIKE = re.compile(
-    r"\.(nii|nrrd|nhdr|mha|mhd|hdr|img|mgz|mgh|mnc|npz|npy|dcm|stl|obj|ply|glb|gltf|vtp|vtk|vtu|3mf|wrl)(\.|$)", re.I
+    r"\.(nii|nrrd|nhdr|mha|mhd|hdr|img|mgz|mgh|mnc|npz|npy|dcm|stl|obj|ply|glb|gltf|vtp|vtk|vtu|3mf|wrl)(?![a-z0-9])",
+    re.I,
 )
 """Names of what may be a structure: of volumes and meshes, also those that are not read, packed, cut or renamed."""
 

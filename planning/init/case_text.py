@@ -38,7 +38,9 @@ step_deg = 2.0
 max_skin_angle_deg = 60.0
 {trust}
 """
-TRUSTED = "trust_labels = true  # a person has looked at CT and structures, and knows that these lie right\n"
+TRUSTED = (
+    "trust_labels = true  # a person has looked: structures lie right, and what they leave out of the CT is free\n"
+)
 OWN_TARGET = "hit_radius_mm = {radius!r}  # it lies in no structure: what is hit is this ball about it"
 SKIN_OF_CT = """[[structure]]
 name = "skin"

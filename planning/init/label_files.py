@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from puncture_twin.planning.anatomy.default_roles import default_role
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -195,17 +196,28 @@ def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence
 
 
 def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool:
-    """Whether a table beside a map of one label names that: not one that names the file itself otherwise.
+    """Whether a table beside a map of one label names that: not one with the file's own name in it.
 
     Args:
         place: The case's folder.
         source: The file.
         label: The only one in it.
         only: Whether no other map or mask lies beside it, so that the table may have any name.
+
+    Raises:
+        InputError: It is one organ by the file's name, and another by a table of another name.
     """
     tables = [one for one in _tables_beside(place.folder, source) if only or _is_named_like(one, source)]
     table, _ = _one_table(place, source, [label], tables)
-    return table is not None and structure_name(source) not in table[1].values()
+    name = structure_name(source)
+    if table is None or name in table[1].values():
+        return False
+    own, told = (default_role(one, "other") for one in (name, table[1][label]))
+    if own not in (None, told) and not _is_named_like(table[0], source):
+        what = f"is '{name}' by its own name, and '{table[1][label]}' by {table[0]}"
+        allowed = "--naming with that table where it is right; else the table in another folder"
+        raise InputError(what, where=place.folder / source, allowed=allowed, code="label_named_twice")
+    return True
 
 
 def _one_table(

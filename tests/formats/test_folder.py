@@ -39,7 +39,7 @@ LOST = (
     *("vessel.nii.bz2", "vessel.nrrd.crdownload", ".vessel.nii.gz", "vessel.nii.gz.dvc", "vessel.json"),
     *("._vessel.nii.gz", "vessel.nii.gz~", ".liver.nii.gz.Xy12Za", "vessel.h5", "vessel.mat"),
     *("vessel.nii.gz.txt", "liver_vessels.nii.gz.txt", "vessel.nrrd.log", "vessel.stl.csv", "readme.mha", "vessel.pkl"),
-    *("liver.nii.gz.npz", "vessel.NII.GZ.md5", "vessel.dcm.png"),
+    *("liver.nii.gz.npz", "vessel.NII.GZ.md5", "vessel.dcm.png", "vessel.nii_old.txt"),
 )
 """What programs leave behind, and formats that nobody reads here."""
 
@@ -148,10 +148,12 @@ def test_a_folder_that_cannot_be_listed_is_refused(tmp_path: Path) -> None:
     assert [one.name for one in unaccounted(tmp_path, entries(tmp_path, most=9), nothing_else)] == ["seg"]
 
 
-@pytest.mark.parametrize("name", ["4.dcm", "4.dcm.part", "4", ".4.dcm"])
+@pytest.mark.parametrize("name", ["4.dcm", "4.dcm.part", "4", ".4.dcm", "4.dcm.txt"])
 def test_a_slice_that_cannot_be_read_is_no_end_of_the_scan(tmp_path: Path, name: str) -> None:
     """A link to nothing beside the slices, a pointer in place of one, half a download: the scan would be shorter."""
     folder = world.write_series(tmp_path / "s", world.series(), [f"{n}.dcm" for n in range(4)])
+    for beside in ("3.dcm.txt", "3.dcm.md5", "._3.dcm"):
+        (folder / beside).write_text("about a slice that is there")
     assert choose_series(folder).notes == ()
     if name == "4":
         (folder / name).symlink_to("not_fetched/4")
@@ -291,6 +293,16 @@ def test_a_map_of_one_label_is_named_by_its_table(tmp_path: Path, maps: list, ta
     seen = found(folder)
     assert not seen.problems
     assert {name for one in seen.segmentations for name in one.names.values()} == names
+
+
+def test_a_file_named_like_another_organ_than_its_table_says_is_refused(tmp_path: Path) -> None:
+    """An aorta must not become a liver because a table of another map lies beside it."""
+    folder = one_label(tmp_path, "aorta.nii.gz")
+    (folder / "organs.csv").write_text("id,name\n1,liver\n")
+    (error,) = found(folder).problems
+    assert error.code == "label_named_twice" and "organs.csv" in str(error)
+    (one,) = found(folder, naming="organs.csv").segmentations
+    assert list(one.names.values()) == ["liver"]
 
 
 def test_among_meshes_alone_nothing_else_lies(tmp_path: Path) -> None:

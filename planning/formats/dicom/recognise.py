@@ -218,7 +218,9 @@ def choose_series(path: Path) -> SeriesFiles:
         slices = [one for one in slices if one.series_uid == named.series_uid]
     _check_one_series(slices, found, others, path)
     names = tuple(one.name for one in slices)
-    if lost := [one for one in unaccounted(folder, others, lambda _: False) if _may_be_slice(one, names)]:
+    read = {one.name: Entry(one.name, FILE) for one in found}
+    left = unaccounted(folder, (*others, *read.values()), lambda path: path.name in read)
+    if lost := [one for one in left if _may_be_slice(one, names)]:
         raise InputError(
             f"beside the slices lies what is not read, and may be a slice: {first_few([one.said for one in lost])}",
             where=path,
