@@ -25,7 +25,7 @@ NOT_READ = "of a kind that is not read"
 HARMLESS = (
     *(".ds_store", "thumbs.db", "desktop.ini", ".directory", ".git*", ".datalad", ".dvc", ".dvcignore"),
     *(".nfs*", ".~lock.*", ".ipynb_checkpoints"),
-    *("statistics.json", "statistics_radiomics.json", "dataset.json", "plans.json"),
+    *("manifest.json", "statistics.json", "statistics_radiomics.json", "dataset.json", "plans.json"),
     *("predict_from_raw_data_args.json", "postprocessing.pkl"),
     *("readme", "readme.*", "license", "license.*", "*.txt", "*.md", "*.log", "*.html", "*.pdf"),
     *("*.jpg", "*.jpeg", "*.png", "*.bmp", "*.mtl", "*.yaml", "*.yml", "*.py", "*.sh", "*.ipynb", "*.cff"),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.output.manifest import FORMAT
 from puncture_twin.planning.formats.meshes.ply import ply_bytes
 from puncture_twin.twin.plant.beside.arms import Arms
 from puncture_twin.twin.plant.beside.bed import Bed
@@ -16,7 +17,7 @@ from puncture_twin.twin.plant.beside.tubes import Part
 
 FOLDER = "beside"
 LIST = "manifest.json"
-"""`init` passes a folder that holds it: the truth is no segmentation."""
+"""`init` passes a folder whose list says that this program wrote it: the truth is no segmentation."""
 
 
 def parse_beside(arms: str, bed: str, lines: int) -> Beside | None:
@@ -51,6 +52,6 @@ def write_beside(parts: Sequence[Part], folder: Path) -> Iterator[Path]:
         path = folder / FOLDER / f"{one.name}.ply"
         path.write_bytes(ply_bytes(one.mesh))
         yield path
-    listed = {"schema": 1, "unit": "mm", "space": "LPS", "parts": beside_summary(parts)}
+    listed = {"part_of": FORMAT, "schema": 1, "unit": "mm", "space": "LPS", "parts": beside_summary(parts)}
     (folder / FOLDER / LIST).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
     yield folder / FOLDER / LIST
