@@ -44,9 +44,6 @@ CIRCLE = (
     "and no body that the arm could meet"
 )
 
-WIDE_MM = 5.0
-"""Air into which a ball of this radius fits and that goes on outside is the room's; a nose's is narrower."""
-
 
 @dataclass(frozen=True, eq=False)
 class BodyMask:
