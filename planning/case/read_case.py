@@ -24,8 +24,8 @@ from puncture_twin.planning.case.sections.breath import breathing_of
 from puncture_twin.planning.case.sections.robot import robot_of
 from puncture_twin.planning.case.sections.tool_section import tool_of
 from puncture_twin.planning.case.settings import (
-    CtSettings,
     Needle,
+    ct_of,
     gantry_of,
     obstacle_of,
     search_of,
@@ -90,7 +90,7 @@ def case_of(
         rehearsal=content.rehearsal,
         files=files,
         volumes=case_volumes,
-        ct=CtSettings(**content.ct.model_dump(), trust_labels=settings.trust_labels),
+        ct=ct_of(content.ct, trust_labels=settings.trust_labels),
         gantry=None if content.gantry is None else gantry_of(content.gantry, space, path),
         place=content.place,
         stated_structures=content.stated_structures,

@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.case.mount import axes_frame
 from puncture_twin.planning.case.tables.registration_section import RegistrationSection
 from puncture_twin.planning.case.tables.search_section import SearchSection
-from puncture_twin.planning.case.tables.structures_section import AIR_HU, DENSE_HU
+from puncture_twin.planning.case.tables.structures_section import AIR_HU, DENSE_HU, CtSection, Stated
 from puncture_twin.planning.case.tables.surroundings_section import GantrySection, ObstacleSection
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
@@ -77,6 +77,10 @@ class CtSettings:
         dense_hu: Inside the body, what is at least so dense must belong to a structure.
         margin_mm: Clearance that these structures demand.
         trust_labels: Whether the inside is left to the structures alone.
+        arms: Whether the image shows arms or other limbs beside the trunk, where a person states it.
+        table: Whether it shows what the body lies on, where a person states it.
+        beyond_mm: How much wider than where the image cuts it the body may be beyond, where a person states it;
+            infinite for all that lies beyond the plane of the cut.
     """
 
     file: str | None = None
@@ -84,6 +88,22 @@ class CtSettings:
     dense_hu: float = DENSE_HU
     margin_mm: float = 2.0
     trust_labels: bool = False
+    arms: Stated | None = None
+    table: Stated | None = None
+    beyond_mm: float | None = None
+
+    @property
+    def declared(self) -> tuple[str, ...]:
+        """What a person states of the image, one sentence each."""
+        said = []
+        if self.arms is not None:
+            said.append("declared: " + ("no arms in the image" if self.arms == "none" else "arms in the image"))
+        if self.table is not None:
+            said.append("declared: " + ("no table in the image" if self.table == "none" else "a table in the image"))
+        if self.beyond_mm is not None:
+            wider = "fills all" if np.isinf(self.beyond_mm) else f"is at most {self.beyond_mm:g} mm wider"
+            said.append(f"declared: beyond the image the body {wider}")
+        return tuple(said)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +155,12 @@ class RobotSettings:
     def transform(self) -> str | None:
         """The file of the stated transform, or None."""
         return None if self.stated is None else self.stated.transform
+
+
+def ct_of(section: CtSection, *, trust_labels: bool) -> CtSettings:
+    """The CT's table; ``beyond_mm = "all"`` is infinite."""
+    beyond_mm = np.inf if section.beyond_mm == "all" else section.beyond_mm
+    return CtSettings(**section.model_dump(exclude={"beyond_mm"}), trust_labels=trust_labels, beyond_mm=beyond_mm)
 
 
 def search_of(section: SearchSection) -> SearchSettings:

@@ -53,6 +53,7 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
     )
     _refuse(case, placed)  # what follows looks from the target, which must lie in the body
     rest = (
+        *declared(case),
         *outside_skin(case, anatomy, cache),
         *open_around_target(case, anatomy),
         *markers(case, anatomy, placement, cache),
@@ -63,6 +64,12 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
     )
     _refuse(case, rest)
     return placed + rest
+
+
+def declared(case: Case) -> Iterator[Finding]:
+    """What a person states of the image: no rule guesses it, and every result repeats it."""
+    for sentence in case.ct.declared:
+        yield Finding("declared", Severity.WARNING, sentence)
 
 
 def _refuse(case: Case, found: Sequence[Finding]) -> None:

@@ -353,6 +353,28 @@ def test_a_level_of_air_that_cannot_be_is_refused(scene, level):
         load_case(write_case(folder, more=f"[ct]\nair_hu = {level!r}".replace("'", '"'), name="level"))
 
 
+def test_what_a_person_declares_stands_in_every_result(scene):
+    """Arms, table, and how far the body may go on beyond the image."""
+    folder, _ = scene("alone")
+    more = '[ct]\narms = "none"\ntable = "present"\nbeyond_mm = "all"'
+    context = prepare(write_case(folder, more=more, name="declared"), arm=False)
+    said = [one.sentence for one in context.anatomy.findings if one.code == "declared"]
+    assert said == [
+        "declared: no arms in the image",
+        "declared: a table in the image",
+        "declared: beyond the image the body fills all",
+    ]
+    assert context.case.ct.beyond_mm == np.inf
+
+
+@pytest.mark.parametrize("line", ['arms = "some"', "table = true", "beyond_mm = -1", 'beyond_mm = "none"'])
+def test_what_cannot_be_declared_is_refused(scene, line):
+    """The key is named."""
+    folder, _ = scene("alone")
+    with pytest.raises(InputError, match=line.split()[0]):
+        load_case(write_case(folder, more=f"[ct]\n{line}", name="undeclared"))
+
+
 def test_a_table_that_touches_the_back_is_no_body(scene):
     """Back and solid table hold together; no path through the table is safe, the front stays free, it is said."""
     folder, _ = scene("plank")

@@ -12,6 +12,9 @@ from puncture_twin.planning.geometry.spaces import Up
 MAX_STRUCTURES = 1000
 """Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree."""
 
+Stated = Literal["none", "present"]
+"""What a person says of arms, or of a table, in an image."""
+
 Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
 
 MAX_LABEL_MAPS = 100
@@ -112,3 +115,6 @@ class CtSection(Section):
     air_hu: Annotated[Number, Field(ge=-990, le=-300)] = AIR_HU
     dense_hu: Annotated[Number, Field(ge=100, le=3000)] = DENSE_HU
     margin_mm: Margin = 2.0
+    arms: Stated | None = None
+    table: Stated | None = None
+    beyond_mm: Annotated[Number, Field(ge=0, le=1000)] | Literal["all"] | None = None
