@@ -1,17 +1,18 @@
 """The images, fixed by name: which are ambiguous, how each is made, and what is true in it. All seeds are here.
 
-*Ambiguous* is what a person could not tell from the image either: arms pressed flat against the flanks, a narrow field of view in
-which arms and table are half seen, a pad under the back that is as dense as the body. Real images are the 3 mm abdomen,
-whole and cut in three along the bed, and the chest of 10 mm slices. Body in them: above -300 HU, opened by 6 mm, what holds the
-target, holes filled slice by slice. Beside it: above -300 HU, two voxels away from the body, 200 mm3 or more. Doubtful:
-200 HU and more, or gas, within the body and in no label, each dilated by a voxel, 100 mm3 or more.
+*Ambiguous* is what a person could not tell from the image either: arms pressed flat against the flanks, a narrow field
+of view in which arms and table are half seen, a pad under the back that is as dense as the body. Real images are the 3 mm
+abdomen, whole and cut in three along the bed, and the chest of 10 mm slices. Body in them: above -300 HU, opened by
+6 mm, the largest part, holes filled slice by slice. Beside it: above -300 HU, two voxels away from the body, 200 mm3 or
+more. Doubtful: 200 HU and more, or gas, within the body and in no label, each dilated by a voxel, 100 mm3 or more.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -66,7 +67,9 @@ def asked_alike(folder: Path) -> None:
 def start(folder: Path, target, region=None) -> None:
     """The case as `init` makes it."""
     text = ",".join(f"{one:.3f}" for one in target)
-    init_case(Request(folder, text, None, region, Wanted(Space.LPS, None, None, None, None)), force=True, watcher=Silent())
+    init_case(
+        Request(folder, text, None, region, Wanted(Space.LPS, None, None, None, None)), force=True, watcher=Silent()
+    )
     asked_alike(folder)
 
 
@@ -84,7 +87,7 @@ class Phantom(NamedTuple):
 
     depth: Callable
     bottom: float
-    others: dict = {}
+    others: Mapping[str, tuple[float, Callable]] = MappingProxyType({})
 
 
 VESSEL = (np.array([15.0, -30.0, 0.0]), 6.0)
@@ -111,14 +114,22 @@ def phantom(name: str, table: bool) -> Callable[[Path, Path | None], Scene]:
     def make(folder: Path, data: Path | None) -> Scene:
         block, image = BLOCKS[name], Grid.of((-150, -120, -160), (150, 120, 160), 2.0)
         truth = Grid.of((-300, -300, -300), (300, 300, 300), 3.0)
-        hu, labels, names = np.full(image.shape, AIR), np.zeros(image.shape, np.uint8), ["lesion", "vessel", *block.others]
+        hu, labels, names = (
+            np.full(image.shape, AIR),
+            np.zeros(image.shape, np.uint8),
+            ["lesion", "vessel", *block.others],
+        )
         scenes = []
         for grid in (image, truth):
             x, y, z = grid.axes()
             inside = block.depth(x, y, z) >= 0
             masks = {"lesion": x**2 + y**2 + z**2 <= 8**2}
-            masks["vessel"] = (x - VESSEL[0][0]) ** 2 + (y - VESSEL[0][1]) ** 2 + (z - VESSEL[0][2]) ** 2 <= VESSEL[1] ** 2
-            masks |= {one: np.broadcast_to(where(x, y, z), grid.shape) & inside for one, (_, where) in block.others.items()}
+            masks["vessel"] = (x - VESSEL[0][0]) ** 2 + (y - VESSEL[0][1]) ** 2 + (z - VESSEL[0][2]) ** 2 <= VESSEL[
+                1
+            ] ** 2
+            masks |= {
+                one: np.broadcast_to(where(x, y, z), grid.shape) & inside for one, (_, where) in block.others.items()
+            }
             below = y - block.bottom
             bed = np.broadcast_to((below > 0) & (below <= 24) & (abs(x) < 140) & (table & (abs(z) < 1e3)), grid.shape)
             plate = bed & (below > 20)
@@ -140,8 +151,11 @@ def write_lab(folder: Path, image: Grid, hu, labels, names, target=(0.0, 0.0, 0.
     """CT, labels and a case written by hand."""
     write_nifti(folder / "ct.nii.gz", np.round(hu).astype(np.int16), _matrix(image))
     write_nifti(folder / "labels.nii.gz", labels, _matrix(image))
-    text = f'schema = 2\nregion = "{region}"\nname = "lab"\nspace = "LPS"\n\n[target]\nposition_mm = {list(map(float, target))}\n'
-    text += f'structure = "lesion"\n\n{NEEDLE}\n{SEARCH}\n[[structure]]\nname = "skin"\nct = "ct.nii.gz"\nrole = "skin"\n'
+    text = f'schema = 2\nregion = "{region}"\nname = "lab"\nspace = "LPS"\n\n[target]\n'
+    text += f"position_mm = {list(map(float, target))}\n"
+    text += (
+        f'structure = "lesion"\n\n{NEEDLE}\n{SEARCH}\n[[structure]]\nname = "skin"\nct = "ct.nii.gz"\nrole = "skin"\n'
+    )
     for number, name in enumerate(names, start=1):
         role = 'role = "target"' if name == "lesion" else 'role = "avoid"\nmargin_mm = 2.0'
         text += f'\n[[structure]]\nname = "{name}"\nlabelmap = "labels.nii.gz"\nlabel = {number}\n{role}\n'
@@ -208,7 +222,10 @@ def abdomen(target, low=None, high=None, step=None) -> Callable[[Path, Path | No
         if step is not None:
             factor = grid.step / step
             hu = ndimage.zoom(hu.astype(np.float32), factor, order=1, grid_mode=False)
-            index = [np.clip(np.round(np.linspace(0, n - 1, m)).astype(int), 0, n - 1) for n, m in zip(labels.shape, hu.shape, strict=True)]
+            index = [
+                np.clip(np.round(np.linspace(0, n - 1, m)).astype(int), 0, n - 1)
+                for n, m in zip(labels.shape, hu.shape, strict=True)
+            ]
             labels = labels[np.ix_(*index)]
             real = grid.step * (np.array(grid.shape) - 1) / (np.array(hu.shape) - 1)
             grid = Grid(grid.low, real, hu.shape)
@@ -228,7 +245,15 @@ def abdomen(target, low=None, high=None, step=None) -> Callable[[Path, Path | No
 
 
 GASES = ("lung", "stomach", "bowel", "colon", "duodenum", "esophagus", "trachea")
-CHEST = {"ribs": 1, "cervical vertebral column": 2, "thoracic vertebral column": 3, "lumbar vertebral column": 4}
+CHEST = {
+    "ribs": 1,
+    "cervical vertebral column": 2,
+    "thoracic vertebral column": 3,
+    "lumbar vertebral column": 4,
+    "right lung": 5,
+    "left lung": 6,
+    "tissue": 7,
+}
 CHEST_CASE = """schema = 2
 region = "chest"
 name = "chest"
@@ -247,26 +272,28 @@ role = "skin"
 [[structures]]
 labelmap = "Segmentation.seg.nrrd"
 target = ["{holds}"]
-traverse = ["tissue"]
-avoid = {{ "ribs" = 1, "*vertebral column" = 2, "{other}" = 2 }}
+{crossed}avoid = {{ "ribs" = 1, "*vertebral column" = 2, {lungs} }}
 
 [end]
 structures = 8
 """
 
 
-def chest(target, holds: str, other: str) -> Callable[[Path, Path | None], Scene]:
-    """The real chest, with a case written by hand: its lung holds the target."""
+def chest(target, holds: str) -> Callable[[Path, Path | None], Scene]:
+    """The real chest, with a case written by hand; the lungs that do not hold the target are avoided."""
 
     def make(folder: Path, data: Path | None) -> Scene:
         source = data / "slicer_chest_ct4"
         for name in ("CTChest4.nrrd", "Segmentation.seg.nrrd"):
             (folder / name).write_bytes((source / name).read_bytes())
-        text = CHEST_CASE.format(target=list(target), holds=holds, other=other, asked=NEEDLE + "\n" + SEARCH)
+        lungs = ", ".join(f'"{one}" = 2' for one in ("right lung", "left lung") if one != holds)
+        crossed = "" if holds == "tissue" else 'traverse = ["tissue"]\n'
+        text = CHEST_CASE.format(
+            target=list(target), holds=holds, crossed=crossed, lungs=lungs, asked=NEEDLE + "\n" + SEARCH
+        )
         (folder / "case.toml").write_text(text, encoding="utf-8")
         hu, labels, grid = _pair(source / "CTChest4.nrrd", source / "Segmentation.seg.nrrd")
-        names = CHEST | {"right lung": 5, "left lung": 6, "tissue": 7}
-        return _real(hu, labels, names, grid, np.array(target), ("lung",))
+        return _real(hu, labels, CHEST, grid, np.array(target), ("lung",))
 
     return make
 
@@ -285,7 +312,15 @@ def _pair(ct: Path, labels: Path):
 def _real(hu, labels, names, grid: Grid, target, gases) -> Scene:
     """What can be known of a real image, by the simple means of the module's first lines."""
     ball = np.ceil(6.0 / grid.step).astype(int)
-    rod = np.linalg.norm(np.stack(np.meshgrid(*(np.arange(-n, n + 1) * s for n, s in zip(ball, grid.step, strict=True)), indexing="ij")), axis=0) <= 6.0
+    rod = (
+        np.linalg.norm(
+            np.stack(
+                np.meshgrid(*(np.arange(-n, n + 1) * s for n, s in zip(ball, grid.step, strict=True)), indexing="ij")
+            ),
+            axis=0,
+        )
+        <= 6.0
+    )
     dense = np.pad(hu > -300, [(n, n) for n in ball], mode="edge")
     opened = ndimage.binary_opening(dense, rod)[tuple(slice(n, -n) for n in ball)] | (labels > 0)
     parts, _ = ndimage.label(opened)
@@ -300,7 +335,17 @@ def _real(hu, labels, names, grid: Grid, target, gases) -> Scene:
     doubtful = _large((hu >= 200) & body & ~named, 100.0, grid) | _large((hu < -300) & inner & ~gas, 100.0, grid)
     masks = {name: labels == number for name, number in names.items()}
     unscanned = hu < -1500
-    return Scene(grid, grid, body, foreign, masks, np.asarray(target, float), doubtful=doubtful, unscanned=unscanned if unscanned.any() else None, real=True)
+    return Scene(
+        grid,
+        grid,
+        body,
+        foreign,
+        masks,
+        np.asarray(target, float),
+        doubtful=doubtful,
+        unscanned=unscanned if unscanned.any() else None,
+        real=True,
+    )
 
 
 def _large(mask, mm3: float, grid: Grid):
@@ -314,17 +359,16 @@ def _scan(spacing=2.5, pixel=2.0, noise=15.0, seed=0, fov=None, length=180.0) ->
     return ScanSettings(spacing, pixel, noise, seed=seed, fov_mm=fov, length_mm=length)
 
 
-LIVER, KIDNEY, PSOAS, PSOAS_RIGHT, BLADDER = (-85, -200, 372), (-80, -140, 316), (52, -146, 250), (-50, -149, 250), (1, -170, 148)
-LUNGS = ("right lung", "left lung")
+LIVER_SIDE, LIVER_FRONT, KIDNEY = (-110, -131, 352), (-8, -233, 382), (-89, -134, 337)
 IMAGES = (
-    Image("abdomen_liver", abdomen(LIVER), real=True),
+    Image("abdomen_liver_side", abdomen(LIVER_SIDE), real=True),
+    Image("abdomen_liver_front", abdomen(LIVER_FRONT), real=True),
     Image("abdomen_kidney", abdomen(KIDNEY), real=True),
-    Image("abdomen_psoas", abdomen(PSOAS), real=True),
-    Image("abdomen_head_third", abdomen(LIVER, low=318), real=True),
-    Image("abdomen_middle_third", abdomen(PSOAS_RIGHT, low=206, high=318), real=True),
-    Image("abdomen_feet_third", abdomen(BLADDER, high=206), real=True),
-    Image("chest_right", chest((-85.5, 8.2, -138.1), *LUNGS), real=True),
-    Image("chest_left_back", chest((89.5, 73.2, -210.2), *LUNGS[::-1]), real=True),
+    Image("abdomen_head_third", abdomen((-41, -224, 397), low=318), real=True),
+    Image("abdomen_middle_third", abdomen((-122, -119, 226), low=206, high=318), real=True),
+    Image("abdomen_feet_third", abdomen((-26, -200, 145), high=206), real=True),
+    Image("chest_front", chest((25.5, -60.9, -250.2), "tissue"), real=True),
+    Image("chest_lung", chest((-56.7, -24.3, -220.2), "right lung"), real=True),
     *(Image(f"{name}_{where}", phantom(name, where == "table")) for name in BLOCKS for where in ("air", "table")),
     Image("torso_cradle", cradled),
     Image("trunk1_up_flat", drawn(1, "none", "flat", 0, _scan(seed=1))),
@@ -334,7 +378,7 @@ IMAGES = (
     Image("trunk2_across_pad", drawn(2, "across", "pad", 0, _scan(4.0, 3.0, 20.0, 5)), ambiguous=True),
     Image("trunk3_up_narrow", drawn(3, "none", "curved", 0, _scan(3.0, 2.0, 20.0, 6, fov=300.0)), ambiguous=True),
     Image("trunk3_beside_flat", drawn(3, "beside", "flat", 2, _scan(seed=7))),
-    Image("abdomen_fine_liver", abdomen(LIVER, step=(0.78, 0.78, 1.0)), fine=True, real=True),
-    Image("abdomen_fine_psoas", abdomen(PSOAS, step=(0.78, 0.78, 1.0)), fine=True, real=True),
+    Image("abdomen_fine_liver", abdomen(LIVER_SIDE, step=(0.78, 0.78, 1.0)), fine=True, real=True),
+    Image("abdomen_fine_kidney", abdomen(KIDNEY, step=(0.78, 0.78, 1.0)), fine=True, real=True),
     Image("trunk2_fine_beside", drawn(2, "beside", "flat", 2, _scan(1.5, 0.9, 25.0, 8)), fine=True),
 )

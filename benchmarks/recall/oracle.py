@@ -1,7 +1,7 @@
 """What is true of a needle in a scene, by voxels and their distances: numpy and scipy, nothing of the product.
 
-A scene is masks on a grid of its own, which for drawn bodies is larger than the image and holds what the image lacks. Points
-are sampled every millimetre; a distance is interpolated between voxels' centres, negative inside.
+A scene is masks on a grid of its own, which for drawn bodies is larger than the image and holds what the image lacks.
+Points are sampled every millimetre; a distance is interpolated between voxels' centres, negative inside.
 
 *Free beyond doubt*: the skin is crossed once, the path is shorter than the shaft by a voxel's diagonal, its angle to
 the skin stays 10 degrees below the limit, and from target to flange needle and holder keep radius + margin + diagonal.
