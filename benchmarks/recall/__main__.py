@@ -3,9 +3,9 @@
     python -m benchmarks.recall [--real FOLDER] [--only NAME,...] [--fine] [--json FILE] [--markdown]
 
 FOLDER holds totalseg_abdomen_3mm and slicer_chest_ct4 (default: ../shared/data beside the repository); where it is not
-there, their images are left out, and it is said. Two
-processes; a line an image as it ends. The images are in `images`, the truth in `oracle`; the search is the product's,
-without the arm, on a grid of 6 degrees over all directions (a pole counts once). Nothing is read from the user's cache.
+there, their images are left out, and it is said. Two processes; a line an image as it ends. The images are in `images`,
+the truth in `oracle`; the search is the product's, without the arm, on a grid of 6 degrees over all directions (a pole
+counts once). Each image has a cache of its own, empty at first.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The images, fixed by name: which are ambiguous, how each is made, and what is true in it. All seeds are here.
 
 *Ambiguous* is what a person could not tell from the image either: arms pressed flat against the flanks, a narrow field
-of view in which arms and table are half seen, a pad under the back that is as dense as the body. Real images are the 3 mm
-abdomen, whole and cut in three along the bed, and the chest of 10 mm slices. Body in them: above -300 HU, opened by
-6 mm, the largest part, holes filled slice by slice. Beside it: above -300 HU, two voxels away from the body, 200 mm3 or
-more. Doubtful: 200 HU and more, or gas, within the body and in no label, each dilated by a voxel, 100 mm3 or more.
+of view in which arms and table are half seen, a pad under the back that is as dense as the body. Real images are the
+3 mm abdomen, whole and cut in three along the bed, and the chest of 10 mm slices. Body in them: above -300 HU, opened
+by 6 mm, the largest part, holes filled slice by slice. Beside it: above -300 HU, two voxels away from the body, 200 mm3
+or more. Doubtful: 200 HU and more, or gas, within the body and in no label dilated by a voxel, 100 mm3 or more.
 """
 
 from __future__ import annotations
@@ -108,11 +108,11 @@ BLOCKS = {
 """The plate lies in the agar, 10 mm above its bottom."""
 
 
-def phantom(name: str, table: bool) -> Callable[[Path, Path | None], Scene]:
+def phantom(name: str, table: bool, step: float = 2.0) -> Callable[[Path, Path | None], Scene]:
     """A phantom in air, or on a table: 20 mm of foam on a plate of 4 mm, 280 mm wide, longer than the image."""
 
     def make(folder: Path, data: Path | None) -> Scene:
-        block, image = BLOCKS[name], Grid.of((-150, -120, -160), (150, 120, 160), 2.0)
+        block, image = BLOCKS[name], Grid.of((-150, -120, -160), (150, 120, 160), step)
         truth = Grid.of((-300, -300, -300), (300, 300, 300), 3.0)
         hu, labels, names = (
             np.full(image.shape, AIR),

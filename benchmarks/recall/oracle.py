@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-FAR_MM = 60.0
-"""What a distance is where nothing is nearer."""
+FAR_MM = 32.0
+"""What a distance is where nothing is nearer: the holder's radius, a diagonal of 11 mm and a margin of 5 are less."""
 GROWN_MM, CUT_MM2, ANGLE, STEP_MM, LONGEST_MM = 150.0, 300.0, np.radians(10.0), 1.0, 560.0
 
 

@@ -23,10 +23,10 @@ DEFAULT_MARGIN_MM = 5.0
 
 def measured(name: str, real: Path | None) -> dict:
     """The row of one image."""
-    os.environ["PUNCTURE_TWIN_CACHE"] = ""
     image = next(one for one in IMAGES if one.name == name)
     began = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as cache:
+        os.environ["PUNCTURE_TWIN_CACHE"] = cache
         row = judged(Path(folder), image, real)
     return {"name": name, "ambiguous": image.ambiguous, **row, "seconds": round(time.perf_counter() - began, 1)}
 
