@@ -359,11 +359,11 @@ def _scan(spacing=2.5, pixel=2.0, noise=15.0, seed=0, fov=None, length=180.0) ->
     return ScanSettings(spacing, pixel, noise, seed=seed, fov_mm=fov, length_mm=length)
 
 
-LIVER_SIDE, LIVER_FRONT, KIDNEY = (-110, -131, 352), (-8, -233, 382), (-89, -134, 337)
+LIVER_SIDE, LIVER_FRONT, PSOAS = (-110, -131, 352), (-8, -233, 382), (106, -194, 157)
 IMAGES = (
     Image("abdomen_liver_side", abdomen(LIVER_SIDE), real=True),
     Image("abdomen_liver_front", abdomen(LIVER_FRONT), real=True),
-    Image("abdomen_kidney", abdomen(KIDNEY), real=True),
+    Image("abdomen_psoas", abdomen(PSOAS), real=True),
     Image("abdomen_head_third", abdomen((-41, -224, 397), low=318), real=True),
     Image("abdomen_middle_third", abdomen((-122, -119, 226), low=206, high=318), real=True),
     Image("abdomen_feet_third", abdomen((-26, -200, 145), high=206), real=True),
@@ -379,6 +379,6 @@ IMAGES = (
     Image("trunk3_up_narrow", drawn(3, "none", "curved", 0, _scan(3.0, 2.0, 20.0, 6, fov=300.0)), ambiguous=True),
     Image("trunk3_beside_flat", drawn(3, "beside", "flat", 2, _scan(seed=7))),
     Image("abdomen_fine_liver", abdomen(LIVER_SIDE, step=(0.78, 0.78, 1.0)), fine=True, real=True),
-    Image("abdomen_fine_kidney", abdomen(KIDNEY, step=(0.78, 0.78, 1.0)), fine=True, real=True),
+    Image("abdomen_fine_psoas", abdomen(PSOAS, step=(0.78, 0.78, 1.0)), fine=True, real=True),
     Image("trunk2_fine_beside", drawn(2, "beside", "flat", 2, _scan(1.5, 0.9, 25.0, 8)), fine=True),
 )
