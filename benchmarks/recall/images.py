@@ -205,7 +205,7 @@ def drawn(seed: int, arms: str, bed: str, lines: int, settings: ScanSettings) ->
                 limbs |= mask
         shown = Grid(image.T_ct_index[:3, 3], np.asarray(image.spacing_mm), image.shape)
         structures = {one.name: filled(one.mesh, grid) for one in truth.anatomy.structures if one.demands_margin}
-        return Scene(grid, shown, body, foreign, structures, target, limbs=limbs)
+        return Scene(grid, shown, body, foreign, structures, target, limbs=limbs, lies_unseen=bed == "none")
 
     return make
 
@@ -345,6 +345,7 @@ def _real(hu, labels, names, grid: Grid, target, gases) -> Scene:
         doubtful=doubtful,
         unscanned=unscanned if unscanned.any() else None,
         real=True,
+        lies_unseen=True,
     )
 
 

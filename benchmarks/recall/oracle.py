@@ -8,7 +8,8 @@ the skin stays 10 degrees below the limit, and from target to flange needle and 
 *Wrong*, of a direction called safe: the needle comes nearer than radius + margin - diagonal to a structure, deeper than
 the diagonal into what lies beside the body, or into the body again, or runs in the body where the image has ended.
 *Unseen*: needle or holder passes beyond a face at which the image cuts the body, within the section there drawn on and
-grown by 150 mm; or what the scanner did not measure; or beyond the back of a real image, where nobody knows the table.
+grown by 150 mm; or what the scanner did not measure; or beyond the back of an image in which a patient lies on
+nothing, or of a real one, where nobody knows the table.
 """
 
 from __future__ import annotations
@@ -61,6 +62,8 @@ class Scene:
         doubtful: What keeps a direction from being free and makes none wrong: dense and gas that no label names.
         unscanned: What the scanner did not measure.
         real: Nothing is known beyond the image.
+        lies_unseen: A patient, whose image does not show for sure what they lie on: what is beyond its back is unseen.
+        margins: Of the structures that demand one, mm.
         target: Shape (3,), mm.
     """
 
@@ -74,6 +77,7 @@ class Scene:
     doubtful: np.ndarray | None = None
     unscanned: np.ndarray | None = None
     real: bool = False
+    lies_unseen: bool = False
     margins: dict = field(default_factory=dict)
 
 
@@ -251,7 +255,7 @@ class Oracle:
             found |= (ahead > -radius) & (aside <= GROWN_MM + radius)
             if self.scene.real:
                 beyond = np.where(ahead > self.diagonal, np.minimum(beyond, aside), beyond)
-        if self.scene.real:
+        if self.scene.lies_unseen:
             found |= points[..., 1] > self.scene.image.ends[1, 1]
         if self.scene.unscanned is not None:
             off = sampled(self.scene.unscanned.astype(np.float32), self.scene.grid, points, 0.0)
