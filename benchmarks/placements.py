@@ -20,8 +20,16 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from puncture_twin.planning.evidence.edges import edge_image
-from puncture_twin.planning.evidence.label_placement import WARNING_Z, Source, assess
+from puncture_twin.planning.evidence.edges import compare, edge_image, sample_surfaces
+from puncture_twin.planning.evidence.label_placement import (
+    AGREEING_RATIO,
+    AGREEING_Z,
+    STRUCTURE_RATIO,
+    STRUCTURE_Z,
+    WARNING_Z,
+    Source,
+    assess,
+)
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
@@ -191,8 +199,20 @@ def rows(patients, draws: int, rng: np.random.Generator) -> Iterator[dict]:
                     source = source_of(image_of, {one: meshes[one] for one in chosen})
                     kind, T = wrong(source, rng)
                     moved = {one: mesh.transformed(T) for one, mesh in source.meshes.items()}
-                    yield _row(name, change, count, "true", assess(image, source))
-                    yield _row(name, change, count, kind, assess(image, source_of(image_of, moved)))
+                    off = source_of(image_of, moved)
+                    yield _row(name, change, count, "true", assess(image, source)) | own_z(image, source)
+                    yield _row(name, change, count, kind, assess(image, off)) | own_z(image, off)
+
+
+def own_z(image, source):
+    """The largest z of each structure by itself: of shifts, and of any place, where it is so much better at least."""
+    compared = compare(image, sample_surfaces(list(source.meshes.values())), source.placements())
+    shifted = np.array([fit.placement.kind == "shift" for fit in compared.fits])
+    z = [
+        np.where(compared.own_ratio >= ratio, compared.own_z, -np.inf)[rows].max(axis=0).tolist()
+        for ratio, rows in ((STRUCTURE_RATIO, shifted), (AGREEING_RATIO, slice(None)))
+    ]
+    return {"own_z": z[0], "own_z_anywhere": z[1]}
 
 
 def _row(name, change, count, kind, found):
@@ -227,6 +247,14 @@ def main() -> None:
         true = [row for row in some if row["kind"] == "true"]
         counted = f"{z.max():.1f} | {sum(map(_refused, true))} of {len(z)} | {sum(map(_warned, true))}"
         print(f"| {name} | {count} | {counted} | {' | '.join(f'{one:.2f}' for one in part)} |")
+    print("\nEach structure by itself, the largest z:")
+    print(f"| structures | shifted, {STRUCTURE_RATIO:g} times: most | above {STRUCTURE_Z:g} | ", end="")
+    print(f"anywhere, {AGREEING_RATIO:g} times: most | above {AGREEING_Z:g} |\n|---|---|---|---|---|")
+    for kind in ("true", *sorted({row["kind"] for row in found} - {"true"})):
+        some = [row for row in found if row["kind"] == kind]
+        own, anywhere = (np.concatenate([row[key] for row in some]) for key in ("own_z", "own_z_anywhere"))
+        counted = f"{own.max():.1f} | {np.mean(own >= STRUCTURE_Z):.3f} | {anywhere.max():.1f} | "
+        print(f"| {len(own)} {kind} | {counted}{np.mean(anywhere >= AGREEING_Z):.3f} |")
     if arguments.json:
         arguments.json.write_text(json.dumps(found, indent=1))
 

@@ -13,6 +13,7 @@ from puncture_twin.planning.evidence.coverage import absent_usual_organs, short_
 from puncture_twin.planning.evidence.inside_skin import outside_skin
 from puncture_twin.planning.evidence.label_placement import label_placement
 from puncture_twin.planning.evidence.named_places import densities, inside_out, order_of_organs
+from puncture_twin.planning.evidence.neighbours import odd_units, overlaps
 from puncture_twin.planning.evidence.target import (
     needle_too_short,
     open_around_target,
@@ -50,6 +51,8 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
         *order_of_organs(case, anatomy),
         *inside_out(case, anatomy),
         *densities(case, anatomy, on_edges=on_edges),
+        *overlaps(case, anatomy, cache),
+        *odd_units(anatomy),
     )
     _refuse(case, placed)  # what follows looks from the target, which must lie in the body
     rest = (

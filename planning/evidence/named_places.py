@@ -152,9 +152,7 @@ def _pairs(middles: dict[str, Floats], axis: int) -> Iterator[tuple[str, str]]:
 
 def _is(name: str, organ: str) -> bool:
     """Whether a plain name is an organ's, or that of one of several of its kind (``vertebrae_L1``)."""
-    return name == organ or (
-        organ in {"vertebrae", "kidney", "lung", "hip", "rib", "femur"} and name.startswith(f"{organ}_")
-    )
+    return name == organ or (organ in SEVERAL and name.startswith(f"{organ}_"))
 
 
 def densities(case: Case, anatomy: Anatomy, *, on_edges: bool) -> Iterator[Finding]:
