@@ -118,7 +118,7 @@ def init(
         str | None, typer.Option("--segmentation", help="Which file or folder, where FOLDER holds several.")
     ] = None,
     trust_labels: Annotated[
-        bool, typer.Option("--trust-labels", help="You have looked: structures lie right, and none is missing.")
+        bool, typer.Option("--trust-labels", help="You have looked: structures lie right.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace a case.toml that is there.")] = False,
     as_json: JsonOption = False,

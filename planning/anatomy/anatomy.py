@@ -43,7 +43,7 @@ LIMB_ATTACHED = (
     f"unknown_region ({ATTACHED_LIMB})"
 )
 
-LABELS_TRUSTED = "search.trust_labels: what the CT shows inside the body beside the structures is not checked"
+UNNAMED_FREE = '[ct] unnamed = "free": what the CT shows inside the body beside the structures is not checked'
 
 CELLS = 24
 """Along the ball's diameter."""
@@ -123,8 +123,8 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         outside, couch = _outside(case, scan, shown, loader.warnings), shown.couch
         if any(structure.name == ATTACHED_LIMB for structure in outside):
             loader.warnings.append(LIMB_ATTACHED)
-        if case.ct.trust_labels:
-            loader.warnings.append(LABELS_TRUSTED)
+        if case.ct.unnamed == "free":
+            loader.warnings.append(UNNAMED_FREE)
         structures.extend(_unnamed(case, scan, structures))
     beyond = beyond_labels(case, skin, structures)
     structures.extend(beyond.structures)
@@ -148,8 +148,8 @@ def _outside(case: Case, scan: Scan, outside: Outside, warnings: list[str]) -> t
 
 
 def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterator[Structure]:
-    """What the CT shows inside the body that no structure names, unless the labels are trusted."""
-    if case.ct.trust_labels:
+    """What the CT shows inside the body that no structure names, unless the case takes that for free."""
+    if case.ct.unnamed == "free":
         return
     named = [Named(structure.name, structure.mesh) for structure in structures]
     unnamed = scan.unnamed(named, case.ct.dense_hu)
