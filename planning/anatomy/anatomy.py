@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,11 +107,11 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         InputError: A file that cannot be trusted, or a label that no rule names.
     """
     loader = StructureSources(case, progress, cache)
-    structures = [loader.one(section) for section in case.structure if section.role != "skin"]
-    for section in case.structures:
-        structures.extend(loader.many(section))
+    named = [partial(loader.one, section) for section in case.structure if section.role != "skin"]
+    ruled = [one for section in case.structures for one in loader.many(section)]
+    _check_count(case, len(named) + len(ruled) + 1)
+    structures = [read() for read in (*named, *ruled)]
     skin = loader.skin(case.skin_section, structures)
-    _check_count(case, structures)
     _check_demands(case, structures)
     structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
@@ -178,10 +179,9 @@ def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh 
     return None if scan is None else scan.outside(case.ct.air_hu).couch
 
 
-def _check_count(case: Case, structures: list[Structure]) -> None:
-    """Of a case that states how many structures it has; before the CT adds others."""
-    wrong = "" if case.stated_structures is None else count_difference(case.stated_structures, len(structures) + 1)
-    if wrong:
+def _check_count(case: Case, count: int) -> None:
+    """Of a case that states how many structures it has, before a surface is made; the CT adds others later."""
+    if wrong := "" if case.stated_structures is None else count_difference(case.stated_structures, count):
         raise InputError(wrong, where=case.path, allowed="the number of structures that are read")
 
 
