@@ -22,10 +22,8 @@ import scipy
 
 from puncture_twin.planning.evidence.edges import compare, edge_image, sample_surfaces
 from puncture_twin.planning.evidence.label_placement import (
-    AGREEING_RATIO,
-    AGREEING_Z,
-    STRUCTURE_RATIO,
-    STRUCTURE_Z,
+    AGREEING,
+    STRUCTURES,
     WARNING_Z,
     Source,
     assess,
@@ -205,14 +203,25 @@ def rows(patients, draws: int, rng: np.random.Generator) -> Iterator[dict]:
 
 
 def own_z(image, source):
-    """The largest z of each structure by itself: of shifts, and of any place, where it is so much better at least."""
+    """Each structure's largest z by itself where it is so many times better: of shifts for two, of any place."""
     compared = compare(image, sample_surfaces(list(source.meshes.values())), source.placements())
     shifted = np.array([fit.placement.kind == "shift" for fit in compared.fits])
     z = [
         np.where(compared.own_ratio >= ratio, compared.own_z, -np.inf)[rows].max(axis=0).tolist()
-        for ratio, rows in ((STRUCTURE_RATIO, shifted), (AGREEING_RATIO, slice(None)))
+        for (_, ratio), rows in zip((*STRUCTURES, AGREEING), (shifted, shifted, slice(None)), strict=True)
     ]
-    return {"own_z": z[0], "own_z_anywhere": z[1]}
+    return {"own_z": z}
+
+
+def _print_own(found):
+    limits = (*STRUCTURES, AGREEING)
+    print("\nEach structure by itself, the largest z where it is so many times better, and which have so much:")
+    heads = [f"{ratio:g} times better: most | z >= {z:g}" for z, ratio in limits]
+    print(f"| structures | {' | '.join(heads)} anywhere |\n|---|{6 * '---|'}")
+    for kind in ("true", *sorted({row["kind"] for row in found} - {"true"})):
+        own = np.concatenate([np.transpose(row["own_z"]) for row in found if row["kind"] == kind])
+        cells = [f"{own[:, k].max():.1f} | {np.mean(own[:, k] >= z):.3f}" for k, (z, _) in enumerate(limits)]
+        print(f"| {len(own)} {kind} | {' | '.join(cells)} |")
 
 
 def _row(name, change, count, kind, found):
@@ -247,14 +256,7 @@ def main() -> None:
         true = [row for row in some if row["kind"] == "true"]
         counted = f"{z.max():.1f} | {sum(map(_refused, true))} of {len(z)} | {sum(map(_warned, true))}"
         print(f"| {name} | {count} | {counted} | {' | '.join(f'{one:.2f}' for one in part)} |")
-    print("\nEach structure by itself, the largest z:")
-    print(f"| structures | shifted, {STRUCTURE_RATIO:g} times: most | above {STRUCTURE_Z:g} | ", end="")
-    print(f"anywhere, {AGREEING_RATIO:g} times: most | above {AGREEING_Z:g} |\n|---|---|---|---|---|")
-    for kind in ("true", *sorted({row["kind"] for row in found} - {"true"})):
-        some = [row for row in found if row["kind"] == kind]
-        own, anywhere = (np.concatenate([row[key] for row in some]) for key in ("own_z", "own_z_anywhere"))
-        counted = f"{own.max():.1f} | {np.mean(own >= STRUCTURE_Z):.3f} | {anywhere.max():.1f} | "
-        print(f"| {len(own)} {kind} | {counted}{np.mean(anywhere >= AGREEING_Z):.3f} |")
+    _print_own(found)
     if arguments.json:
         arguments.json.write_text(json.dumps(found, indent=1))
 

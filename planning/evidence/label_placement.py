@@ -24,7 +24,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.anatomy.scan import Scan
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.case.case import Case
@@ -62,11 +62,11 @@ LEAST_SLIP = {"shift": 0.9, "turn": 0.9, "axes": 0.9, "grid": 0.9, "unit": 0.9, 
 """In shifts of the least that counts, by kind of placement: what moves the surfaces by less is never refused. A rib
 cage by itself lies better on the edge of the lungs, 4 % smaller: .96."""
 
-STRUCTURE_Z, STRUCTURE_RATIO = 3.5, 1.2
-AGREEING_Z, AGREEING_RATIO = 4.0, 1.5
-"""One structure of a source that fits is named where it lies so much better elsewhere, and several are refused that
-do so at one place: the table of `python -m benchmarks.placements` has z of true ones. Of those that are 15 mm off four
-in ten are named; a small one has too few patches for that."""
+STRUCTURES = ((3.5, 1.2), (2.5, 2.0))
+AGREEING = (4.0, 1.5)
+"""z and ratio: one structure of a source that fits is named where it lies so much better elsewhere by itself (either),
+and several are refused that do so at one place. The table of `python -m benchmarks.placements` has z of true ones. Of
+those that are 15 mm off half are named; a small one has too few patches for that."""
 
 UNITS = (0.001, 0.1, 10.0, 1000.0)
 LEAST_EXTENT_MM = 50.0
@@ -232,15 +232,20 @@ def _excluded(fit: Fit) -> bool:
 def _odd(names: Sequence[str], compared: Compared) -> tuple[str, ...]:
     """Structures that lie better shifted by themselves. A lung that is full has no edge, but its mirror image has."""
     shifted = np.array([fit.placement.kind == "shift" for fit in compared.fits])
-    better = (compared.own_ratio >= STRUCTURE_RATIO) & (compared.own_z >= STRUCTURE_Z)
+    better = sum(_better(compared, *least) for least in STRUCTURES) > 0
     return tuple(name for name, own in zip(names, better[shifted].any(axis=0), strict=True) if own)
 
 
 def _agreeing(names: Sequence[str], compared: Compared) -> tuple[str, ...]:
     """The structures that lie better at the place that most of them prefer; empty where no two agree."""
-    better = (compared.own_ratio >= AGREEING_RATIO) & (compared.own_z >= AGREEING_Z)
+    better = _better(compared, *AGREEING)
     most = better[better.sum(axis=1).argmax()]
     return tuple(name for name, one in zip(names, most, strict=True) if one) if most.sum() >= 2 else ()
+
+
+def _better(compared: Compared, z: float, ratio: float) -> Bools:
+    """Which structures lie so much better at which place by themselves, shape (placements, structures)."""
+    return np.asarray((compared.own_z >= z) & (compared.own_ratio >= ratio))
 
 
 def label_placement(case: Case, anatomy: Anatomy) -> Iterator[Finding]:

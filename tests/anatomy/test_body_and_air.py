@@ -262,7 +262,7 @@ def test_a_skin_from_elsewhere_with_the_ct_beside_it(scene):
 
 
 def test_a_bone_that_nobody_labelled_is_unknown(scene):
-    """Without its label the spine is ``unnamed_dense``; ``[ct] unnamed`` takes it for free, ``trust_labels`` does not."""
+    """Without its label the spine is ``unnamed_dense``; ``[ct] unnamed`` takes it for free, trusted labels do not."""
     folder, parts = scene("alone")
     spine = next(part for part in parts if part.name == "spine")
     found = prepare(write_case(folder, structures=KIDNEY), arm=False).search()
