@@ -27,6 +27,7 @@ from puncture_twin.planning.evidence.label_placement import (
     WARNING_Z,
     Source,
     assess,
+    better_alone,
 )
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.volumes.orientation import canonical
@@ -203,21 +204,18 @@ def rows(patients, draws: int, rng: np.random.Generator) -> Iterator[dict]:
 
 
 def own_z(image, source):
-    """Each structure's largest z by itself where it is so many times better: of shifts for two, of any place."""
+    """Each structure's largest z by itself, for each limit where it is so many times better: shifted, or in RAS."""
     compared = compare(image, sample_surfaces(list(source.meshes.values())), source.placements())
-    shifted = np.array([fit.placement.kind == "shift" for fit in compared.fits])
-    z = [
-        np.where(compared.own_ratio >= ratio, compared.own_z, -np.inf)[rows].max(axis=0).tolist()
-        for (_, ratio), rows in zip((*STRUCTURES, AGREEING), (shifted, shifted, slice(None)), strict=True)
-    ]
-    return {"own_z": z}
+    limits = (*STRUCTURES, AGREEING)
+    own = [np.where(better_alone(compared, -np.inf, ratio), compared.own_z, -np.inf) for _, ratio in limits]
+    return {"own_z": [z.max(axis=0).tolist() for z in own]}
 
 
 def _print_own(found):
     limits = (*STRUCTURES, AGREEING)
     print("\nEach structure by itself, the largest z where it is so many times better, and which have so much:")
     heads = [f"{ratio:g} times better: most | z >= {z:g}" for z, ratio in limits]
-    print(f"| structures | {' | '.join(heads)} anywhere |\n|---|{6 * '---|'}")
+    print(f"| structures | {' | '.join(heads)} |\n|---|{6 * '---|'}")
     for kind in ("true", *sorted({row["kind"] for row in found} - {"true"})):
         own = np.concatenate([np.transpose(row["own_z"]) for row in found if row["kind"] == kind])
         cells = [f"{own[:, k].max():.1f} | {np.mean(own[:, k] >= z):.3f}" for k, (z, _) in enumerate(limits)]

@@ -1,0 +1,49 @@
+"""Draws of every kind, and what came of them."""
+
+import tempfile
+import zlib
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from slips import devices, files, placements
+from slips.kinds import REFUSED, RIGHT, SILENT, TOLD, WARNED, Kind
+
+KINDS: tuple[Kind, ...] = (*placements.KINDS, *files.KINDS, *devices.KINDS)
+
+
+class Found(NamedTuple):
+    """What came of the draws of one kind."""
+
+    name: str
+    slips: Counter[str]
+    true: Counter[str]
+    wrong: tuple[str, ...]
+    """Each draw that passed in silence, or was refused and true."""
+
+
+def run(kind: Kind, draws: int, seed: int) -> Found:
+    """Its share of so many draws, at least one; each with a generator of its own, told by kind, seed and number."""
+    slips, true, wrong = Counter(), Counter(), []
+    for number in range(max(1, round(draws * kind.share / sum(one.share for one in KINDS)))):
+        for slip, counted in ((True, slips), (False, true)):
+            rng = np.random.default_rng([seed, zlib.crc32(kind.name.encode()), number])
+            with tempfile.TemporaryDirectory() as folder:
+                came = kind.draw(rng, Path(folder), slip)
+            counted[came.how] += 1
+            if came.how == (SILENT if slip else REFUSED):
+                wrong.append(f"{kind.name}, {number}, {'slip' if slip else 'true'}: {came.how} {came.code}")
+    return Found(kind.name, slips, true, tuple(wrong))
+
+
+def table(found: Sequence[Found]) -> str:
+    """One row a kind."""
+    heads = (REFUSED, WARNED, TOLD, RIGHT, SILENT)
+    lines = [f"| kind | draws | {' | '.join(heads)} | true: refused | true: warned |", "|---|" + 8 * "---|"]
+    for one in found:
+        cells = [one.slips.total(), *(one.slips[how] for how in heads), one.true[REFUSED], one.true[WARNED]]
+        lines.append(f"| {one.name} | {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)
