@@ -4,7 +4,7 @@ import argparse
 import sys
 import time
 
-from slips.runner import KINDS, run, table
+from slips.runner import HEAD, KINDS, row, run
 
 
 def main():
@@ -15,14 +15,15 @@ def main():
     arguments.add_argument("--only", default="", help="Kinds whose name holds this.")
     given = arguments.parse_args()
     start, found = time.monotonic(), []
+    sys.stdout.write(HEAD)
     for kind in (one for one in KINDS if given.only in one.name):
         found.append(run(kind, given.draws, given.seed))
-        for line in found[-1].wrong:
-            sys.stdout.write(f"{line}\n")
-            sys.stdout.flush()
+        sys.stdout.write(row(found[-1]))
+        sys.stdout.flush()
     draws = sum(one.slips.total() for one in found)
-    sys.stdout.write(f"{draws} slips and {draws} true inputs in {time.monotonic() - start:.0f} s\n{table(found)}\n")
-    return any(one.wrong for one in found)
+    wrong = [line for one in found for line in one.wrong]
+    sys.stdout.write("\n".join([f"\n{draws} slips, {draws} true inputs, {time.monotonic() - start:.0f} s", *wrong, ""]))
+    return bool(wrong)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import dicom_world
 import numpy as np
+import pydicom
 import trimesh
 
 from puncture_twin.planning.base.cache import entry_file
@@ -144,8 +145,9 @@ def _slice_cut(rng, path):
 
 
 def _slice_moved(rng, path):
-    """One slice at another's place."""
-    data = dicom_world.ct_slice(np.zeros((7, 5), np.int16), dicom_world.affine(), int(rng.integers(0, 8)), 90)
+    """One slice where another one is, or between two."""
+    data = pydicom.dcmread(path)
+    data.ImagePositionPatient[2] += 2.5 * rng.choice([-2, -1, -0.5, 0.5, 1, 2])
     dicom_world.write(data, path)
 
 

@@ -3,7 +3,6 @@
 import tempfile
 import zlib
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 from slips import devices, files, placements
 from slips.kinds import REFUSED, RIGHT, SILENT, TOLD, WARNED, Kind
 
-KINDS: tuple[Kind, ...] = (*placements.KINDS, *files.KINDS, *devices.KINDS)
+KINDS: tuple[Kind, ...] = (*files.KINDS, *devices.KINDS, *placements.KINDS)
 
 
 class Found(NamedTuple):
@@ -39,11 +38,11 @@ def run(kind: Kind, draws: int, seed: int) -> Found:
     return Found(kind.name, slips, true, tuple(wrong))
 
 
-def table(found: Sequence[Found]) -> str:
-    """One row a kind."""
-    heads = (REFUSED, WARNED, TOLD, RIGHT, SILENT)
-    lines = [f"| kind | draws | {' | '.join(heads)} | true: refused | true: warned |", "|---|" + 8 * "---|"]
-    for one in found:
-        cells = [one.slips.total(), *(one.slips[how] for how in heads), one.true[REFUSED], one.true[WARNED]]
-        lines.append(f"| {one.name} | {' | '.join(map(str, cells))} |")
-    return "\n".join(lines)
+ANSWERS = (REFUSED, WARNED, TOLD, RIGHT, SILENT)
+HEAD = f"| kind | draws | {' | '.join(ANSWERS)} | true: refused | true: warned |\n|---|{8 * '---|'}\n"
+
+
+def row(one: Found) -> str:
+    """Of the table whose head is `HEAD`."""
+    cells = [one.slips.total(), *(one.slips[how] for how in ANSWERS), one.true[REFUSED], one.true[WARNED]]
+    return f"| {one.name} | {' | '.join(map(str, cells))} |\n"
