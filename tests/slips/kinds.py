@@ -26,11 +26,13 @@ class Kind(NamedTuple):
         name: In words.
         share: Of a thousand draws.
         draw: With a generator, an empty folder, and whether it slips; without, the same input is drawn right.
+        may_pass: Of the slips, how many are known to pass in silence: a hole that is measured, and only shrinks.
     """
 
     name: str
     share: int
     draw: Callable[[np.random.Generator, Path, bool], Answer]
+    may_pass: float = 0.0
 
 
 def answer(call: Callable[[], Answer | None]) -> Answer:
