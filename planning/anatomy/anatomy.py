@@ -107,10 +107,10 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         InputError: A file that cannot be trusted, or a label that no rule names.
     """
     loader = StructureSources(case, progress, cache)
-    named = [partial(loader.one, section) for section in case.structure if section.role != "skin"]
-    ruled = [one for section in case.structures for one in loader.many(section)]
-    _check_count(case, len(named) + len(ruled) + 1)
-    structures = [read() for read in (*named, *ruled)]
+    reads = [partial(loader.one, section) for section in case.structure if section.role != "skin"]
+    reads += [one for section in case.structures for one in loader.many(section)]
+    _check_count(case, len(reads) + 1)
+    structures = [read() for read in reads]
     skin = loader.skin(case.skin_section, structures)
     _check_demands(case, structures)
     structures.extend(own_target(case))

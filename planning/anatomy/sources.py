@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -52,7 +52,7 @@ class StructureSources:
         role, margin_mm = Role(section.role), section.margin_mm or 0.0
         return Structure(section.name, role, margin_mm, mesh, source, voxel_ct=voxel_ct)
 
-    def many(self, section: StructuresSection) -> list[Callable[[], Structure]]:
+    def many(self, section: StructuresSection) -> list[partial[Structure]]:
         """All labels of one map, or masks of one folder, that the rules do not ignore; their surfaces when called."""
         if section.mask_set is not None:
             return self._masks(section, section.mask_set)
@@ -69,7 +69,7 @@ class StructureSources:
         role, mesh = Role(rule.kind.value), volume.label(label)
         return Structure(rule.name, role, rule.margin_mm, mesh, f"{file}:{label}", voxel_ct=volume.voxel_ct)
 
-    def _masks(self, section: StructuresSection, folder: str) -> list[Callable[[], Structure]]:
+    def _masks(self, section: StructuresSection, folder: str) -> list[partial[Structure]]:
         """One structure a mask (a file or part of one) that is not empty; one mask's voxels at a time are in memory."""
         self._refuse_local(folder, "masks")
         files = self._case.masks(folder)

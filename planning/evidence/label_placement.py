@@ -239,7 +239,7 @@ def _excluded(fit: Fit) -> bool:
 
 def _odd(names: Sequence[str], compared: Compared) -> tuple[str, ...]:
     """Structures that lie better elsewhere by themselves."""
-    better = sum(better_alone(compared, *least).any(axis=0) for least in STRUCTURES)
+    better = np.any([better_alone(compared, *least).any(axis=0) for least in STRUCTURES], axis=0)
     return tuple(name for name, own in zip(names, better, strict=True) if own)
 
 
