@@ -205,6 +205,9 @@ def _other_space(rng):
     return np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
+MAY_PASS = 0.35
+"""What is shifted into the rim of the body, or against the skin, where no other part lies."""
+
 KINDS = (
     Kind("labels shifted", 40, partial(_whole, "shift", _shift)),
     Kind("labels scaled", 25, partial(_whole, "scale", _scale)),
@@ -213,8 +216,8 @@ KINDS = (
     Kind("labels turned", 20, partial(_whole, "turn", _turn)),
     Kind("labels reversed", 15, partial(_whole, "axes", _reversed)),
     Kind("labels with exchanged axes", 20, partial(_whole, "axes", _permuted)),
-    Kind("one mask 15 mm off", 30, partial(_one_off, "masks", _beside)),
-    Kind("one mesh 15 mm off", 20, partial(_one_off, "meshes", _beside)),
+    Kind("one mask 15 mm off", 30, partial(_one_off, "masks", _beside), may_pass=MAY_PASS),
+    Kind("one mesh 15 mm off", 20, partial(_one_off, "meshes", _beside), may_pass=MAY_PASS),
     Kind("one mesh in the other space", 20, partial(_one_off, "meshes", _other_space)),
     Kind("one mesh in cm", 15, partial(_one_off, "meshes", partial(_scaled, 0.1))),
     Kind("one mesh in m", 10, partial(_one_off, "meshes", partial(_scaled, 0.001))),
