@@ -180,14 +180,16 @@ def _answered(command: Callable[[], object]) -> object:
     try:
         return command()
     except (PlanningError, ClickException) as error:
-        document = {"code": "command_line", "sentence": _line_and_code(error)[0], "where": "", "allowed": ""}
-        if isinstance(error, InputError):
-            document |= {"code": error.code or "bad_input", "sentence": error.what}
-            document |= {"where": error.where, "allowed": error.allowed}
-        elif isinstance(error, PlanningError):
-            document["code"] = "no_answer" if isinstance(error, NoAnswerError) else "program_failed"
-        numbers = getattr(error, "numbers", None) or getattr(error, "counts", {})
-        print_answer({"error": document | {"numbers": numbers}}, "", as_json=True)
+        codes = {InputError: "bad_input", NoAnswerError: "no_answer", PlanningError: "program_failed"}
+        code = next((code for kind, code in codes.items() if isinstance(error, kind)), "command_line")
+        document = {
+            "code": getattr(error, "code", "") or code,
+            "sentence": getattr(error, "what", _line_and_code(error)[0]),
+            "where": getattr(error, "where", ""),
+            "allowed": getattr(error, "allowed", ""),
+            "numbers": getattr(error, "numbers", None) or getattr(error, "counts", {}),
+        }
+        print_answer({"error": document}, "", as_json=True)
         flush_output()
         raise
 
