@@ -7,12 +7,14 @@ BIN := $(VENV)/bin
 OUT ?= out/demo
 RUNS ?= 100000
 FIRST ?= 0
+DRAWS ?= 1000
+SEED ?= 0
 KILLS ?= 10
 
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test quick durations fuzz kill kill-batch lint mutants install reinstall kernels wheel docs pictures meshes clean
+.PHONY: demo test quick durations slips fuzz kill kill-batch lint mutants install reinstall kernels wheel docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -42,6 +44,10 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# Slips of each kind, each beside a true input: what is said of them; DRAWS=100 SEED=1 for fewer, and other, ones.
+slips: install
+	cd tests && PYTHONPATH=..:. ../$(BIN)/python -m slips --draws $(DRAWS) --seed $(SEED)
 
 # Mutated files and command lines; RUNS=1000 FIRST=500000 for fewer, and other, ones.
 fuzz: install

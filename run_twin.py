@@ -118,7 +118,7 @@ def init(
         str | None, typer.Option("--segmentation", help="Which file or folder, where FOLDER holds several.")
     ] = None,
     trust_labels: Annotated[
-        bool, typer.Option("--trust-labels", help="You have looked: structures lie right, and none is missing.")
+        bool, typer.Option("--trust-labels", help="You have looked: structures lie right.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace a case.toml that is there.")] = False,
     as_json: JsonOption = False,
@@ -698,7 +698,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for one another
     with late_collection():
-        return with_room(partial(exit_code_of, partial(_parsed, arguments), _print_whole))
+        as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
+        return with_room(partial(exit_code_of, partial(_parsed, arguments), _print_whole, as_json=as_json))
 
 
 def _parsed(arguments: list[str] | None) -> Any:

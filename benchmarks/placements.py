@@ -20,8 +20,15 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from puncture_twin.planning.evidence.edges import edge_image
-from puncture_twin.planning.evidence.label_placement import WARNING_Z, Source, assess
+from puncture_twin.planning.evidence.edges import compare, edge_image, sample_surfaces
+from puncture_twin.planning.evidence.label_placement import (
+    AGREEING,
+    STRUCTURES,
+    WARNING_Z,
+    Source,
+    assess,
+    better_alone,
+)
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
@@ -191,8 +198,28 @@ def rows(patients, draws: int, rng: np.random.Generator) -> Iterator[dict]:
                     source = source_of(image_of, {one: meshes[one] for one in chosen})
                     kind, T = wrong(source, rng)
                     moved = {one: mesh.transformed(T) for one, mesh in source.meshes.items()}
-                    yield _row(name, change, count, "true", assess(image, source))
-                    yield _row(name, change, count, kind, assess(image, source_of(image_of, moved)))
+                    off = source_of(image_of, moved)
+                    yield _row(name, change, count, "true", assess(image, source)) | own_z(image, source)
+                    yield _row(name, change, count, kind, assess(image, off)) | own_z(image, off)
+
+
+def own_z(image, source):
+    """Each structure's largest z by itself, for each limit where it is so many times better: shifted, or in RAS."""
+    compared = compare(image, sample_surfaces(list(source.meshes.values())), source.placements())
+    limits = (*STRUCTURES, AGREEING)
+    own = [np.where(better_alone(compared, -np.inf, ratio), compared.own_z, -np.inf) for _, ratio in limits]
+    return {"own_z": [z.max(axis=0).tolist() for z in own]}
+
+
+def _print_own(found):
+    limits = (*STRUCTURES, AGREEING)
+    print("\nEach structure by itself, the largest z where it is so many times better, and which have so much:")
+    heads = [f"{ratio:g} times better: most | z >= {z:g}" for z, ratio in limits]
+    print(f"| structures | {' | '.join(heads)} |\n|---|{6 * '---|'}")
+    for kind in ("true", *sorted({row["kind"] for row in found} - {"true"})):
+        own = np.concatenate([np.transpose(row["own_z"]) for row in found if row["kind"] == kind])
+        cells = [f"{own[:, k].max():.1f} | {np.mean(own[:, k] >= z):.3f}" for k, (z, _) in enumerate(limits)]
+        print(f"| {len(own)} {kind} | {' | '.join(cells)} |")
 
 
 def _row(name, change, count, kind, found):
@@ -227,6 +254,7 @@ def main() -> None:
         true = [row for row in some if row["kind"] == "true"]
         counted = f"{z.max():.1f} | {sum(map(_refused, true))} of {len(z)} | {sum(map(_warned, true))}"
         print(f"| {name} | {count} | {counted} | {' | '.join(f'{one:.2f}' for one in part)} |")
+    _print_own(found)
     if arguments.json:
         arguments.json.write_text(json.dumps(found, indent=1))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ LIMB_ATTACHED = (
     f"unknown_region ({ATTACHED_LIMB})"
 )
 
-LABELS_TRUSTED = "search.trust_labels: what the CT shows inside the body beside the structures is not checked"
+UNNAMED_FREE = '[ct] unnamed = "free": what the CT shows inside the body beside the structures is not checked'
 
 CELLS = 24
 """Along the ball's diameter."""
@@ -106,11 +107,11 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         InputError: A file that cannot be trusted, or a label that no rule names.
     """
     loader = StructureSources(case, progress, cache)
-    structures = [loader.one(section) for section in case.structure if section.role != "skin"]
-    for section in case.structures:
-        structures.extend(loader.many(section))
+    reads = [partial(loader.one, section) for section in case.structure if section.role != "skin"]
+    reads += [one for section in case.structures for one in loader.many(section)]
+    _check_count(case, len(reads) + 1)
+    structures = [read() for read in reads]
     skin = loader.skin(case.skin_section, structures)
-    _check_count(case, structures)
     _check_demands(case, structures)
     structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
@@ -123,8 +124,8 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         outside, couch = _outside(case, scan, shown, loader.warnings), shown.couch
         if any(structure.name == ATTACHED_LIMB for structure in outside):
             loader.warnings.append(LIMB_ATTACHED)
-        if case.ct.trust_labels:
-            loader.warnings.append(LABELS_TRUSTED)
+        if case.ct.unnamed == "free":
+            loader.warnings.append(UNNAMED_FREE)
         structures.extend(_unnamed(case, scan, structures))
     beyond = beyond_labels(case, skin, structures)
     structures.extend(beyond.structures)
@@ -148,8 +149,8 @@ def _outside(case: Case, scan: Scan, outside: Outside, warnings: list[str]) -> t
 
 
 def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterator[Structure]:
-    """What the CT shows inside the body that no structure names, unless the labels are trusted."""
-    if case.ct.trust_labels:
+    """What the CT shows inside the body that no structure names, unless the case takes that for free."""
+    if case.ct.unnamed == "free":
         return
     named = [Named(structure.name, structure.mesh) for structure in structures]
     unnamed = scan.unnamed(named, case.ct.dense_hu)
@@ -178,10 +179,9 @@ def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh 
     return None if scan is None else scan.outside(case.ct.air_hu).couch
 
 
-def _check_count(case: Case, structures: list[Structure]) -> None:
-    """Of a case that states how many structures it has; before the CT adds others."""
-    wrong = "" if case.stated_structures is None else count_difference(case.stated_structures, len(structures) + 1)
-    if wrong:
+def _check_count(case: Case, count: int) -> None:
+    """Of a case that states how many structures it has, before a surface is made; the CT adds others later."""
+    if wrong := "" if case.stated_structures is None else count_difference(case.stated_structures, count):
         raise InputError(wrong, where=case.path, allowed="the number of structures that are read")
 
 

@@ -11,7 +11,6 @@ from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin, flat_ends
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.anatomy.surfaces import Imaged, VolumeSurfaces, kept_skin
-from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names
@@ -53,21 +52,24 @@ class StructureSources:
         role, margin_mm = Role(section.role), section.margin_mm or 0.0
         return Structure(section.name, role, margin_mm, mesh, source, voxel_ct=voxel_ct)
 
-    def many(self, section: StructuresSection) -> list[Structure]:
-        """All labels of one map, or masks of one folder, that the rules do not ignore."""
+    def many(self, section: StructuresSection) -> list[partial[Structure]]:
+        """All labels of one map, or masks of one folder, that the rules do not ignore; their surfaces when called."""
         if section.mask_set is not None:
             return self._masks(section, section.mask_set)
         name = section.source
         volume = self._labels(name)
         names = names_for(section.naming, self._case.folder, self._case.files.content, volume)
-        structures = []
-        for rule in self._kept_rules(section, names, volume.labels_present()):
-            self._progress(rule.name)
-            mesh = volume.label(rule.label)
-            structures.append(_ruled(rule, mesh, f"{name}:{rule.label}", volume.voxel_ct))
-        return structures
+        rules = self._kept_rules(section, names, volume.labels_present())
+        return [partial(self._ruled, rule, volume, name, rule.label) for rule in rules]
 
-    def _masks(self, section: StructuresSection, folder: str) -> list[Structure]:
+    def _ruled(self, rule: LabelRule, volume: VolumeSurfaces | None, file: str, label: int) -> Structure:
+        """The structure that a rule names; a volume that nobody holds is opened for it alone."""
+        self._progress(rule.name)
+        volume = volume or self._open(file)
+        role, mesh = Role(rule.kind.value), volume.label(label)
+        return Structure(rule.name, role, rule.margin_mm, mesh, f"{file}:{label}", voxel_ct=volume.voxel_ct)
+
+    def _masks(self, section: StructuresSection, folder: str) -> list[partial[Structure]]:
         """One structure a mask (a file or part of one) that is not empty; one mask's voxels at a time are in memory."""
         self._refuse_local(folder, "masks")
         files = self._case.masks(folder)
@@ -81,13 +83,8 @@ class StructureSources:
         self.warnings.extend(said for number, mask in masks.items() for said in mask.notes(Path(files[names[number]])))
         if empty := [name for number, name in names.items() if number not in present]:
             self.warnings.append(EMPTY_MASKS.format(folder=folder, count=len(empty), names=first_few(empty)))
-        structures = []
-        for rule in self._kept_rules(section, names, present):
-            self._progress(rule.name)
-            (label,) = masks[rule.label].labels
-            volume = self._open(files[rule.name])
-            structures.append(_ruled(rule, volume.label(label), f"{files[rule.name]}:{label}", volume.voxel_ct))
-        return structures
+        rules = self._kept_rules(section, names, present)
+        return [partial(self._ruled, rule, None, files[rule.name], *masks[rule.label].labels) for rule in rules]
 
     def _kept_rules(
         self, section: StructuresSection, names: Mapping[int, str], present: Collection[int]
@@ -240,7 +237,3 @@ class StructureSources:
 def _no_bytes(ends: tuple[str, ...]) -> int:
     """Of a few names."""
     return 100 * len(ends)
-
-
-def _ruled(rule: LabelRule, mesh: TriangleMesh, source: str, voxel_ct: Floats) -> Structure:
-    return Structure(rule.name, Role(rule.kind.value), rule.margin_mm, mesh, source, voxel_ct=voxel_ct)

@@ -76,7 +76,8 @@ class CtSettings:
         air_hu: Outside of the body, what is denser is not air.
         dense_hu: Inside the body, what is at least so dense must belong to a structure.
         margin_mm: Clearance that these structures demand.
-        trust_labels: Whether the inside is left to the structures alone.
+        unnamed: What it shows inside the body and no structure names: ``unknown``, or ``free``.
+        trust_labels: Whether a person has seen that the structures lie right: no check of that refuses them.
         arms: Whether the image shows arms or other limbs beside the trunk, where a person states it.
         table: Whether it shows what the body lies on, where a person states it.
         beyond_mm: How much wider than where the image cuts it the body may be beyond, where a person states it;
@@ -87,6 +88,7 @@ class CtSettings:
     air_hu: float = AIR_HU
     dense_hu: float = DENSE_HU
     margin_mm: float = 2.0
+    unnamed: str = "unknown"
     trust_labels: bool = False
     arms: Stated | None = None
     table: Stated | None = None

@@ -12,7 +12,8 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.evidence.coverage import absent_usual_organs, short_grid, thick_slices
 from puncture_twin.planning.evidence.inside_skin import outside_skin
 from puncture_twin.planning.evidence.label_placement import label_placement
-from puncture_twin.planning.evidence.named_places import densities, inside_out, order_of_organs
+from puncture_twin.planning.evidence.named_places import densities, order_of_organs
+from puncture_twin.planning.evidence.neighbours import odd_units, overlaps
 from puncture_twin.planning.evidence.target import (
     needle_too_short,
     open_around_target,
@@ -48,8 +49,9 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
         *target_in_vessel(case),
         *target_in_other_space(case, anatomy),
         *order_of_organs(case, anatomy),
-        *inside_out(case, anatomy),
         *densities(case, anatomy, on_edges=on_edges),
+        *overlaps(case, anatomy, cache),
+        *odd_units(anatomy),
     )
     _refuse(case, placed)  # what follows looks from the target, which must lie in the body
     rest = (

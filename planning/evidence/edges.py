@@ -185,10 +185,8 @@ def sample_surfaces(meshes: Sequence[TriangleMesh], count: int = POINTS) -> Samp
     points, normals = [], []
     for mesh, number in zip(meshes, counts, strict=True):
         spread = spread_on(mesh, number)
-        a, b, c = np.moveaxis(mesh.triangles[spread.triangle], 1, 0)
-        normal = np.cross(b - a, c - a)
         points.append(spread.points)
-        normals.append(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny))
+        normals.append(spread.normals)
     structure = np.repeat(np.arange(len(meshes)), counts)
     where = np.concatenate(points)
     cube = np.floor((where - where.min(axis=0)) / PATCH_MM).astype(np.intp)

@@ -152,9 +152,7 @@ def _pairs(middles: dict[str, Floats], axis: int) -> Iterator[tuple[str, str]]:
 
 def _is(name: str, organ: str) -> bool:
     """Whether a plain name is an organ's, or that of one of several of its kind (``vertebrae_L1``)."""
-    return name == organ or (
-        organ in {"vertebrae", "kidney", "lung", "hip", "rib", "femur"} and name.startswith(f"{organ}_")
-    )
+    return name == organ or (organ in SEVERAL and name.startswith(f"{organ}_"))
 
 
 def densities(case: Case, anatomy: Anatomy, *, on_edges: bool) -> Iterator[Finding]:
@@ -190,23 +188,4 @@ def densities(case: Case, anatomy: Anatomy, *, on_edges: bool) -> Iterator[Findi
 def _below(mesh: TriangleMesh) -> Floats:
     """Points (n, 3) just below a surface, mm."""
     spread = spread_on(mesh, SAMPLES)
-    a, b, c = np.moveaxis(mesh.triangles[spread.triangle], 1, 0)
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
-    return np.asarray(spread.points - INWARD_MM * _outward(mesh) * normal)
-
-
-def _outward(mesh: TriangleMesh) -> float:
-    """1 where triangles are wound so that normals point outward, -1 where the mesh is inside out (by its volume)."""
-    a, b, c = np.moveaxis(mesh.triangles - mesh.bounds.mean(axis=0), 1, 0)
-    return 1.0 if np.einsum("ij,ij->", a, np.cross(b, c)) >= 0.0 else -1.0
-
-
-def inside_out(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
-    """That closed meshes are inside out: who mirrors points and keeps the triangles leaves that behind."""
-    files = {section.mesh for section in case.structure if section.mesh is not None}
-    closed = [one for one in anatomy.structures if one.source in files and one.mesh.closed]
-    turned = [one.name for one in closed if _outward(one.mesh) < 0.0]
-    if len(turned) >= 2:
-        said = f"{len(turned)} of {len(closed)} closed meshes are inside out ({', '.join(turned)}): were they mirrored?"
-        yield Finding("meshes_inside_out", Severity.WARNING, said)
+    return np.asarray(spread.points - np.copysign(INWARD_MM, mesh.volume) * spread.normals)

@@ -126,6 +126,12 @@ class TriangleMesh:
         a, b, c = np.moveaxis(self.triangles, 1, 0)
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
 
+    @property
+    def volume(self) -> float:
+        """What it encloses where it is closed, mm^3; negative where its triangles face inward."""
+        a, b, c = np.moveaxis(self.triangles - self.bounds.mean(axis=0), 1, 0)
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
     def transformed(self, T_b_a: NDArray[np.float64]) -> TriangleMesh:
         """The same surface in frame b.
 
@@ -136,10 +142,10 @@ class TriangleMesh:
 
 
 class Spread(NamedTuple):
-    """Points on a surface: coordinates (n, 3), mm, and the triangle that each lies on, shape (n,)."""
+    """Points on a surface (n, 3), mm, and the unit normals (n, 3) of their triangles, as these are wound."""
 
     points: Floats
-    triangle: NDArray[np.intp]
+    normals: Floats
 
 
 def spread_on(mesh: TriangleMesh, count: int) -> Spread:
@@ -148,13 +154,15 @@ def spread_on(mesh: TriangleMesh, count: int) -> Spread:
     Along the triangles by cumulative area, within a triangle by the R2 sequence (Roberts 2018), folded at its diagonal.
     """
     a, b, c = np.moveaxis(mesh.triangles, 1, 0)
-    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    normal = np.cross(b - a, c - a)
+    area = np.cumsum(np.linalg.norm(normal, axis=1))
     number = np.arange(count)
     at = np.minimum(np.searchsorted(area, (number + 0.5) / count * area[-1]), len(area) - 1)
     u, v = (0.5 + 0.7548776662466927 * number) % 1.0, (0.5 + 0.5698402909980532 * number) % 1.0
     folded = u + v > 1.0
     u, v = np.where(folded, 1.0 - u, u)[:, None], np.where(folded, 1.0 - v, v)[:, None]
-    return Spread(np.asarray(a[at] + u * (b[at] - a[at]) + v * (c[at] - a[at])), at)
+    normals = normal[at] / np.maximum(np.linalg.norm(normal[at], axis=1, keepdims=True), np.finfo(float).tiny)
+    return Spread(np.asarray(a[at] + u * (b[at] - a[at]) + v * (c[at] - a[at])), normals)
 
 
 def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:

@@ -13,20 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rotations import exp_rotation, left_jacobian, log_rotation
-
-
-def exp_twist(twist: Floats) -> Floats:
-    """The pose of a twist (6,) = (translation mm, rotation rad), shape (4, 4)."""
-    # Exp(τ) = [Exp(ω), J_l(ω) ρ; 0, 1]   (Solà 2018, Eq. 172)
-    return pose(exp_rotation(twist[3:]), left_jacobian(twist[3:]) @ twist[:3])
-
-
-def log_twist(T: Floats) -> Floats:
-    """The twist (6,) = (translation mm, rotation rad) of a pose (4, 4)."""
-    # Log(T) = (J_l(ω)⁻¹ t, ω)   (Solà 2018, Eq. 173)
-    w = log_rotation(T[:3, :3])
-    return np.concatenate([np.linalg.solve(left_jacobian(w), T[:3, 3]), w])
+from puncture_twin.planning.geometry.rotations import exp_rotation
 
 
 def pose(R: ArrayLike, t: ArrayLike) -> Floats:

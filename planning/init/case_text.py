@@ -38,9 +38,7 @@ step_deg = 2.0
 max_skin_angle_deg = 60.0
 {trust}
 """
-TRUSTED = (
-    "trust_labels = true  # a person has looked: structures lie right, and what they leave out of the CT is free\n"
-)
+TRUSTED = "trust_labels = true  # a person has looked: structures lie right\n"
 OWN_TARGET = "hit_radius_mm = {radius!r}  # it lies in no structure: what is hit is this ball about it"
 SKIN_OF_CT = """[[structure]]
 name = "skin"

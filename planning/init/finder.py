@@ -178,7 +178,7 @@ class _Looker:
         self._dicom()
         volumes = [name for name in self._names if name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS)]
         meshes = [name for name in self._names if is_mesh(name)]
-        self._read.update(volumes, meshes, map(self._name, entered))
+        self._read.update(volumes, meshes, (self._name(one) for one in entered if not self._hollow(one)))
         self._volumes(volumes)
         if meshes and not volumes:
             self._only = "meshes"
@@ -187,6 +187,12 @@ class _Looker:
             if name.lower().endswith(POINT_ENDINGS):
                 self._points(name)
         self._account()
+
+    def _hollow(self, name: str) -> bool:
+        """Whether a folder is named like a structure, and nothing lies in it: one that was not fetched or unpacked."""
+        folder = self._folder / name
+        like = STRUCTURE_LIKE.search(name)
+        return bool(like) and not unaccounted(folder, entries(folder, most=MOST_ENTRIES), lambda _: False)
 
     def _account(self) -> None:
         """What was not read: it is refused where it may be a structure, and else told."""

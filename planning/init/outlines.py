@@ -13,13 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.default_roles import BODY, default_role
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.containment import Side, side_of
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
 from puncture_twin.planning.init.segmentation import Assigned, Segmentation
 
 NEAR_MM, NEAR = 8.0, 0.02
@@ -32,7 +31,7 @@ MOST_OF_SKIN = 0.7
 PART_OF_SKIN, MOST_OF_OUTLINE = 0.25, 0.6
 """A body that was cropped, or cut at its limbs, covers a part of the skin, and is bounded by it but for the cuts."""
 
-POINTS, PLACES, SEED = 4_000, 200_000, 3
+POINTS, PLACES = 4_000, 200_000
 """Points that are asked about, and places of the other surface that they are compared with: on 2 square metres these
 lie 3 mm apart, so that what is within 8 mm is found."""
 
@@ -94,39 +93,18 @@ def _is_one(found: Agreement, mesh: TriangleMesh, point_ct: Floats) -> bool:
 
 
 def agreement(mesh: TriangleMesh, skin: Skin) -> Agreement:
-    """How far a surface and the skin are near to each other, by random points of both."""
+    """How far a surface and the skin are near to each other, by points of both."""
     within_mm = min(NEAR_MM, NEAR * float(np.linalg.norm(np.ptp(skin.mesh.bounds, axis=0))))
-    whole = np.ones(len(mesh.faces), bool)
     open_skin = ~skin.cut_faces if not skin.cut_faces.all() else skin.cut_faces
-    covered = _near(_points(skin.mesh, open_skin, POINTS), _points(mesh, whole, PLACES), within_mm)
-    everywhere = np.ones(len(skin.mesh.faces), bool)
-    on_skin = _near(_points(mesh, whole, POINTS), _points(skin.mesh, everywhere, PLACES), within_mm)
-    return Agreement(float(covered.mean()), float(on_skin.mean()))
+    seen = TriangleMesh(skin.mesh.vertices, skin.mesh.faces[open_skin])
+    return Agreement(fraction_near(seen, mesh, within_mm), fraction_near(mesh, skin.mesh, within_mm))
 
 
 def fraction_near(mesh: TriangleMesh, other: TriangleMesh, within_mm: float) -> float:
-    """The fraction of a surface's area that lies so near to another surface, by random points of both."""
-    points = _points(mesh, np.ones(len(mesh.faces), bool), POINTS)
-    places = _points(other, np.ones(len(other.faces), bool), PLACES)
-    return float(_near(points, places, within_mm).mean())
-
-
-def _near(points: Floats, places: Floats, within_mm: float) -> NDArray[np.bool_]:
-    """Which points have one of the places so near, shape (n,)."""
-    distance, _ = scipy.spatial.cKDTree(places).query(points, distance_upper_bound=within_mm)
-    return np.asarray(np.isfinite(distance))
-
-
-def _points(mesh: TriangleMesh, faces: Bools, count: int) -> Floats:
-    """Random points, evenly spread over some triangles of a surface, shape (count, 3)."""
-    rng, corners = np.random.default_rng(SEED), mesh.triangles[faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    total = np.cumsum(areas)
-    rows = np.minimum(np.searchsorted(total, rng.uniform(0.0, total[-1], count)), len(total) - 1)
-    a, b = rng.uniform(size=(2, count, 1))
-    a, b = np.where(a + b > 1.0, 1.0 - a, a), np.where(a + b > 1.0, 1.0 - b, b)
-    first, second, third = np.moveaxis(corners[rows], 1, 0)
-    return np.asarray(first + a * (second - first) + b * (third - first))
+    """The fraction of a surface's area that lies so near to another surface, by points of both."""
+    places = scipy.spatial.cKDTree(spread_on(other, PLACES).points)
+    distance, _ = places.query(spread_on(mesh, POINTS).points, distance_upper_bound=within_mm)
+    return float(np.isfinite(distance).mean())
 
 
 BORDER_MM = 2.0

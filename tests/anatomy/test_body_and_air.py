@@ -262,18 +262,20 @@ def test_a_skin_from_elsewhere_with_the_ct_beside_it(scene):
 
 
 def test_a_bone_that_nobody_labelled_is_unknown(scene):
-    """Without its label the spine is ``unnamed_dense``; ``trust_labels`` takes it for soft tissue, and says so."""
+    """Without its label the spine is ``unnamed_dense``; ``[ct] unnamed`` takes it for free, trusted labels do not."""
     folder, parts = scene("alone")
     spine = next(part for part in parts if part.name == "spine")
     found = prepare(write_case(folder, structures=KIDNEY), arm=False).search()
-    trusted = prepare(write_case(folder, structures=KIDNEY, search="trust_labels = true", name="trust"), arm=False)
+    labels = prepare(write_case(folder, structures=KIDNEY, search="trust_labels = true", name="trust"), arm=False)
+    trusted = prepare(write_case(folder, structures=KIDNEY, more='[ct]\nunnamed = "free"', name="free"), arm=False)
 
     rows = through(found, trusted.case, spine)
     assert rows.sum() > 20
     assert not found.safe[rows].any()
     assert "unnamed_dense" in found.clearance.structures
     assert trusted.search().safe[rows].any()
-    assert any("trust_labels" in warning for warning in trusted.anatomy.warnings)
+    assert any("unnamed" in warning for warning in trusted.anatomy.warnings)
+    np.testing.assert_array_equal(labels.search().safe, found.safe)
 
 
 def test_a_named_bone_leaves_nothing_unnamed(scene):
@@ -636,15 +638,15 @@ def test_a_thin_or_flat_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_p
 
 
 @pytest.mark.parametrize("radius_mm", [32.0, 24.0], ids=["thick", "thin"])
-@pytest.mark.parametrize("search", ["", "trust_labels = true"], ids=["", "labels trusted"])
-def test_a_forearm_across_the_belly_is_no_way_in(tmp_path, radius_mm, search):
+@pytest.mark.parametrize("unnamed", ["unknown", "free"])
+def test_a_forearm_across_the_belly_is_no_way_in(tmp_path, radius_mm, unnamed):
     """Nothing narrows between it and the trunk, and its bone runs across the bed: air on many sides of it tells."""
     line = (-207.0, -10.0, 0.0), (95.0, -104.0, 10.0)
     arm = ScannedPart("arm", capsule(*line, radius_mm), 20.0)
     bone = ScannedPart("radius", capsule(*line, 7.0), 700.0)
     parts = [*supine.trunk_parts(), arm, bone]
     write_scene(tmp_path, parts, supine.grid())
-    prepared = prepare(write_case(tmp_path, search=search), arm=False)
+    prepared = prepare(write_case(tmp_path, more=f'[ct]\nunnamed = "{unnamed}"'), arm=False)
     found = prepared.search()
 
     assert hit_parts_from_target(prepared, found, arm) == 0

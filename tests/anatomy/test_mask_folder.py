@@ -5,6 +5,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 from case_world import SKIN, case_text, image_of, structure, vessel_voxels, write_balls
 
+from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.search.context import prepare
@@ -141,3 +142,18 @@ def test_a_name_belongs_to_one_structure(tmp_path):
     )
     with pytest.raises(InputError, match="structure 'organ' stands twice"):
         prepare(path, arm=False)
+
+
+@pytest.mark.parametrize("source", ['masks = "seg"', 'labelmap = "labels.nrrd"\nnaming = "names.csv"'])
+def test_a_wrong_count_is_refused_before_a_surface_is_made(tmp_path, monkeypatch, source):
+    """What the headers and the values that are there tell needs no surface of hundreds of organs, nor the body's."""
+    write_masks(tmp_path / "seg")
+    sitk.WriteImage(image_of(labels()), str(tmp_path / "labels.nrrd"))
+    (tmp_path / "names.csv").write_text("id,name\n1,organ\n3,vessel left\n")
+    path = case_of(tmp_path, source)
+    path.write_text(path.read_text().replace(END.format(3), END.format(4)))
+    made = []
+    monkeypatch.setattr(VolumeSurfaces, "label", lambda _, label: made.append(label))
+    with pytest.raises(InputError, match="structures = 4 is stated, and the case has 3"):
+        prepare(path, arm=False)
+    assert made == []

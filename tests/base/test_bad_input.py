@@ -21,7 +21,9 @@ from case_world import (
 )
 from refusals import refused
 
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import exit_code_of
 
 CASE = case_text(
     SKIN,
@@ -411,6 +413,38 @@ def test_open_and_inverted_meshes_work_with_a_warning(folder, tmp_path, capfd):
     assert "rib" in warnings
     assert "inside" in warnings
     assert "organ" in warnings
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "code", "where"),
+    [
+        ("", ["check", "CASE", "--theta", "999", "--beta", "0"], "command_line", ""),
+        ("", ["check", "CASE", "--theta", "5", "--window", "1"], "bad_input", ""),
+        ("structures = 9", ["check", "CASE", "--theta", "5", "--beta", "0", "--no-arm"], "bad_input", "case.toml"),
+    ],
+)
+def test_a_refusal_is_the_one_object_of_json(folder, capfd, change, arguments, code, where):
+    """What, where and what is allowed, for a program; the same line stands on stderr, and the exit code is 2."""
+    if change:
+        (folder / "case.toml").write_text((folder / "case.toml").read_text() + f"[end]\n{change}\n")
+    assert main([str(folder) if one == "CASE" else one for one in arguments] + ["--json"]) == 2
+    captured = capfd.readouterr()
+    error = json.loads(captured.out)["error"]
+    assert set(error) == {"code", "sentence", "where", "allowed", "numbers"}
+    assert error["code"] == code
+    assert where in error["where"]
+    assert error["sentence"] in captured.err
+
+
+def test_that_nothing_is_found_is_the_one_object_of_json(capfd):
+    """Exit code 1, and the counts of the reasons."""
+
+    def command():
+        raise NoAnswerError("nothing is safe", counts={"crossed": 3})
+
+    assert exit_code_of(command, print, as_json=True) == 1
+    error = json.loads(capfd.readouterr().out.splitlines()[0])["error"]
+    assert (error["code"], error["numbers"]) == ("no_answer", {"crossed": 3})
 
 
 def test_json_is_alone_on_stdout(folder, tmp_path, capfd):

@@ -8,8 +8,7 @@ from placed_trunk import moved, write_trunk
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.findings import Severity
-from puncture_twin.planning.evidence.named_places import TISSUES, densities, inside_out, order_of_organs
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.evidence.named_places import TISSUES, densities, order_of_organs
 from puncture_twin.planning.search.context import prepare
 
 
@@ -75,27 +74,6 @@ def test_bones_that_are_none_are_doubted(trunk):
 def test_a_tissue_is_told_by_the_whole_name(name, tissue):
     """A part of a name is not enough: the vessels of a lung are no air."""
     assert next((one.name for one in TISSUES if one.has(name)), None) == tissue
-
-
-def test_meshes_that_are_all_inside_out_are_told(trunk, ball):
-    """As a program leaves them that mirrors points and keeps triangles; one of several is no such sign."""
-    right = ball(20.0)
-    inner = TriangleMesh(right.vertices, right.faces[:, ::-1])
-    section = trunk.case.structure[1]
-    case = replace(
-        trunk.case,
-        structure=tuple(section.model_copy(update={"mesh": file, "labelmap": None}) for file in ("a.stl", "b.stl")),
-    )
-
-    def anatomy(*meshes):
-        files = zip("ab", meshes, strict=True)
-        return replace(
-            trunk.anatomy,
-            structures=tuple(Structure(f, Role.AVOID, 1.0, mesh, f"{f}.stl") for f, mesh in files),
-        )
-
-    assert [one.code for one in inside_out(case, anatomy(inner, inner))] == ["meshes_inside_out"]
-    assert list(inside_out(case, anatomy(inner, right))) == []
 
 
 def test_things_of_a_phantom_have_no_side(trunk):

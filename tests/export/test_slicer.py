@@ -15,7 +15,8 @@ from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.export.slicer.entry_area import entry_area
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.points.point_files import read_points
-from puncture_twin.planning.geometry.rigid import apply, exp_twist
+from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rotations import exp_rotation, left_jacobian
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.registration.placement import load_placement
@@ -25,7 +26,8 @@ from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.patient.slicer_job import export_to_slicer
 
-T_BASE_CT = exp_twist(np.array([310.0, -120.0, 240.0, 0.4, -1.1, 2.0]))
+TURN = np.array([0.4, -1.1, 2.0])
+T_BASE_CT = pose(exp_rotation(TURN), left_jacobian(TURN) @ [310.0, -120.0, 240.0])
 CHANGES = (('space = "LPS"', 'space = "RAS"'), ("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'))
 NO_ROBOT = (registration_section(), "")
 MARKERS = np.array([[0.0, 0, 80], [50, 0, 75], [0, 60, 70], [-40, -30, 72]])

@@ -81,23 +81,6 @@ def test_left_jacobian_is_the_slope_of_the_exponential(angle):
         np.testing.assert_allclose(rotations.left_jacobian(w), slope, atol=1e-9)
 
 
-@pytest.mark.parametrize("angle", ANGLES)
-def test_twists_return_from_their_poses(angle):
-    """Log(Exp(t)) = t, and Exp(-t) is the inverse of Exp(t)."""
-    shifts = np.random.default_rng(SEED).normal(0.0, 100.0, (20, 3))
-    for twist in np.concatenate([shifts, rotation_vectors(angle)], axis=1):
-        T = rigid.exp_twist(twist)
-        np.testing.assert_allclose(rigid.log_twist(T), twist, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(rigid.exp_twist(-twist), rigid.inverse(T), atol=1e-9)
-
-
-def test_half_a_twist_twice_is_the_twist():
-    """A screw motion goes along one path."""
-    for T in poses():
-        half = rigid.exp_twist(rigid.log_twist(T) / 2)
-        np.testing.assert_allclose(half @ half, T, atol=1e-10)
-
-
 def test_poses_form_a_group():
     """Products and inverses are poses; the inverse undoes; the product applies one after the other."""
     T, other = poses(), poses()[::-1]

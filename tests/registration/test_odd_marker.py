@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import apply, exp_twist
+from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rotations import exp_rotation, left_jacobian
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residual_test import FALSE_ALARM, odd_marker
 
-T_BASE_CT = exp_twist(np.array([300.0, -50.0, 100.0, 0.3, -0.2, 1.0]))
+TURN = np.array([0.3, -0.2, 1.0])
+T_BASE_CT = pose(exp_rotation(TURN), left_jacobian(TURN) @ [300.0, -50.0, 100.0])
 PLACES = np.array([[0, 0, 80], [60, 10, 75], [0, 70, 60], [-50, -40, 65], [40, -60, 70], [-70, 30, 50]], dtype=float)
 NAMES = ("A", "navel", "C", "D", "left rib", "F")
 TARGET = np.array([0.0, 0.0, -20.0])

@@ -8,13 +8,15 @@ from case_world import CASE, MARKERS, changed, registration_section, write_case
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.geometry.rigid import apply, exp_twist, inverse
+from puncture_twin.planning.geometry.rigid import apply, inverse, pose
+from puncture_twin.planning.geometry.rotations import exp_rotation, left_jacobian
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
 from puncture_twin.planning.registration.checks.marker_list import Surroundings
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.jobs.patient.answers import registration_report
 
-T_BASE_CT = exp_twist(np.array([310.0, -120.0, 240.0, 0.4, -1.1, 2.0]))
+TURN = np.array([0.4, -1.1, 2.0])
+T_BASE_CT = pose(exp_rotation(TURN), left_jacobian(TURN) @ [310.0, -120.0, 240.0])
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 POINTS = np.array([[0.0, 0.0, 80.0], [50.0, 0.0, 75.0], [0.0, 60.0, 70.0], [-40.0, -30.0, 72.0]])
 TOLERANCE_MM = 1e-9

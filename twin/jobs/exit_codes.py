@@ -108,26 +108,27 @@ PrintLine = Callable[[str], None]
 """Shows one line, on stderr."""
 
 
-def exit_code_of(command: Callable[[], object], print_line: PrintLine) -> int:
+def exit_code_of(command: Callable[[], object], print_line: PrintLine, *, as_json: bool = False) -> int:
     """Run a command, which returns its exit code or None; what it raises becomes a code and a line.
 
     Args:
         command: Such as the parser with its arguments.
         print_line: Shows the line, and what was made anew.
+        as_json: Whether stdout gets what was refused, or not found, as an object too.
     """
     try:
-        return _exit_code_of(command, print_line)
+        return _exit_code_of(command, print_line, as_json)
     except KeyboardInterrupt:  # as the command's own last line was printed
         print_line("interrupted")
         return INTERRUPTED
 
 
-def _exit_code_of(command: Callable[[], object], print_line: PrintLine) -> int:
+def _exit_code_of(command: Callable[[], object], print_line: PrintLine, as_json: bool) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = _notes(warnings.showwarning, print_line)
         try:
             with insistent_ctrl_c():
-                result = command()
+                result = _answered(command) if as_json else command()
                 flush_output()
         except (KeyboardInterrupt, typer.Abort):
             result = INTERRUPTED
@@ -172,6 +173,25 @@ def _line_and_code(error: PlanningError | ClickException) -> tuple[str, int]:
     if isinstance(error, NoAnswerError):
         return one_line(str(error)), ANSWER_IS_NO
     return str(error), BAD_INPUT if isinstance(error, InputError) else PROGRAM_FAILED
+
+
+def _answered(command: Callable[[], object]) -> object:
+    """Run a command; what it raises on purpose stands on stdout too, as the one object that ``--json`` promises."""
+    try:
+        return command()
+    except (PlanningError, ClickException) as error:
+        codes = {InputError: "bad_input", NoAnswerError: "no_answer", PlanningError: "program_failed"}
+        code = next((code for kind, code in codes.items() if isinstance(error, kind)), "command_line")
+        document = {
+            "code": getattr(error, "code", "") or code,
+            "sentence": getattr(error, "what", _line_and_code(error)[0]),
+            "where": getattr(error, "where", ""),
+            "allowed": getattr(error, "allowed", ""),
+            "numbers": getattr(error, "numbers", None) or getattr(error, "counts", {}),
+        }
+        print_answer({"error": document}, "", as_json=True)
+        flush_output()
+        raise
 
 
 def _notes(usual: Callable[..., None], print_line: PrintLine) -> Callable[..., None]:

@@ -18,7 +18,6 @@ SAFE_LOW: Rgb = (150, 224, 190)
 SAFE_HIGH: Rgb = (0, 104, 74)
 """Safe, with the greatest clearance."""
 
-CHOSEN: Rgb = (0, 0, 0)
 NEEDLE: Rgb = (20, 20, 24)
 HOLDER: Rgb = (70, 74, 82)
 ARM: Rgb = (173, 183, 196)

@@ -115,6 +115,7 @@ class CtSection(Section):
     air_hu: Annotated[Number, Field(ge=-990, le=-300)] = AIR_HU
     dense_hu: Annotated[Number, Field(ge=100, le=3000)] = DENSE_HU
     margin_mm: Margin = 2.0
+    unnamed: Literal["unknown", "free"] = "unknown"
     arms: Stated | None = None
     table: Stated | None = None
     beyond_mm: Annotated[Number, Field(ge=0, le=1000)] | Literal["all"] | None = None

@@ -29,8 +29,8 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
         )
     elif not mesh.wound_alike:
         warnings.append(f"{name}: triangles are given twice or wound against their neighbours: inside is found by rays")
-    elif _signed_volume(mesh) < 0.0:
-        warnings.append(f"{name}: inverted normals: they point inward; inside is found without them")
+    elif mesh.volume < 0.0:
+        warnings.append(f"{name}: inverted normals: they point inward (was it mirrored?); inside is found without them")
     return tuple(warnings)
 
 
@@ -55,9 +55,3 @@ def kept_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tupl
     for mesh, (closed, wound_alike) in zip(meshes.values(), kept["facts"].tolist(), strict=True):
         mesh.known(closed=closed, wound_alike=wound_alike)
     return tuple(kept["lines"].tolist())
-
-
-def _signed_volume(mesh: TriangleMesh) -> float:
-    """Volume by the divergence theorem, mm^3; negative when the triangles face inward."""
-    a, b, c = np.moveaxis(mesh.triangles - mesh.vertices[0], 1, 0)
-    return float(np.einsum("ij,ij", a, np.cross(b, c)) / 6.0)

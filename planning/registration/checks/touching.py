@@ -118,18 +118,13 @@ def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Float
         T_base_ct: Shape (4, 4), mm.
     """
     a, b, c = np.moveaxis(skin.triangles[:: max(1, len(skin.triangles) // SKIN_POINTS)], 1, 0)
-    normals = np.cross(b - a, c - a) * (1.0 if _winds_outward(skin) else -1.0)
+    normals = np.cross(b - a, c - a) * np.copysign(1.0, skin.volume)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
     points, model, length = (a + b + c) / 3, case.robot.model, case.needle.length_mm
     poses = flange_poses(apply(T_base_ct, points), normals @ T_base_ct[:3, :3].T, length)
     reached = ~np.isnan(inverse(model, poses)).all(axis=(1, 2))
     blocked = {row for row, _ in untouchable(case, points, normals)}
     return points[[row for row in np.flatnonzero(reached) if row not in blocked]]
-
-
-def _winds_outward(skin: TriangleMesh) -> bool:
-    a, b, c = np.moveaxis(skin.triangles - skin.bounds.mean(axis=0), 1, 0)
-    return bool(np.einsum("ij,ij->", a, np.cross(b, c)) >= 0)
 
 
 def _boxes_ct(case: Case) -> tuple[Obstacle, ...]:

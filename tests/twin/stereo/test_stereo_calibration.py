@@ -180,7 +180,7 @@ def test_a_prior_and_a_measurement_meet_at_their_weights(rng):
     expected = np.linalg.solve(information + np.eye(3) / sigma**2, information @ true[0])
     np.testing.assert_allclose(found.points[0], expected, atol=1e-5)
     np.testing.assert_allclose(
-        found.point_covariance(0), np.linalg.inv(information + np.eye(3) / sigma**2), rtol=1e-3, atol=1e-6
+        found.covariance[-3:, -3:], np.linalg.inv(information + np.eye(3) / sigma**2), rtol=1e-3, atol=1e-6
     )
 
 

@@ -91,11 +91,6 @@ class Bundle:
         rows = slice(14 * camera, 14 * camera + 14)
         return self.covariance[rows, rows]
 
-    def point_covariance(self, point: int) -> Floats:
-        """Of one point, shape (3, 3), mm^2."""
-        first = 14 * len(self.cameras) + 6 * len(self.T_c_bodies) + 3 * point
-        return self.covariance[first : first + 3, first : first + 3]
-
 
 def adjust(
     cameras: Sequence[Camera], T_c_bodies: Floats, points: Floats, seen: Observations, spreads: PixelSpreads
