@@ -11,10 +11,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.body.attached_limbs import attached_limbs
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.flat_side import FlatSide
+from puncture_twin.planning.anatomy.body.limbs import NamedBones, limb_search
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_LONG_MM,
     OutsideImage,
@@ -109,20 +109,28 @@ class Scan:
         """Sides at which a table holds together with the body that this CT shows."""
         return ((), ()) if self.skin is not None else (self._ct.found.flat_sides, self._ct.found.drawn_sides)
 
-    def attached_limbs(self, target_ct: NDArray[np.float64]) -> TriangleMesh | None:
-        """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None."""
+    def attached_limbs(
+        self, target_ct: NDArray[np.float64], structures: Sequence[NamedBones] = ()
+    ) -> TriangleMesh | None:
+        """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None.
+
+        Args:
+            target_ct: Shape (3,), LPS mm.
+            structures: Of the case: bones that they name are no evidence of a limb.
+        """
 
         def make() -> TriangleMesh | None:
-            ct = self._ct
-            if ct.alone:
+            if self._ct.alone:
                 return None
-            at = np.linalg.solve(ct.T_ct_index, np.append(target_ct, 1.0))[:3]
-            limbs = attached_limbs(ct.hu, self._body, ct.spacing_mm, at)
+            search = limb_search(self._ct, self._body, target_ct, structures)
+            limbs = search.limbs()
             if not limbs.any():
                 return None
-            return field_surface(limbs.astype(np.float32) - 0.5, ct.T_ct_index, where=self._ct.where)
+            return field_surface(limbs.astype(np.float32) - 0.5, search.T_ct_index, where=self._ct.where)
 
-        return self._kept({"what": "attached limbs", "target": target_ct.tolist()}, lambda: [make()])[0]
+        named = [f"{one.name} {one.mesh.digest}" for one in structures]
+        made_from = {"what": "attached limbs", "target": target_ct.tolist(), "structures": named}
+        return self._kept(made_from, lambda: [make()])[0]
 
     def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
         """What is dense, or gas, inside the body and in no structure.
