@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.beyond_labels import beyond_labels
 from puncture_twin.planning.anatomy.body.limbs import NamedBones
-from puncture_twin.planning.anatomy.body.support import support_warnings
+from puncture_twin.planning.anatomy.body.tables import support_warnings
 from puncture_twin.planning.anatomy.scan import Outside, Scan
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
@@ -140,11 +140,11 @@ def _outside(
     case: Case, scan: Scan, outside: Outside, structures: Sequence[Structure], warnings: list[str]
 ) -> tuple[Structure, ...]:
     """What the CT shows outside of the body that is not air, and limbs that are pressed against it."""
-    warnings.extend(support_warnings(outside.supported, outside.open_faces))
+    if case.ct.table != "none":
+        warnings.extend(support_warnings(outside.supported, outside.open_faces))
     voxel_ct = scan.source.surfaces.voxel_ct
     bones = [NamedBones(one.name, one.mesh) for one in structures if one.source != OWN_TARGET]
-    limbs = None if case.ct.arms == "none" else scan.attached_limbs(case.target_ct, bones)
-    found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, limbs))
+    found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct, bones)))
     return tuple(
         Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", True, voxel_ct)
         for name, mesh in found

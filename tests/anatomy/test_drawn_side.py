@@ -6,9 +6,8 @@ import SimpleITK as sitk  # noqa: N813
 from places import REAL_CT
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, body_mask
-from puncture_twin.planning.anatomy.body.drawn_side import drawn_sides, support_side
 from puncture_twin.planning.anatomy.body.outside_body import OutsideImage, outside_mask
-from puncture_twin.planning.anatomy.body.support import find_support, support_warnings
+from puncture_twin.planning.anatomy.body.tables import drawn_sides, find_support, support_side, support_warnings
 
 CT = REAL_CT / "ct.nii.gz"
 SPACING = np.array([4.0, 4.0, 5.0])

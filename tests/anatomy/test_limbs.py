@@ -97,7 +97,7 @@ def test_an_arm_that_holds_the_target_is_not_forbidden():
 
 
 def test_nothing_about_the_target_is_a_limb():
-    """A target in the trunk, near an arm that lies upon it: only what is nearer to the bone than the air is the arm's."""
+    """A target in the trunk near an arm upon it: only what is nearer to the bone than the air is the arm's."""
     hu, body = image(ACROSS)
     target = np.array([160.0, 108.0, 90.0])
     found = search(hu, body, target)
