@@ -186,12 +186,12 @@ def touching_tables(above: NDArray[np.floating], trunk: Bools, spacing_mm: Float
     if (shown.phantom or prism) and shown.table != "present":
         return Touching(cut_off, (), tuple(said) if shown.phantom else (PRISM,))
     named = {side.face for side in flat}
-    sides = flat if cut_off.any() else (*flat, *(side for side in drawn if side.face not in named or side.whole))
-    said += [side.warning for side in sides if side.whole and (side in flat or side.face not in named)]
+    left = () if cut_off.any() else drawn
+    said += [side.warning for side in (*flat, *(one for one in left if one.whole and one.face not in named))]
     length_mm = trunk.shape[2] * float(spacing_mm[2])
     if length_mm < LEAST_LENGTH_MM:
         said.append(TOO_SHORT.format(length=length_mm))
-    return Touching(cut_off, sides, tuple(said))
+    return Touching(cut_off, (*flat, *left), tuple(said))
 
 
 def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
