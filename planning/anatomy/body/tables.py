@@ -560,6 +560,7 @@ def find_support(
     supports = {side.face for side in (*drawn, *touching) if side.whole}
     cut = [face for face in FACES if _cuts(outside, face) and any(face[0] != axis for axis, _ in supports)]
     faces = cut if supports else FACES
+    faces = [face for face in faces if face[0] == 1 or shown.limbs]  # at its sides only an arm may lie unseen
     gaps = {face: _gap_mm(body, face, spacing_mm) for face in faces}
     near = tuple(face for face, gap in gaps.items() if gap <= NEAR_MM and not (supports and gap == 0.0))
     return Support(drawn, bool(supports), () if shown.phantom and not supports else near)
