@@ -28,8 +28,8 @@ SMOOTH_MM = 3.0
 DENSE_HU = -700.0
 """A single voxel above this is no noise (ten times that of a low-dose image)."""
 MIN_PIECE_MM3 = 100.0
-"""Pieces that hold less above ``DENSE_HU`` are noise, or cloth: a line of 4 mm diameter has this in 8 mm of its
-length. Cloth of a gown on the skin has -900 to -750 in a real CT of 3 mm; it stops no needle."""
+"""Pieces that hold less above ``BODY_HU`` are noise, or cloth: a line of 4 mm diameter has this in 8 mm of its
+length. A gown on the skin of a real chest has -850, and -600 in its folds; it stops no needle."""
 BULKY_ML = 50.0
 """Pieces of this volume that the border of the image cuts (a table, a mattress) go on beyond it, also between the
 places where they are cut: of a table that sags below the image both ends are seen."""
@@ -96,7 +96,7 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     dense = (mean > air_hu) | (hu > max(DENSE_HU, air_hu))
     dense &= ~scipy.ndimage.maximum_filter(body, size=tuple(2 * (size // 2 + 1) + 1))
     dense = (dense | (hu > BODY_HU)) & ~unscanned.voxels & ~body
-    dense = _stiff_pieces(dense, hu > DENSE_HU, float(np.prod(image.spacing_mm)))
+    dense = _stiff_pieces(dense, hu > BODY_HU, float(np.prod(image.spacing_mm)))
     return dense | (_unscanned_beside(dense | body, body, unscanned, image.spacing_mm) & ~body)
 
 
@@ -215,11 +215,17 @@ def _facing_outward(vertices: Floats, faces: Ints32) -> Ints32:
 
 
 def _stiff_pieces(mask: Bools, solid: Bools, voxel_mm3: float) -> Bools:
-    """The pieces that are large, or hold enough that is solid: what is neither is noise, or cloth on the skin."""
+    """The pieces that are bulky, and of others what is solid with its rim: the rest is noise, or cloth on the skin."""
+    bulky = _pieces(mask, mask, 1000.0 * BULKY_ML / voxel_mm3)
+    near = scipy.ndimage.binary_dilation(solid & mask, FULL)
+    stiff = _pieces(near, solid & mask, MIN_PIECE_MM3 / voxel_mm3)
+    return np.asarray(mask & (bulky | scipy.ndimage.binary_dilation(stiff, FULL)))
+
+
+def _pieces(mask: Bools, counted: Bools, least_voxels: float) -> Bools:
+    """The pieces of a mask that hold enough voxels of another."""
     labels, count = scipy.ndimage.label(mask, FULL)
-    size = np.bincount(labels.ravel(), minlength=count + 1) * voxel_mm3
-    dense = np.bincount(labels[solid], minlength=count + 1) * voxel_mm3
-    kept = (dense >= MIN_PIECE_MM3) | (size >= 1000.0 * BULKY_ML)
+    kept = np.bincount(labels[counted], minlength=count + 1) >= least_voxels
     kept[0] = False
     return np.asarray(kept[labels])
 
