@@ -179,7 +179,7 @@ def cradled(folder: Path, data: Path | None) -> Scene:
     hu += np.random.default_rng(12).normal(0.0, 15.0, image.shape)
     write_lab(folder, image, hu, labels, names, LESION_LPS_MM, "abdomen")
     true = found[1]
-    table = true["cradle"] & ~true["beneath"] & ~true["trunk"]
+    table = true["cradle"] & ~true["trunk"]
     return Scene(truth, image, true["trunk"], table, {"spine": true["spine"]}, np.array(LESION_LPS_MM))
 
 

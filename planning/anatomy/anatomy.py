@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.beyond_labels import beyond_labels
-from puncture_twin.planning.anatomy.body.support import support_warnings
+from puncture_twin.planning.anatomy.body.limbs import NamedBones
+from puncture_twin.planning.anatomy.body.tables import support_warnings
 from puncture_twin.planning.anatomy.scan import Outside, Scan
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
@@ -121,7 +122,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
         shown = scan.outside(case.ct.air_hu)
-        outside, couch = _outside(case, scan, shown, loader.warnings), shown.couch
+        outside, couch = _outside(case, scan, shown, structures, loader.warnings), shown.couch
         if any(structure.name == ATTACHED_LIMB for structure in outside):
             loader.warnings.append(LIMB_ATTACHED)
         if case.ct.unnamed == "free":
@@ -136,11 +137,15 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch)
 
 
-def _outside(case: Case, scan: Scan, outside: Outside, warnings: list[str]) -> tuple[Structure, ...]:
+def _outside(
+    case: Case, scan: Scan, outside: Outside, structures: Sequence[Structure], warnings: list[str]
+) -> tuple[Structure, ...]:
     """What the CT shows outside of the body that is not air, and limbs that are pressed against it."""
-    warnings.extend(support_warnings(outside.supported, outside.open_faces))
+    if case.ct.table != "none":
+        warnings.extend(support_warnings(outside.supported, outside.open_faces))
     voxel_ct = scan.source.surfaces.voxel_ct
-    found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct)))
+    bones = [NamedBones(one.name, one.mesh) for one in structures if one.source != OWN_TARGET]
+    found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct, bones)))
     return tuple(
         Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", True, voxel_ct)
         for name, mesh in found

@@ -11,21 +11,18 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.body.attached_limbs import attached_limbs
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
-from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
-from puncture_twin.planning.anatomy.body.flat_side import FlatSide
+from puncture_twin.planning.anatomy.body.limbs import NamedBones, limb_search
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_LONG_MM,
     OutsideImage,
     beyond_body,
-    beyond_drawn_sides,
     beyond_face,
-    beyond_flat_sides,
+    beyond_table,
     outside_mask,
     outside_surface,
 )
-from puncture_twin.planning.anatomy.body.support import FACES, find_support
+from puncture_twin.planning.anatomy.body.tables import FACES, TableSide, find_support
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import Imaged, kept_mesh, mesh_arrays
@@ -93,36 +90,42 @@ class Scan:
 
     def _outside_meshes(self, image: OutsideImage, mask: Bools) -> list[TriangleMesh | None]:
         """What is outside of the body, what lies beyond tables, and what beyond each open face."""
-        flat, drawn = self._tables
-        support = find_support(mask & ~image.unscanned.voxels, image.body, image.spacing_mm, [*flat, *drawn])
+        measured = mask & ~image.unscanned.voxels
+        support = find_support(measured, image.body, image.spacing_mm, self._tables, self._ct.shown)
         solids = [outside_surface(image, mask, where=self._ct.where)]
         solids += [] if self.skin is None else beyond_body(image)
-        supports = beyond_flat_sides(image, flat) + beyond_drawn_sides(image, drawn, edges=True)
-        supports += beyond_drawn_sides(image, support.drawn, edges=False)
-        near = () if self._ct.alone and not support.seen else support.open_faces
+        supports = [beyond_table(image, side) for side in (*self._tables, *support.drawn)]
         wider = image.beyond_mm[0]
-        faces = [beyond_face(image, *face, wider_mm=wider) if face in near else None for face in FACES]
+        faces = [beyond_face(image, *face, wider_mm=wider) if face in support.open_faces else None for face in FACES]
         return [_joined(solids), _joined(supports), *faces]
 
     @property
-    def _tables(self) -> tuple[tuple[FlatSide, ...], tuple[DrawnSide, ...]]:
+    def _tables(self) -> tuple[TableSide, ...]:
         """Sides at which a table holds together with the body that this CT shows."""
-        return ((), ()) if self.skin is not None else (self._ct.found.flat_sides, self._ct.found.drawn_sides)
+        return () if self.skin is not None else self._ct.found.tables
 
-    def attached_limbs(self, target_ct: NDArray[np.float64]) -> TriangleMesh | None:
-        """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None."""
+    def attached_limbs(
+        self, target_ct: NDArray[np.float64], structures: Sequence[NamedBones] = ()
+    ) -> TriangleMesh | None:
+        """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None.
+
+        Args:
+            target_ct: Shape (3,), LPS mm.
+            structures: Of the case: bones that they name are no evidence of a limb.
+        """
 
         def make() -> TriangleMesh | None:
-            ct = self._ct
-            if ct.alone:
+            if not self._ct.shown.limbs:
                 return None
-            at = np.linalg.solve(ct.T_ct_index, np.append(target_ct, 1.0))[:3]
-            limbs = attached_limbs(ct.hu, self._body, ct.spacing_mm, at)
+            search = limb_search(self._ct, self._body, target_ct, structures)
+            limbs = search.limbs()
             if not limbs.any():
                 return None
-            return field_surface(limbs.astype(np.float32) - 0.5, ct.T_ct_index, where=self._ct.where)
+            return field_surface(limbs.astype(np.float32) - 0.5, search.T_ct_index, where=self._ct.where)
 
-        return self._kept({"what": "attached limbs", "target": target_ct.tolist()}, lambda: [make()])[0]
+        named = [f"{one.name} {one.mesh.digest}" for one in structures]
+        made_from = {"what": "attached limbs", "target": target_ct.tolist(), "structures": named}
+        return self._kept(made_from, lambda: [make()])[0]
 
     def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
         """What is dense, or gas, inside the body and in no structure.

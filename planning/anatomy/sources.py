@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from puncture_twin.planning.anatomy.body.tables import Shown
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin, flat_ends
 from puncture_twin.planning.anatomy.structure import Role, Structure
@@ -151,8 +152,9 @@ class StructureSources:
         """What a CT, or the label of a body, shows of it."""
         if (name, label) not in self._imaged:
             volume = self._volume(name) if label is None else self._labels(name)
-            organs, whole = [(one.mesh, one.voxel_mm) for one in structures], self._case.region == "phantom"
-            self._imaged[name, label] = volume.imaged(label, organs, whole=whole, stated=stated)
+            organs, ct = [(one.mesh, one.voxel_mm) for one in structures], self._case.ct
+            shown = Shown(self._case.region == "phantom", ct.arms, ct.table)
+            self._imaged[name, label] = volume.imaged(label, organs, shown=shown, stated=stated)
         return self._imaged[name, label]
 
     def scan(self, skin_section: StructureSection, skin: Skin, structures: Sequence[Structure] = ()) -> Scan | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -22,6 +22,7 @@ from puncture_twin.planning.anatomy.body.cut_ends import (
     stated_ends,
 )
 from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
+from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_label, skin_from_mesh, skin_of_image
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
@@ -132,7 +133,7 @@ class VolumeSurfaces:
         label: int | None = None,
         organs: Iterable[tuple[TriangleMesh, float]] = (),
         *,
-        whole: bool = False,
+        shown: Shown = PATIENT,
         stated: Collection[str] | None = None,
     ) -> Imaged:
         """What a scanner saw of a body, without what was laid around it.
@@ -140,13 +141,13 @@ class VolumeSurfaces:
         Args:
             label: Of the body, in a label map; None where this is a CT.
             organs: See `cut_ends`.
-            whole: Whether it is a phantom: see `cut_ends`; where the image shows all of it, it lies on nothing.
+            shown: What a person says of the image; for a phantom see `cut_ends`.
             stated: The sides at which the body was cut, where a person says so.
         """
         content = self._kept(f"content {label}", lambda: self._content(label), _to_content)
-        cut = cut_ends(content, organs, whole=whole) if stated is None else stated_ends(stated)
-        notes = end_warnings(content, cut, whole and stated is None)
-        return Imaged(self, content.box(cut), label, notes, alone=whole and content.inside)
+        cut = cut_ends(content, organs, whole=shown.phantom) if stated is None else stated_ends(stated)
+        notes = end_warnings(content, cut, shown.phantom and stated is None)
+        return Imaged(self, content.box(cut), label, notes, replace(shown, whole=bool(content.inside)))
 
     def _content(self, label: int | None) -> Arrays:
         if label is None:
@@ -173,14 +174,14 @@ class Imaged:
         box: The part that was seen, voxels of the canonical order.
         label: Of the body; None where this is a CT.
         notes: What was left out, one sentence each.
-        alone: See `CtImage`.
+        shown: What a person says of it.
     """
 
     surfaces: VolumeSurfaces
     box: Box
     label: int | None
     notes: tuple[str, ...]
-    alone: bool
+    shown: Shown
 
     @property
     def voxels(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
@@ -191,7 +192,7 @@ class Imaged:
     @cached_property
     def image(self) -> CtImage:
         """The CT."""
-        return self.surfaces.ct_image.within(self.box, alone=self.alone)
+        return self.surfaces.ct_image.within(self.box, self.shown)
 
     def skin(self) -> Skin:
         """The body's skin."""
@@ -207,7 +208,7 @@ class Imaged:
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
     ) -> Value:
         """See `VolumeSurfaces.kept`."""
-        return self.surfaces.kept({"box": self.box, "alone": self.alone, **made_from}, make, read, by=by)
+        return self.surfaces.kept({"box": self.box, "shown": asdict(self.shown), **made_from}, make, read, by=by)
 
 
 def kept_skin(mesh: TriangleMesh, cut: Sequence[str], cache: Cache) -> Skin:

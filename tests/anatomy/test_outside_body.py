@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_MM,
     BULKY_ML,
     CUT_AT_MM,
     OutsideImage,
-    beyond_drawn_sides,
+    beyond_table,
     outside_surface,
 )
+from puncture_twin.planning.anatomy.body.tables import TableSide
 from puncture_twin.planning.geometry.containment import Side, inside_each, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -97,10 +97,9 @@ def test_it_is_as_wide_beyond_the_image_as_at_its_border(bar, beyond_mm, end):
 def table() -> TriangleMesh:
     """Beyond a curved section behind the body, of a bed that runs at an angle to the slices' axis."""
     across = np.arange(5.0, 35.0)
-    side = DrawnSide(1, -1, across, 20.0 + 0.01 * (across - 20.0) ** 2, (0.02, -0.05), 60.0, True)
+    side = TableSide(1, -1, across, 20.0 + 0.01 * (across - 20.0) ** 2, (0.02, -0.05), 60.0, True, 40.0)
     empty = OutsideImage(np.full(SHAPE, -1000.0, np.float32), np.zeros(SHAPE, bool), np.diag([*SPACING, 1.0]), SPACING)
-    (surface,) = beyond_drawn_sides(empty, [side], edges=True)
-    return surface
+    return beyond_table(empty, side)
 
 
 @pytest.mark.parametrize("z_mm", [-1999.0, -480.0, -75.0, 0.0, 28.5, 57.0, 300.0, 2050.0])

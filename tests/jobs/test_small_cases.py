@@ -4,13 +4,16 @@ The programs that make them lie beside the real data, where there is any. By cod
 the lesion, unless it says otherwise.
 """
 
+import csv
 import importlib.util
 import json
 import sys
 
+import numpy as np
 import pytest
 from places import DATA
 
+from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 
 CASES = DATA.parent / "cases"
@@ -124,3 +127,29 @@ def test_a_scale_between_two_lists_is_named(made, capsys):
     ]
     assert main(command) == 0
     assert "1.016" in json.dumps(json.loads(capsys.readouterr().out)["flags"])
+
+
+@pytest.mark.parametrize("shape", ["cylinder", "box", "trunk"])
+@pytest.mark.parametrize("table", ["", "_table"], ids=["in air", "on a table"])
+def test_a_phantom_is_as_safe_as_geometry_says(made, shape, table):
+    """Every row of its truth; no limb, and the table is no body."""
+    folder = made(f"lab_{shape}{table}")
+    prepared = prepare(folder, arm=False)
+    found = prepared.search()
+    said = {
+        (round(theta), round(beta)): safe
+        for theta, beta, safe in zip(np.degrees(found.theta), np.degrees(found.beta), found.safe, strict=True)
+    }
+    with (folder / "truth.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if float(row["theta_deg"]) > 0]
+    assert len(rows) > 50
+    for row in rows:
+        assert said[int(row["theta_deg"]), int(row["beta_deg"])] == (row["verdict"] == "safe"), row
+    assert "attached_limb" not in {one.name for one in prepared.anatomy.checked}
+
+
+def test_no_part_of_a_real_chest_is_a_limb(made):
+    """Shoulder blades and collar bones without a label."""
+    prepared = prepare(made("chest_ct4"), arm=False)
+    assert "attached_limb" not in {one.name for one in prepared.anatomy.checked}
+    assert prepared.search().safe.sum() >= 1346

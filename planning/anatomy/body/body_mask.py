@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,8 +17,7 @@ from puncture_twin.planning.anatomy.body.detached_parts import (
     limb_warnings,
     thick_parts,
 )
-from puncture_twin.planning.anatomy.body.drawn_side import LEAST_LENGTH_MM, TOO_SHORT, DrawnSide, drawn_sides
-from puncture_twin.planning.anatomy.body.flat_side import FlatSide, flat_sides
+from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown, TableSide, touching_tables
 from puncture_twin.planning.anatomy.body.unscanned import find_unscanned, measured_hu
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
@@ -53,15 +51,13 @@ class BodyMask:
         body: Shape (nx, ny, nz), the solid body: the trunk, and parts of the patient that do not touch it.
         unscanned: Same shape, voxels that the scanner did not measure.
         warnings: What the user should know.
-        flat_sides: Where the body ends in a plane, as a table does that touches it.
-        drawn_sides: Where it ends in one section along the bed, as a curved table or cradle does that touches it.
+        tables: Where the body ends as a table, cradle or board does that touches it.
     """
 
     body: Bools
     unscanned: Bools
     warnings: tuple[str, ...]
-    flat_sides: tuple[FlatSide, ...] = ()
-    drawn_sides: tuple[DrawnSide, ...] = ()
+    tables: tuple[TableSide, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +68,13 @@ class CtImage:
         hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         where: The file.
-        alone: Whether the body lies on nothing: a phantom in air, all of which the image shows.
+        shown: What a person says that it shows.
     """
 
     hu: NDArray[np.float32]
     T_ct_index: Floats
     where: Path
-    alone: bool = False
+    shown: Shown = PATIENT
 
     @property
     def spacing_mm(self) -> Floats:
@@ -92,17 +88,17 @@ class CtImage:
         Raises:
             InputError: See `body_mask`.
         """
-        return body_mask(self.hu, self.spacing_mm, where=self.where, alone=self.alone)
+        return body_mask(self.hu, self.spacing_mm, where=self.where, shown=self.shown)
 
     @property
     def content(self) -> Content:
         """Where what is as dense as a body ends."""
         return content_of(self.hu > BODY_HU, self.T_ct_index)
 
-    def within(self, box: Box, *, alone: bool = False) -> CtImage:
-        """The part of it in a box, and whether the body there lies on nothing."""
+    def within(self, box: Box, shown: Shown = PATIENT) -> CtImage:
+        """The part of it in a box, and what a person says that it shows."""
         part = self.hu[tuple(slice(*ends) for ends in box)]
-        return CtImage(part, shifted(self.T_ct_index, box), self.where, alone)
+        return CtImage(part, shifted(self.T_ct_index, box), self.where, shown)
 
 
 def ct_image(volume: Volume) -> CtImage:
@@ -112,34 +108,41 @@ def ct_image(volume: Volume) -> CtImage:
 
 
 def body_mask(
-    hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path, alone: bool = False
+    hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path, shown: Shown = PATIENT
 ) -> BodyMask:
-    """Finds the patient in a CT.
+    """Finds the patient, or the phantom, in a CT.
 
-    Threshold, opening, largest component, and every other component that looks like a limb; then air that each of
-    them encloses in an axial slice is filled, and so is air at the border of the volume that does not look like the
-    room's. Filling too much is the safe side: it turns "air" at the border into "unknown".
+    Threshold, opening, largest component without the table that touches it, and every other component that looks like a
+    limb; then air that each of them encloses in an axial slice is filled, and so is air at the border of the volume
+    that does not look like the room's. Filling too much is the safe side: it turns "air" at the border into "unknown".
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
         spacing_mm: Shape (3,).
         where: For messages.
-        alone: Whether it lies on nothing, so that no table is looked for.
+        shown: What a person says of the image.
 
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
     """
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
-    dense = hu > BODY_HU
-    solids = thick_parts(dense, spacing_mm)
+    solids = thick_parts(hu > BODY_HU, spacing_mm)
     trunk = largest_component(solids == 1)
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
         raise InputError(
             what, where=where, allowed=f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
         )
-    limbs = detached_limbs(hu, solids, spacing_mm)
-    warnings = list(limb_warnings(limbs, trunk, voxel_ml))
+    warnings: list[str] = []
+    tables: tuple[TableSide, ...] = ()
+    if shown.tables:
+        touching = touching_tables(hu - BODY_HU, trunk, spacing_mm, shown)
+        tables, warnings = touching.sides, list(touching.warnings)
+        if touching.cut_off.any():
+            solids = np.where(touching.cut_off, 0, solids)
+            trunk = largest_component(trunk & ~touching.cut_off)
+    limbs = detached_limbs(hu, solids, spacing_mm) if shown.limbs else ()
+    warnings += limb_warnings(limbs, trunk, voxel_ml)
     filled = filled_slices(trunk)
     for limb in limbs:
         filled |= filled_slices(limb)
@@ -152,21 +155,7 @@ def body_mask(
         warnings.append(PADDED)
     if (ends & ~padded).any():
         warnings.append(CIRCLE)
-    if alone:
-        return BodyMask(body, unscanned, tuple(warnings))
-    flat = flat_sides(hu - BODY_HU, body, spacing_mm)
-    drawn = drawn_sides(hu - BODY_HU, trunk, spacing_mm)
-    warnings.extend(_table_warnings(flat, drawn, body.shape[2] * float(spacing_mm[2])))
-    return BodyMask(body, unscanned, tuple(warnings), flat, drawn)
-
-
-def _table_warnings(flat: Sequence[FlatSide], drawn: Sequence[DrawnSide], length_mm: float) -> Iterator[str]:
-    """One sentence for each side at which a table touches the body, or that none could be told."""
-    yield from (side.warning for side in flat)
-    named = {(side.axis, side.end) for side in flat}
-    yield from (side.warning for side in drawn if side.whole and (side.axis, side.end) not in named)
-    if length_mm < LEAST_LENGTH_MM:
-        yield TOO_SHORT.format(length=length_mm)
+    return BodyMask(body, unscanned, tuple(warnings), tables)
 
 
 def filled_slices(mask: Bools) -> Bools:

@@ -17,6 +17,8 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 
 OPENING_MM = 6.0
 """Parts thinner than twice this are no trunk, head or limb: table tops, sheets, tubes."""
+CORNER = 3.0**0.5
+"""So many times as far from where the ball fits a box's corner lies: it belongs to the box."""
 SAMPLING_MM = 3.0
 """Spacing at which the opening is done: half its radius."""
 MIN_LIMB_ML = 20.0
@@ -53,7 +55,7 @@ def thick_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
     if not cores.any():
         return np.zeros(mask.shape, np.int32)
     gap, nearest = scipy.ndimage.distance_transform_edt(cores == 0, sampling=coarse_mm, return_indices=True)
-    parts = np.where(gap <= OPENING_MM + coarse_mm.max(), cores[tuple(nearest)], 0)
+    parts = np.where(gap <= CORNER * OPENING_MM + coarse_mm.max(), cores[tuple(nearest)], 0)
     parts = parts[tuple(slice(r, -r) for r in reach)]
     for axis, times in enumerate(stride):
         parts = np.repeat(parts, times, axis=axis)

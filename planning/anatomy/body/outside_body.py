@@ -7,7 +7,6 @@ checked by the same engine as every organ, along the whole needle while it waits
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,8 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
-from puncture_twin.planning.anatomy.body.drawn_side import DrawnSide
-from puncture_twin.planning.anatomy.body.flat_side import FlatSide
+from puncture_twin.planning.anatomy.body.tables import TableSide
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.formats.labels.label_surface import field_surface
@@ -30,15 +28,14 @@ SMOOTH_MM = 3.0
 DENSE_HU = -700.0
 """A single voxel above this is no noise (ten times that of a low-dose image)."""
 MIN_PIECE_MM3 = 100.0
-"""Smaller pieces are noise: a line of 4 mm diameter has this volume in 8 mm of its length."""
+"""Pieces that hold less above ``BODY_HU`` are noise, or cloth: a line of 4 mm diameter has this in 8 mm of its
+length. A gown on the skin of a real chest has -850, and -600 in its folds; it stops no needle."""
 BULKY_ML = 50.0
 """Pieces of this volume that the border of the image cuts (a table, a mattress) go on beyond it, also between the
 places where they are cut: of a table that sags below the image both ends are seen."""
 BEYOND_MM = (100.0, 100.0, 2000.0)
 """How far what the border cuts is taken to go on to the sides, to front and back, and along the bed. A CT table is at
 most 550 mm wide and an image at least 350; along the bed table and mattress go on farther than a needle reaches."""
-EDGE_MM = 40.0
-"""The edge of a table or cradle is no thicker."""
 BEYOND_LONG_MM = (*BEYOND_MM[:2], 1000.0)
 """`BEYOND_MM` where an image is so long that the surface would be larger than any that is plausible."""
 CUT_AT_MM = (30.0, 120.0, 480.0)
@@ -99,7 +96,7 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     dense = (mean > air_hu) | (hu > max(DENSE_HU, air_hu))
     dense &= ~scipy.ndimage.maximum_filter(body, size=tuple(2 * (size // 2 + 1) + 1))
     dense = (dense | (hu > BODY_HU)) & ~unscanned.voxels & ~body
-    dense = _without_specks(dense, MIN_PIECE_MM3 / float(np.prod(image.spacing_mm)))
+    dense = _stiff_pieces(dense, hu > BODY_HU, float(np.prod(image.spacing_mm)))
     return dense | (_unscanned_beside(dense | body, body, unscanned, image.spacing_mm) & ~body)
 
 
@@ -141,39 +138,29 @@ def beyond_face(image: OutsideImage, axis: int, end: int, *, wider_mm: float = 0
     return _box(low, high, image)
 
 
-def beyond_flat_sides(image: OutsideImage, sides: Sequence[FlatSide]) -> list[TriangleMesh]:
-    """Boxes beyond the planes in which a body ends that lies on something: to both sides and along the bed too."""
-    shape, away = np.array(image.hu.shape), np.array(image.beyond_mm) / image.spacing_mm
-    boxes = []
-    for side in sides:
-        low, high = -away, shape - 1.0 + away
-        (high if side.end == 0 else low)[side.axis] = side.plane
-        boxes.append(_box(low, high, image))
-    return boxes
-
-
 def _box(low: Floats, high: Floats, image: OutsideImage) -> TriangleMesh:
     """A box between two corners, voxels."""
     index = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     return TriangleMesh(apply(image.T_ct_index, index), BOX_FACES)
 
 
-def beyond_drawn_sides(image: OutsideImage, sides: Sequence[DrawnSide], *, edges: bool) -> list[TriangleMesh]:
+def beyond_table(image: OutsideImage, side: TableSide) -> TriangleMesh:
     """What lies beyond a section that is drawn along the bed: a table's far side, and on along the bed.
+
+    Where its edges count as table, what is beyond it goes on to both sides, from ``edge_mm`` before the section: what
+    comes out of an edge is not free.
 
     Args:
         image: The CT and its body.
-        sides: The sections.
-        edges: Whether the table counts as body, so that its edges do too: then what is beyond it goes on to both
-            sides, from ``EDGE_MM`` before the section, and what comes out of an edge is not free.
+        side: The section.
     """
-    return [_beyond_line(image, side, edges=edges and side.whole) for side in sides]
-
-
-def _beyond_line(image: OutsideImage, side: DrawnSide, *, edges: bool) -> TriangleMesh:
+    edges = side.edge_mm is not None
     along_mm, across_mm, step_mm = (float(image.spacing_mm[axis]) for axis in (side.axis, 1 - side.axis, 2))
     outward = 1.0 if side.end else -1.0
-    away, edge = (image.beyond_mm[1 - side.axis] / across_mm, outward * EDGE_MM / along_mm) if edges else (1.0, 0.0)
+    away, edge = (
+        image.beyond_mm[1 - side.axis] / across_mm if edges else 1.0,
+        outward * (side.edge_mm or 0.0) / along_mm,
+    )
     last = image.hu.shape[1 - side.axis] - 1.0 if edges else 0.0
     before = [min(0.0 if edges else np.inf, side.across[0]) - away, side.across[0] - 0.5]
     after = [side.across[-1] + 0.5, max(last, side.across[-1]) + away]
@@ -190,7 +177,7 @@ def _beyond_line(image: OutsideImage, side: DrawnSide, *, edges: bool) -> Triang
     return TriangleMesh(vertices, _outward_faces(vertices, len(across)))
 
 
-def _row(side: DrawnSide, across: Floats, along: Floats, at_slice: float) -> Floats:
+def _row(side: TableSide, across: Floats, along: Floats, at_slice: float) -> Floats:
     """Voxel indices (n, 3) of points in one slice of a bed that may run at an angle to the slices' axis."""
     index = np.empty((len(across), 3))
     index[:, side.axis] = along + side.slope[1] * at_slice
@@ -227,11 +214,20 @@ def _facing_outward(vertices: Floats, faces: Ints32) -> Ints32:
     return faces[:, ::-1] if inward else faces
 
 
-def _without_specks(mask: Bools, least_voxels: float) -> Bools:
-    labels, _ = scipy.ndimage.label(mask, FULL)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return np.asarray((sizes >= least_voxels)[labels])
+def _stiff_pieces(mask: Bools, solid: Bools, voxel_mm3: float) -> Bools:
+    """The pieces that are bulky, and of others what is solid with its rim: the rest is noise, or cloth on the skin."""
+    bulky = _pieces(mask, mask, 1000.0 * BULKY_ML / voxel_mm3)
+    near = scipy.ndimage.binary_dilation(solid & mask, FULL)
+    stiff = _pieces(near, solid & mask, MIN_PIECE_MM3 / voxel_mm3)
+    return np.asarray(mask & (bulky | scipy.ndimage.binary_dilation(stiff, FULL)))
+
+
+def _pieces(mask: Bools, counted: Bools, least_voxels: float) -> Bools:
+    """The pieces of a mask that hold enough voxels of another."""
+    labels, count = scipy.ndimage.label(mask, FULL)
+    kept = np.bincount(labels[counted], minlength=count + 1) >= least_voxels
+    kept[0] = False
+    return np.asarray(kept[labels])
 
 
 def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_mm: Floats) -> Bools:

@@ -6,9 +6,16 @@ import SimpleITK as sitk  # noqa: N813
 from places import REAL_CT
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, body_mask
-from puncture_twin.planning.anatomy.body.drawn_side import drawn_sides, support_side
+from puncture_twin.planning.anatomy.body.detached_parts import largest_component
 from puncture_twin.planning.anatomy.body.outside_body import OutsideImage, outside_mask
-from puncture_twin.planning.anatomy.body.support import find_support, support_warnings
+from puncture_twin.planning.anatomy.body.tables import (
+    Shown,
+    drawn_sides,
+    find_support,
+    support_side,
+    support_warnings,
+    touching_tables,
+)
 
 CT = REAL_CT / "ct.nii.gz"
 SPACING = np.array([4.0, 4.0, 5.0])
@@ -113,3 +120,58 @@ def test_of_a_real_patient_only_the_back_lies_on_something(slices):
     assert {(side.axis, side.end) for side in sides if side.whole} <= {(1, -1)}
     assert (support.drawn[0].axis, support.drawn[0].end) == (1, -1)
     assert (1, 0) not in support.open_faces
+
+
+def block(kind):
+    """A phantom that ends within the image, and one as long as the image, Hounsfield units above the threshold."""
+    round_mm = 80.0 - np.hypot(X - 198.0, Y - 150.0)
+    edges_mm = np.minimum(90.0 - np.abs(X - 198.0), 70.0 - np.abs(Y - 150.0))
+    half_mm = np.minimum(110.0 - np.hypot(X - 198.0, Y - 200.0), 200.0 - Y)
+    inside_mm = {"cylinder": round_mm, "box": edges_mm, "half cylinder": half_mm}[kind]
+    return 500.0 * np.clip(inside_mm, -4.0, 4.0) / 4.0
+
+
+BOTTOM_MM = {"cylinder": 230.0, "box": 220.0, "half cylinder": 200.0}
+SHORT = np.abs(Z - 78.0) < 60.0
+
+
+@pytest.mark.parametrize("kind", BOTTOM_MM)
+@pytest.mark.parametrize("short", [False, True], ids=["long", "ends in the image"])
+def test_a_table_that_touches_a_phantom_is_cut_off_and_the_phantom_is_whole(kind, short):
+    """To a voxel; no other side of it is a table, and in air none is."""
+    phantom = np.where(SHORT | (not short), block(kind), -500.0)
+    table_mm = np.minimum(12.0 - np.abs(Y - BOTTOM_MM[kind] - 12.0), 150.0 - np.abs(X - 198.0))
+    scene = noisy(np.maximum(phantom, 500.0 * np.clip(table_mm, -4.0, 4.0) / 4.0))
+    found = touching_tables(scene, scene > 0.0, SPACING, Shown(phantom=True))
+    left = largest_component((scene > 0.0) & ~found.cut_off)
+    wrong = left ^ (noisy(phantom) > 0.0)
+    assert found.sides == ()
+    assert wrong.sum() <= 0.02 * left.sum()
+    assert wrong[:, : int(BOTTOM_MM[kind] / SPACING[1]) - 1].sum() <= 3  # single voxels of noise
+
+    alone = touching_tables(noisy(phantom), phantom > 0.0, SPACING, Shown(phantom=True))
+    assert not alone.cut_off.any()
+    assert alone.sides == ()
+
+
+@pytest.mark.parametrize("kind", ["cylinder", "box"])
+def test_a_body_with_one_section_at_all_four_sides_is_no_table(kind):
+    """Also where nobody says that it is a phantom; where a person says that it lies on one, nothing there is free."""
+    scene = noisy(block(kind))
+    found = touching_tables(scene, scene > 0.0, SPACING)
+    assert found.sides == ()
+    assert "phantom" in found.warnings[0]
+    stated = touching_tables(scene, scene > 0.0, SPACING, Shown(table="present"))
+    assert (1, -1) in {side.face for side in stated.sides}
+
+
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.0, 0.06)])
+def test_of_a_body_on_a_cradle_that_is_wider_the_cradle_is_cut_off(slope):
+    """All of what lies behind the body's back; of the body no more than a few millimetres."""
+    body = np.where(np.abs(X - 198.0) < 110.0, trunk(), -500.0)
+    scene = np.maximum(body, cradle(slope=slope))
+    found = touching_tables(noisy(scene), scene > 0.0, SPACING)
+    beyond = (cradle(slope=slope) > 0.0) & (body < 0.0)
+    assert found.cut_off[beyond].mean() > 0.85
+    assert found.cut_off[(body > 0.0) & (Y < 200.0)].sum() == 0
+    assert found.warnings

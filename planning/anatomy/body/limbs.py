@@ -1,0 +1,301 @@
+"""Limbs that are pressed against the trunk: one body in the CT, but no way for a needle to go from one into the other.
+
+Between an arm and the trunk that it touches there is skin, which a CT does not show. Three things tell them apart: the
+neck (a ball that fits into either does not fit through where they touch); a straight long bone beside the trunk,
+lateral to all others; and a bone with air on many sides. A rib lies below skin that is nearly flat: of a sphere about
+it, 1.6 times as wide as it is deep, .19 is air, however it runs. About a forearm's bones it is a third and more.
+
+Labels explain bones: what a structure names is no evidence, unless its name is an arm's. No part that is larger than a
+limb can be is one, nor the part that holds the target, nor its organ. All of it is decided on a grid of 4 mm.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.body.body_mask import CtImage
+from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
+from puncture_twin.planning.anatomy.body.unscanned import find_unscanned
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.voxelize import voxels_inside
+
+SAMPLING_MM = 4.0
+"""Spacing of the grid on which limbs are looked for."""
+MOST_ML = 9000.0
+"""An adult's leg has 8 to 10 l, an arm 3 to 4 l: of two parts the smaller one is no larger, or neither is a limb."""
+NECK_MM = 30.0
+"""Radius of a ball that fits into an adult's upper arm (35 to 50 mm) and thigh, and not through the place where an arm
+is pressed against the trunk, some 50 mm wide."""
+NAMED_DENSE = 0.4
+"""Of a structure's voxels so many are dense, or it is no bone: of a label "tissue" or "body" that holds bones too few
+are."""
+ARM_NAMES = re.compile(r"humer|radius|ulna|forearm|(?<![a-z])(arm|hand|carp|metacarp|phalan)")
+DEEPEST_MM, DEEPEST_FRACTION = 60.0, 0.45
+"""From a limb's bone to the air, and as a fraction of what the trunk's middle has: a spine lies deeper."""
+GAP_MM = 16.0
+"""Bones of one limb are so near to each other, at a wrist or an elbow."""
+SPHERE, DIRECTIONS = 1.6, 200
+"""Radius of the sphere about a bone, as a multiple of its depth, and how many points of it are asked."""
+PARTLY, EXPOSED = 0.26, 0.32
+"""Share of air about every voxel of a limb's bones, and its median. Of shoulder blades and ribs of a real chest the
+median is .30 at most, of forearms across drawn trunks .33 and more."""
+LEAST_MM = 60.0
+"""Length of a limb's bones. A nose's, a collar bone's visible end and a spinous process's are shorter."""
+STRAIGHT_MM, TILT, WIDTH_MM = 6.0, 0.7, (5.0, 40.0)
+"""A long bone beside the trunk keeps so near to a line, which leans so little against the bed (mm per mm; a rib
+descends at 45 degrees), and is so wide."""
+ASIDE, LATERAL_FRACTION = 0.5, 0.8
+"""It lies so far from the middle, of the half width; in so many slices no other bone of its side is more lateral."""
+FLAT, SLACK_MM = 1.5, 5.0
+"""From its bone a limb that is pressed flat reaches so many times as far as the air is away, and so much farther."""
+BEYOND_ENDS_MM = 50.0
+"""So far beyond the end of its bone a limb goes on, to a joint and the next bone."""
+
+FULL = np.ones((3, 3, 3), bool)
+
+
+class NamedBones(NamedTuple):
+    """A structure of the case, which explains the bone that it holds."""
+
+    name: str
+    mesh: TriangleMesh
+
+
+@dataclass(frozen=True, eq=False)
+class LimbSearch:
+    """The body on a grid of some 4 mm, axes running to the left, back and head.
+
+    Attributes:
+        body: Shape (nx, ny, nz), the part that holds the target; a block counts where any of its voxels does.
+        solid: Same shape, body, and what was not scanned: neither is air.
+        bone: Same shape, bone that is evidence of a limb; a block counts where an eighth of it is, which noise is not.
+        every_bone: Same shape, named bone too.
+        spacing_mm: Shape (3,).
+        T_ct_index: Shape (4, 4), LPS mm.
+        at: The target's block.
+    """
+
+    body: Bools
+    solid: Bools
+    bone: Bools
+    every_bone: Bools
+    spacing_mm: Floats
+    T_ct_index: Floats
+    at: tuple[int, int, int]
+
+    @property
+    def block_ml(self) -> float:
+        """Of one block."""
+        return float(np.prod(self.spacing_mm)) / 1000.0
+
+    def volume_ml(self, mask: Bools) -> float:
+        """Of a mask."""
+        return float(np.count_nonzero(mask)) * self.block_ml
+
+    @cached_property
+    def depth_mm(self) -> Floats:
+        """From the air, shape of ``body``; beyond the border the body goes on."""
+        padded = np.pad(self.solid, 1, mode="edge")
+        return np.asarray(scipy.ndimage.distance_transform_edt(padded, sampling=self.spacing_mm)[1:-1, 1:-1, 1:-1])
+
+    def limbs(self) -> Bools:
+        """Blocks of the body that belong to a limb without the target."""
+        found = np.zeros(self.body.shape, bool)
+        if not self.body[self.at] or self.volume_ml(self.bone) < MIN_BONE_ML:
+            return found
+        for part in self._beyond_necks():
+            found |= part
+        for bones in (*self._rods(), *self._exposed()):
+            found |= self._about(bones)
+        return found & self.body
+
+    def _beyond_necks(self) -> Iterator[Bools]:
+        """Parts beyond a narrow neck that hold bone, as large as a limb can be, if the target's part is not."""
+        owner = _nearest_core(self.body, self.spacing_mm)
+        own_ml = self.volume_ml(owner == owner[self.at])
+        for number in range(1, int(owner.max(initial=0)) + 1):
+            part = owner == number
+            small = min(own_ml, self.volume_ml(part)) <= MOST_ML
+            if number != owner[self.at] and small and self.volume_ml(part & self.bone) >= MIN_BONE_ML:
+                yield part
+
+    def _near_skin(self) -> Bools:
+        deepest = min(DEEPEST_MM, DEEPEST_FRACTION * float(self.depth_mm[self.body].max()))
+        return np.asarray(self.bone & (self.depth_mm <= deepest))
+
+    def _exposed(self) -> Iterator[Bools]:
+        """Bones about which air is on more sides than about a bone of the trunk, of one limb each."""
+        near = self._near_skin()
+        air = np.zeros(self.body.shape)
+        air[near] = self._air_about(np.argwhere(near))
+        groups = _groups(air >= PARTLY, self.spacing_mm)
+        for number, box in enumerate(scipy.ndimage.find_objects(groups), start=1):
+            if box is None:
+                continue
+            group = groups[box] == number
+            exposed = np.argwhere(group & (air[box] >= EXPOSED)) * self.spacing_mm
+            enough = len(exposed) * self.block_ml >= MIN_BONE_ML and np.linalg.norm(np.ptp(exposed, axis=0)) >= LEAST_MM
+            if enough and np.median(air[box][group]) >= EXPOSED:
+                yield self._along(groups == number)
+
+    def _along(self, bones: Bools) -> Bools:
+        """With what continues them in a line, where the limb lies deeper."""
+        labels, _ = scipy.ndimage.label(self.bone, FULL)
+        index = np.argwhere(np.isin(labels, np.unique(labels[bones])))
+        middle, axis = _axis(np.argwhere(bones) * self.spacing_mm)
+        off_mm = index * self.spacing_mm - middle
+        off_mm -= np.outer(off_mm @ axis, axis)
+        line = bones.copy()
+        line[tuple(index[np.linalg.norm(off_mm, axis=1) <= 2.0 * STRAIGHT_MM].T)] = True
+        return line
+
+    def _air_about(self, index: NDArray[np.int64]) -> Floats:
+        """How much of a sphere about each block (n, 3) is air; 0..1."""
+        step = np.arange(DIRECTIONS) + 0.5
+        z = 1.0 - 2.0 * step / DIRECTIONS
+        angle, wide = np.pi * (1.0 + 5.0**0.5) * step, np.sqrt(1.0 - z * z)  # golden angle
+        radius_mm, last = SPHERE * self.depth_mm[tuple(index.T)], np.array(self.body.shape) - 1
+        air = np.zeros(len(index))
+        for direction in np.stack([wide * np.cos(angle), wide * np.sin(angle), z], axis=1):
+            at = np.clip(np.rint(index + radius_mm[:, None] * direction / self.spacing_mm).astype(int), 0, last)
+            air += ~self.solid[tuple(at.T)]
+        return air / DIRECTIONS
+
+    def _rods(self) -> Iterator[Bools]:
+        """Straight long bones along the bed, near the skin and lateral to all other bones."""
+        labels, _ = scipy.ndimage.label(self.bone, FULL)
+        for number, box in enumerate(scipy.ndimage.find_objects(labels), start=1):
+            if (box[2].stop - box[2].start) * self.spacing_mm[2] >= LEAST_MM:
+                bone = labels == number
+                if self._is_straight(bone) and self._is_lateral(bone):
+                    yield bone
+
+    def _is_straight(self, bone: Bools) -> bool:
+        slices = np.flatnonzero(bone.any(axis=(0, 1)))
+        filled = [scipy.ndimage.binary_fill_holes(bone[:, :, k]) for k in slices]
+        area_mm2 = np.median([np.count_nonzero(section) for section in filled]) * np.prod(self.spacing_mm[:2])
+        middle_mm = np.array([scipy.ndimage.center_of_mass(section) for section in filled]) * self.spacing_mm[:2]
+        z_mm = slices * self.spacing_mm[2]
+        line = np.polynomial.polynomial.polyfit(z_mm, middle_mm, 1)
+        off_mm = np.linalg.norm(middle_mm - np.polynomial.polynomial.polyval(z_mm, line).T, axis=1)
+        straight = np.percentile(off_mm, 90) <= STRAIGHT_MM and np.linalg.norm(line[1]) <= TILT
+        return bool(straight and WIDTH_MM[0] <= 2.0 * np.sqrt(area_mm2 / np.pi) <= WIDTH_MM[1])
+
+    def _is_lateral(self, bone: Bools) -> bool:
+        """Whether it is near the skin everywhere, and in most slices no bone lies farther from the body's middle."""
+        lateral, depths = [], []
+        for k in np.flatnonzero(bone.any(axis=(0, 1))):
+            x, y = np.rint(scipy.ndimage.center_of_mass(bone[:, :, k])).astype(int)
+            first, last = np.flatnonzero(self.body[:, :, k].any(axis=1))[[0, -1]]
+            outward = 1.0 if 2.0 * x > first + last else -1.0
+            others = outward * np.flatnonzero(self.every_bone[:, :, k].any(axis=1))
+            beyond_mm = (others.max() - outward * x) * self.spacing_mm[0]
+            lateral.append(abs(2.0 * x - first - last) >= ASIDE * (last - first) and beyond_mm <= WIDTH_MM[1])
+            depths.append(self.depth_mm[x, y, k])
+        return max(depths) <= DEEPEST_MM and float(np.mean(lateral)) >= LATERAL_FRACTION
+
+    def _about(self, bones: Bools) -> Bools:
+        """What may belong to the limb about some bones, also some way beyond their ends; nothing about the target."""
+        gap, nearest = scipy.ndimage.distance_transform_edt(~bones, sampling=self.spacing_mm, return_indices=True)
+        radius = self.depth_mm[tuple(nearest)]
+        if gap[self.at] < radius[self.at]:
+            return np.zeros_like(bones)
+        reach = gap <= FLAT * radius + SLACK_MM
+        along = _axis(np.argwhere(bones) * self.spacing_mm)[1] / self.spacing_mm
+        steps = np.arange(-BEYOND_ENDS_MM, BEYOND_ENDS_MM + 1e-9, 0.5 * float(self.spacing_mm.min()))
+        beyond = np.zeros_like(bones)
+        for shift in np.unique(np.rint(steps[:, None] * along).astype(int), axis=0):
+            beyond |= _shifted(reach, shift)
+        return np.asarray(gap < radius) if beyond[self.at] else beyond
+
+
+def limb_search(image: CtImage, body: Bools, target_ct: Floats, structures: Sequence[NamedBones]) -> LimbSearch:
+    """Sample a CT and its body.
+
+    Args:
+        image: The CT.
+        body: Its voxels that are body.
+        target_ct: Shape (3,), LPS mm.
+        structures: Which explain bones.
+    """
+    stride = np.maximum(1, (SAMPLING_MM / image.spacing_mm).astype(int))
+    T = image.T_ct_index.copy()
+    T[:3, 3] += T[:3, :3] @ ((stride - 1) / 2.0)
+    T[:3, :3] *= stride
+    coarse = _share(body, stride) > 0.0
+    every_bone = _share(body & (image.hu > BONE_HU), stride) >= 0.125
+    index = np.rint(np.linalg.solve(T, np.append(target_ct, 1.0))[:3]).astype(int)
+    x, y, z = np.clip(index, 0, np.array(coarse.shape) - 1)
+    labels, _ = scipy.ndimage.label(coarse)
+    part = coarse & (labels == labels[x, y, z])
+    solid = coarse | (_share(find_unscanned(image.hu).voxels, stride) >= 0.5)
+    bone = every_bone & part & ~_explained(every_bone, T, structures)
+    return LimbSearch(part, solid, bone, every_bone, image.spacing_mm * stride, T, (int(x), int(y), int(z)))
+
+
+def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[NamedBones]) -> Bools:
+    """Blocks within, or beside, a structure that is a bone and not an arm's."""
+    explained = np.zeros(bone.shape, bool)
+    for name, mesh in structures:
+        if not ARM_NAMES.search(name.lower()):
+            inside = voxels_inside(mesh, T_ct_index, bone.shape)
+            if np.count_nonzero(inside & bone) >= NAMED_DENSE * np.count_nonzero(inside):
+                explained |= inside
+    return np.asarray(scipy.ndimage.binary_dilation(explained, FULL))
+
+
+def _axis(points: Floats) -> tuple[Floats, Floats]:
+    """Middle (3,) of points (n, 3), and the direction in which they reach farthest."""
+    middle = points.mean(axis=0)
+    return middle, np.linalg.svd(points - middle, full_matrices=False)[2][0]
+
+
+def _share(mask: Bools, stride: NDArray[np.int_]) -> NDArray[np.float32]:
+    """How much of each block a mask fills; 0..1."""
+    share: NDArray[np.float32] = mask.astype(np.float32)
+    for axis, times in enumerate(stride):
+        starts = np.arange(0, mask.shape[axis], times)
+        counts = np.diff(np.append(starts, mask.shape[axis])).reshape([-1 if k == axis else 1 for k in range(3)])
+        share = np.asarray(np.add.reduceat(share, starts, axis=axis) / counts.astype(np.float32))
+    return share
+
+
+def _shifted(mask: Bools, by: NDArray[np.int_]) -> Bools:
+    """The mask moved by whole voxels; False comes in."""
+    moved = np.zeros_like(mask)
+    into = tuple(slice(max(0, k), n + min(0, k)) for k, n in zip(by, mask.shape, strict=True))
+    out_of = tuple(slice(max(0, -k), n + min(0, -k)) for k, n in zip(by, mask.shape, strict=True))
+    moved[into] = mask[out_of]
+    return moved
+
+
+def _groups(mask: Bools, spacing_mm: Floats) -> Ints32:
+    """Numbers of voxels that hold together across gaps of ``GAP_MM``, 0 outside of the mask."""
+    if not mask.any():
+        return np.zeros(mask.shape, np.int32)
+    gap = scipy.ndimage.distance_transform_edt(~mask, sampling=spacing_mm)
+    labels, _ = scipy.ndimage.label(gap <= GAP_MM / 2.0, FULL)
+    return np.asarray(np.where(mask, labels, 0), dtype=np.int32)
+
+
+def _nearest_core(body: Bools, spacing_mm: Floats) -> Ints32:
+    """For every voxel of a body, the number of the nearest place into which the ball fits; 0 outside."""
+    reach = np.ceil(NECK_MM / spacing_mm).astype(int)
+    padded = np.pad(body, [(r, r) for r in reach], mode="edge")
+    cores, count = scipy.ndimage.label(scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm) > NECK_MM)
+    if count < 2:
+        return body.astype(np.int32)
+    nearest = scipy.ndimage.distance_transform_edt(
+        cores == 0, sampling=spacing_mm, return_distances=False, return_indices=True
+    )
+    owner = cores[tuple(nearest)][tuple(slice(r, -r) for r in reach)]
+    return np.asarray(np.where(body, owner, 0), dtype=np.int32)

@@ -1,0 +1,160 @@
+"""Limbs pressed against a trunk: found by neck, by long bone and by air about their bones; none in a trunk or head."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813
+from places import DATA, REAL_CT
+
+from puncture_twin.planning.anatomy.anatomy import ball
+from puncture_twin.planning.anatomy.body.body_mask import CtImage, ct_image
+from puncture_twin.planning.anatomy.body.limbs import NamedBones, limb_search
+from puncture_twin.planning.formats.volumes.volume_files import read_volume
+
+CT = REAL_CT / "ct.nii.gz"
+CHEST = DATA / "slicer_chest_ct4" / "CTChest4.nrrd"
+SPACING = np.array([4.0, 4.0, 5.0])
+SHAPE = (80, 70, 36)
+POINTS = np.moveaxis(np.indices(SHAPE), 0, -1) * SPACING
+TRUNK = np.hypot((POINTS[..., 0] - 160.0) / 130.0, (POINTS[..., 1] - 165.0) / 90.0) < 1.0
+SPINE = np.hypot(POINTS[..., 0] - 160.0, POINTS[..., 1] - 215.0) < 19.0
+TARGET = np.array([160.0, 160.0, 90.0])
+ACROSS = ((70.0, 65.0, 60.0), (250.0, 65.0, 120.0))
+ALONG = ((120.0, 65.0, 10.0), (170.0, 60.0, 170.0))
+
+
+def about(start, end):
+    """Distance of every voxel from a line."""
+    a, b = np.array(start), np.array(end)
+    t = np.clip((POINTS - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+    return np.linalg.norm(POINTS - a - t[..., None] * (b - a), axis=-1)
+
+
+def image(*lines, radius=28.0, bone=8.0, trunk=TRUNK):
+    """A trunk with a spine, and limbs along lines."""
+    body, bones = trunk.copy(), SPINE & trunk
+    for start, end in lines:
+        off = about(start, end)
+        body |= off < radius
+        bones |= off < bone
+    hu = np.where(body, 30.0, -1000.0)
+    hu[bones] = 600.0
+    return hu.astype(np.float32), body
+
+
+def search(hu, body, target=TARGET, structures=()):
+    """Limbs of an image from its first voxel on."""
+    T = np.diag([*SPACING, 1.0])
+    return limb_search(CtImage(hu, T, Path("ct.nii.gz")), body, target, structures)
+
+
+@pytest.mark.parametrize("line", [ACROSS, ALONG], ids=["across", "along"])
+@pytest.mark.parametrize(("radius", "bone"), [(28.0, 8.0), (20.0, 5.0)], ids=["thick", "thin"])
+def test_an_arm_upon_the_belly_is_found_and_holds_its_soft_tissue(line, radius, bone):
+    """Nine tenths of it; the spine's surroundings and the middle of the trunk are not part of it."""
+    limbs = search(*image(line, radius=radius, bone=bone)).limbs()
+    arm = (about(*line) < radius) & ~TRUNK
+    assert limbs[arm].mean() > 0.9
+    assert not limbs[SPINE].any()
+    assert limbs[TRUNK].mean() < 0.3
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3])
+def test_the_bone_of_an_arm_beside_the_trunk_is_found(slope):
+    """A tube along the bed, pressed in by more than half of the arm; the spine is none."""
+    line = (36.0, 165.0 - 90.0 * slope, 0.0), (36.0, 165.0 + 90.0 * slope, 180.0)
+    hu, body = image(line, radius=32.0, bone=10.0)
+    hu[about(*line) < 4.0] = 30.0
+    found = search(hu, body)
+    (bone,) = found._rods()
+    assert np.abs(np.argwhere(bone)[:, 0] * 4.0 - 36.0).max() <= 12.0
+    assert found.limbs()[(about(*line) < 32.0) & ~TRUNK].mean() > 0.9
+
+
+@pytest.mark.parametrize("line", [ACROSS, ((36.0, 165.0, 0.0), (36.0, 165.0, 180.0))])
+def test_a_bone_that_a_structure_names_is_no_evidence(line):
+    """Unless its name is an arm's; and a label of all that is soft explains no bone in it."""
+    hu, body = image(line)
+    middle = (np.array(line[0]) + line[1]) / 2.0
+    long_bone = ball(np.zeros(3), 1.0)
+    axis = np.subtract(*line[::-1])
+    along = np.outer(axis, axis) / (axis @ axis)
+    stretch = 12.0 * (np.eye(3) - along) + 0.6 * np.linalg.norm(axis) * along
+    vertices = long_bone.vertices @ stretch + middle
+    bone = type(long_bone)(vertices, long_bone.faces)
+    whole = ball(TARGET, 400.0)
+    assert not search(hu, body, structures=[NamedBones("rib_left_7", bone)]).limbs().any()
+    assert search(hu, body, structures=[NamedBones("humerus_left", bone)]).limbs().any()
+    assert search(hu, body, structures=[NamedBones("tissue", whole)]).limbs().any()
+
+
+def test_an_arm_that_holds_the_target_is_not_forbidden():
+    """It is then the arm that is to be punctured."""
+    hu, body = image(ACROSS)
+    middle = (np.array(ACROSS[0]) + ACROSS[1]) / 2.0
+    assert not search(hu, body, middle).limbs().any()
+
+
+def test_nothing_about_the_target_is_a_limb():
+    """A target in the trunk near an arm upon it: only what is nearer to the bone than the air is the arm's."""
+    hu, body = image(ACROSS)
+    target = np.array([160.0, 108.0, 90.0])
+    found = search(hu, body, target)
+    assert found.limbs().any()
+    assert not found.limbs()[found.at]
+
+
+def test_a_limb_alone_is_no_limb_of_a_trunk():
+    """An image of an arm only: its bone is as deep as half of the body is thick."""
+    hu, body = image(ACROSS, radius=35.0, trunk=np.zeros(SHAPE, bool))
+    assert not search(hu, body, np.array([160.0, 85.0, 90.0])).limbs().any()
+
+
+def test_of_two_large_parts_neither_is_a_limb():
+    """Two trunks of more than 9 l that touch at a neck, each with bone: no limb is as large."""
+    trunk = np.abs(POINTS[..., 0] - 160.0) > 12.0
+    trunk |= np.hypot(POINTS[..., 1] - 140.0, POINTS[..., 2] - 90.0) < 20.0
+    trunk &= (POINTS[..., 1] > 20.0) & (POINTS[..., 1] < 260.0)
+    hu, body = image(((60.0, 140.0, 20.0), (60.0, 140.0, 160.0)), trunk=trunk)
+    wide = np.repeat(hu, 4, axis=0), np.repeat(body, 4, axis=0)
+    target = np.array([4.0 * 260.0, 140.0, 90.0])
+    assert not search(*wide, target).limbs().any()
+    assert search(hu, body, np.array([260.0, 140.0, 90.0])).limbs().any()
+
+
+def test_a_rib_a_speck_and_no_bone_are_none():
+    """A rib follows the skin; a piece of metal on the skin is small; a bone deep in the trunk is its own."""
+    ring = np.abs(np.hypot((POINTS[..., 0] - 160.0) / 112.0, (POINTS[..., 1] - 165.0) / 72.0) - 1.0) < 0.05
+    rib = ring & (np.abs(POINTS[..., 2] - 90.0 + 0.3 * (POINTS[..., 1] - 165.0)) < 6.0)
+    assert rib.sum() > 100
+    hu, body = image()
+    hu[rib] = 600.0
+    hu[np.hypot(POINTS[..., 0] - 140.0, POINTS[..., 1] - 165.0) < 10.0] = 800.0
+    assert not search(hu, body).limbs().any()
+    short = about((150.0, 68.0, 90.0), (170.0, 68.0, 90.0))
+    hu, body = image()
+    hu[short < 16.0], hu[short < 6.0] = 30.0, 600.0
+    assert not search(hu, body | (short < 16.0)).limbs().any()
+    assert not search(np.where(body, 30.0, -1000.0).astype(np.float32), body).limbs().any()
+
+
+@pytest.mark.skipif(not CT.is_file(), reason="the real CT (totalseg_abdomen_3mm) is not on this machine")
+@pytest.mark.parametrize("part", [slice(None), slice(0, 50), slice(30, 70), slice(60, None)])
+def test_no_bone_of_a_real_abdomen_is_a_limbs(part):
+    """Ribs, pelvis and spine without a label, in the whole image and in parts of it."""
+    scan = sitk.ReadImage(str(CT))
+    hu = sitk.GetArrayFromImage(scan).transpose(2, 1, 0).astype(np.float32)[:, :, part]
+    ct = CtImage(hu, np.diag([*scan.GetSpacing(), 1.0]), CT)
+    found = limb_search(ct, ct.found.body, np.array(hu.shape) * scan.GetSpacing() / 2.0, ())
+    assert found.bone.sum() > 100
+    assert not found.limbs().any()
+
+
+@pytest.mark.skipif(not CHEST.is_file(), reason="the real chest (slicer_chest_ct4) is not on this machine")
+def test_no_bone_of_a_real_chest_is_a_limbs():
+    """Shoulder blades, collar bones and ribs without a label, arms raised, slices of 10 mm."""
+    ct = ct_image(read_volume(CHEST))
+    found = limb_search(ct, ct.found.body, np.array([-85.5, 8.2, -138.1]), ())
+    assert found.bone.sum() > 1000
+    assert not found.limbs().any()
