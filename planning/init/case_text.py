@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.finder import Markers
+from puncture_twin.planning.init.overrides import with_keys
 from puncture_twin.planning.init.segmentation import Assigned, Segmentation, quoted
 
 HEAD = """# Written by `init`: a start. Look at the roles and margins below before any result is trusted.
@@ -36,16 +37,17 @@ diameter_mm = 1.2
 theta_deg = [0, 90]
 step_deg = 2.0
 max_skin_angle_deg = 60.0
-{trust}
+
 """
-TRUSTED = (
-    "trust_labels = true  # a person has looked: structures lie right, and what they leave out of the CT is free\n"
-)
 OWN_TARGET = "hit_radius_mm = {radius!r}  # it lies in no structure: what is hit is this ball about it"
 SKIN_OF_CT = """[[structure]]
 name = "skin"
 ct = {ct}  # the body is found in the CT
 role = "skin"
+
+"""
+CT_BESIDE = """[ct]
+file = {ct}
 
 """
 REGISTRATION = """
@@ -78,10 +80,11 @@ class CaseParts:
         target_ct: Shape (3,), LPS mm.
         structure: Which holds the target, or None.
         hit_radius_mm: Of the ball that is hit, where none does.
-        ct: The CT whose body is the skin, or None where a mesh is.
+        ct: The CT, or None.
+        skin: What the skin is, for a person: the CT, or a structure.
         sources: Each segmentation with what the case says of its structures.
         markers: Lists of points.
-        trust_labels: Whether a person has seen that the structures lie right.
+        keys: Key of the case to its value, where a person states it.
     """
 
     name: str
@@ -91,9 +94,10 @@ class CaseParts:
     structure: str | None
     hit_radius_mm: float
     ct: str | None
+    skin: str
     sources: tuple[tuple[Segmentation, Sequence[Assigned]], ...]
     markers: tuple[Markers, ...]
-    trust_labels: bool
+    keys: Mapping[str, str]
 
     @property
     def rows(self) -> list[Assigned]:
@@ -111,13 +115,14 @@ def case_text(parts: CaseParts) -> str:
         space=parts.space,
         position=", ".join(repr(float(one)) for one in position),
         structure=own if parts.structure is None else f"structure = {quoted(parts.structure)}",
-        trust=TRUSTED if parts.trust_labels else "",
     )
-    skin = "" if parts.ct is None else SKIN_OF_CT.format(ct=quoted(parts.ct))
-    count = sum(row.kind != "ignore" for row in parts.rows) + (parts.ct is not None)
+    of_structure = any(row.kind == "skin" for row in parts.rows)
+    skin = "" if parts.ct is None else (CT_BESIDE if of_structure else SKIN_OF_CT).format(ct=quoted(parts.ct))
+    count = sum(row.kind != "ignore" for row in parts.rows) + (not of_structure)
     sections = "\n".join(segmentation.section(rows) for segmentation, rows in parts.sources)
     errors = _errors_text([segmentation for segmentation, _ in parts.sources])
-    return head + skin + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
+    text = head + skin + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
+    return with_keys(text, parts.keys)
 
 
 def _errors_text(sources: Sequence[Segmentation]) -> str:

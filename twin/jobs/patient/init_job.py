@@ -14,6 +14,7 @@ from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.geometry.spaces import to_lps
+from puncture_twin.planning.init.overrides import WAYS
 from puncture_twin.planning.init.start import ALLOWED, Request, Start, start_case
 from puncture_twin.planning.search.context import CaseContext, prepare
 
@@ -74,7 +75,7 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
         except InputError as error:
             what, where = (text.replace(draft.name, CASE) for text in (error.what, error.where))
             raise type(error)(
-                what, where=where, allowed=error.allowed, code=error.code, numbers=error.numbers
+                what, where=where, allowed=f"{error.allowed}; {WAYS}", code=error.code, numbers=error.numbers
             ) from error
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
     return InitRun(path, start, context, (*start.notes, *found))
@@ -92,7 +93,7 @@ def init_text(run: InitRun) -> str:
     roles = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
     lines = [
         f"{run.path}",
-        f"  skin           {parts.ct or 'a mesh'}",
+        f"  skin           {parts.skin}",
         f"  structures     {roles}, of {', '.join(_source(one.source) for one, _ in parts.sources)}",
         f"  target         {position} mm {parts.space}, in {parts.structure or 'no structure'}",
         f"  region         {parts.region}",
