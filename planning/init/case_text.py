@@ -9,12 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, Anatomy, body_side
+from puncture_twin.planning.anatomy.body.field_of_view import SIDES
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.finder import Markers
-from puncture_twin.planning.init.overrides import with_keys
+from puncture_twin.planning.init.overrides import with_keys, with_line
 from puncture_twin.planning.init.segmentation import Assigned, Segmentation, quoted
 
 HEAD = """# Written by `init`: a start. Look at the roles and margins below before any result is trusted.
@@ -61,6 +63,7 @@ ERRORS = """
 # [errors]
 # surface_mm = {known}  # by which contours may lie off; {reason}
 """
+PICTURE = "see slices.png"
 OF_VOXELS = "of {sources} by the voxels, at most; left out, every direction has its own"
 OF_MESHES = "of {sources} nobody knows it who did not draw them: left out it counts as 0, and every result says so"
 END = """
@@ -123,6 +126,34 @@ def case_text(parts: CaseParts) -> str:
     errors = _errors_text([segmentation for segmentation, _ in parts.sources])
     text = head + skin + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
     return with_keys(text, parts.keys)
+
+
+IMAGE = """# What the image shows, as rules find it. A line without its # states it: then no rule guesses.
+# arms: {arms}:
+# arms = "none"
+# table: {table}:
+# table = "none"
+# beyond: {beyond}:
+# beyond_mm = 150"""
+
+
+def with_image_seen(text: str, anatomy: Anatomy) -> str:
+    """The text of a case with what rules find in its CT, as comments that state it where a person agrees."""
+    if anatomy.scan is None:
+        return text
+    limbs = [one.numbers for one in anatomy.findings if one.code == ATTACHED_LIMB]
+    arms = [f"{float(str(one['volume_ml'])) / 1000:.1f} l at the {one['side']} side, {PICTURE}" for one in limbs]
+    couch = None if anatomy.couch is None else f"at the {body_side(anatomy.couch, anatomy.skin)} side, {PICTURE}"
+    view = anatomy.skin.field_of_view
+    cut = [] if view is None else [name for name, (axis, end) in SIDES.items() if view.cut[axis, end]]
+    seen = IMAGE.format(
+        arms=f"{arms[0]}; if that is no arm" if arms else "none found; to state it",
+        table="none found; to state it" if couch is None else f"{couch}; if the body lies on nothing",
+        beyond=f"the image cuts the body at its {', '.join(cut)} side; the body is at most so much wider there"
+        if cut
+        else "the image shows the body whole; where it does not, the body is at most so much wider",
+    )
+    return with_line(text, "ct", seen)
 
 
 def _errors_text(sources: Sequence[Segmentation]) -> str:

@@ -104,19 +104,30 @@ def _quoted(text: str) -> str:
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def with_keys(text: str, keys: Mapping[str, str]) -> str:
-    """The text of a case in which keys have these values: in place of theirs, else first in their table."""
-    lines = text.split("\n")
+def with_keys(text: str, keys: Mapping[str, str], reasons: Mapping[str, str] = REASONS) -> str:
+    """The text of a case in which keys have these values: in place of theirs, else first in their table.
+
+    Args:
+        text: Of the case; every table but ``[end]`` may be missing.
+        keys: As `Overrides.keys`.
+        reasons: What stands beside some of them.
+    """
     for key, value in keys.items():
         table, _, name = key.rpartition(".")
-        line = f"{name} = {value}  # {REASONS.get(key, STATED)}"
-        heads = [i for i, one in enumerate(lines) if one.startswith("[")]
-        if table and f"[{table}]" not in lines:
-            lines[heads[-1] : heads[-1]] = [f"[{table}]", line, ""]  # before [end]
-            continue
-        start = lines.index(f"[{table}]") + 1 if table else 0
-        stop = next((i for i in heads if i >= start), len(lines))
-        there = [i for i in range(start, stop) if re.match(rf"{name}\s*=", lines[i])]
-        at = there[0] if there else start
-        lines[at : at + len(there)] = [line]
+        text = with_line(text, table, f"{name} = {value}  # {reasons.get(key, STATED)}", name)
+    return text
+
+
+def with_line(text: str, table: str, line: str, name: str = "") -> str:
+    """The text of a case with a line of a table: in place of a key's, else first in the table, made where it is not."""
+    lines = text.split("\n")
+    heads = [i for i, one in enumerate(lines) if one.startswith("[")]
+    if table and f"[{table}]" not in lines:
+        lines[heads[-1] : heads[-1]] = [f"[{table}]", line, ""]  # before [end]
+        return "\n".join(lines)
+    start = lines.index(f"[{table}]") + 1 if table else 0
+    stop = next((i for i in heads if i >= start), len(lines))
+    there = [i for i in range(start, stop) if name and re.match(rf"{name}\s*=", lines[i])]
+    at = there[0] if there else start
+    lines[at : at + len(there)] = [line]
     return "\n".join(lines)

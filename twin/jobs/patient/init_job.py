@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,20 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.toml_file import parse_toml
+from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.read_case import ALLOWED_CASE
 from puncture_twin.planning.geometry.spaces import to_lps
-from puncture_twin.planning.init.overrides import WAYS
+from puncture_twin.planning.init.case_text import with_image_seen
+from puncture_twin.planning.init.overrides import WAYS, with_keys
 from puncture_twin.planning.init.start import ALLOWED, Request, Start, start_case
 from puncture_twin.planning.search.context import CaseContext, prepare
+from puncture_twin.planning.search.selection.choice import Pick
+from puncture_twin.planning.search.sides import grid_of, sides_text
+from puncture_twin.twin.jobs.patient.run import SLICES
+from puncture_twin.twin.report.numbers import needle_text
+from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
+from puncture_twin.twin.report.slices.subject import Subject
 
 CASE = "case.toml"
 
@@ -29,6 +39,7 @@ class InitRun:
     start: Start
     context: CaseContext
     warnings: tuple[str, ...]
+    picture: Path | None
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm, in the case's space."""
@@ -43,9 +54,12 @@ class InitRun:
             "target_mm": [float(one) for one in position],
             "target_structure": parts.structure,
             "structures": dict(Counter(row.kind for row in parts.rows)),
+            "looked": sides_text(self.context.sides),
+            "sides": [side._asdict() for side in self.context.sides],
             "warnings": list(self.warnings),
+            "findings": self.context.provenance()["findings"],
             "inputs": inputs_document(self.context.case.inputs),
-            "files": [str(self.path)],
+            "files": [str(path) for path in (self.path, self.picture) if path is not None],
         }
 
 
@@ -77,8 +91,29 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
             raise type(error)(
                 what, where=where, allowed=f"{error.allowed}; {WAYS}", code=error.code, numbers=error.numbers
             ) from error
+        text = _with_seen(start, request, context)
+        parse_toml(text.encode(), path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
+        draft.write_text(text, encoding="utf-8")
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
-    return InitRun(path, start, context, (*start.notes, *found))
+    picture = None if context.anatomy.scan is None else _picture(context, folder / SLICES)
+    return InitRun(path, replace(start, text=text), context, (*start.notes, *found), picture)
+
+
+def _with_seen(start: Start, request: Request, context: CaseContext) -> str:
+    """The case's text with what only the whole anatomy tells: what its CT shows, and where a search should look."""
+    text, where = with_image_seen(start.text, context.anatomy), grid_of(context.sides)
+    looked = f"where a needle can come from: {sides_text(context.sides)}"
+    keys = {"search.frame": where.frame, "search.theta_deg": "[{:g}, {:g}]".format(*where.theta_deg)}
+    if not request.wanted.overrides.keys.keys().isdisjoint(keys):
+        return text
+    return with_keys(text, keys, {"search.theta_deg": looked, "search.frame": "theta 0 is its z"})
+
+
+def _picture(context: CaseContext, path: Path) -> Path:
+    """The CT through the target, with what was found of the body and beside it."""
+    explained = context.explain(0.0, 0.0)
+    write_sheet(draw_slices(Subject(context.case, context.anatomy, Pick(explained.candidates, 0))), path)
+    return path
 
 
 def _source(place: str) -> str:
@@ -97,7 +132,9 @@ def init_text(run: InitRun) -> str:
         f"  structures     {roles}, of {', '.join(_source(one.source) for one, _ in parts.sources)}",
         f"  target         {position} mm {parts.space}, in {parts.structure or 'no structure'}",
         f"  region         {parts.region}",
-        "  needle         200 mm, shaft 150 mm, diameter 1.2 mm",
+        f"  needle         {needle_text(run.context.case).removeprefix('needle ')}",
+        f"  looked         {sides_text(run.context.sides)}",
+        *([] if run.picture is None else [f"  look at        {run.picture}"]),
         f"next: run-twin search {run.path.parent}",
     ]
     return "\n".join(lines)
