@@ -210,7 +210,8 @@ class _Looker:
         wanted = [one for one in left if self._wanted.takes("labels", self._name(one.name))]
         lost = {one.name: said for one in wanted if (said := one if self._only else self._like_structure(one))}
         if lost:
-            self._found.problems.append(not_read([*lost.values()], self._only or "files", self._folder))
+            with self._noting(self._name(next(iter(lost)))):
+                raise not_read([*lost.values()], self._only or "files", self._folder)
         self._found.passed += [(self._name(one.name), one.what or NOT_READ) for one in left if one.name not in lost]
 
     def _like_structure(self, one: Entry) -> Entry | None:
@@ -268,7 +269,7 @@ class _Looker:
                     self._label_file(mask.file, self._place.volume(mask.file))
         if not masks:
             return
-        with self._noting():
+        with self._noting("FILE"):
             refuse_one_name([one.file for one in masks], where=self._folder)
         alone = len(masks) + len(empty) == len(names) and all(one.lower().endswith(MASK_ENDINGS) for one in names)
         alone = alone and not self._left_out
@@ -318,7 +319,7 @@ class _Looker:
     def _meshes(self, names: Sequence[str]) -> None:
         if not names:
             return
-        with self._noting():
+        with self._noting("FILE"):
             wanted = self._wanted
             found = mesh_folder(self._place, self._source, names, wanted.space, wanted.unit, wanted.up)
             self._found.segmentations.append(found)

@@ -308,10 +308,11 @@ def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
     freed = short & ~crossed & (candidates.path.skin_angle <= case.search.max_skin_angle)
     if freed.sum() <= candidates.safe.sum():
         return []
+    lengths = candidates.path.length[freed]
     return [
-        f"the needle is too short for {freed.sum()} of {len(candidates)} directions that nothing else speaks against: "
-        f"its longest path is {case.needle.longest_path_mm:g} mm, theirs are {candidates.path.length[freed].min():.0f} "
-        f"to {candidates.path.length[freed].max():.0f} mm"
+        f"the needle is too short for {short.sum()} of {len(candidates)} directions: its longest path is "
+        f"{case.needle.longest_path_mm:g} mm, and nothing else speaks against {freed.sum()} of {lengths.min():.0f} to "
+        f"{lengths.max():.0f} mm"
     ]
 
 

@@ -40,8 +40,8 @@ class Window:
 
     @property
     def wide_deg(self) -> float:
-        """Across the widest circle of directions in it, degrees: twice the largest safe cone, 0 where none is known."""
-        return 2.0 * float(np.degrees(np.nan_to_num(self.widest_cone)))
+        """Across a cone of the same solid angle, degrees."""
+        return 2.0 * float(np.degrees(np.arccos(1.0 - self.square_deg / SQUARE_DEGREES / (2.0 * np.pi))))
 
     @property
     def text(self) -> str:

@@ -8,6 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
@@ -15,6 +18,7 @@ from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.case.read_case import ALLOWED_CASE
 from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.init.case_text import with_image_seen
@@ -110,8 +114,14 @@ def _with_seen(start: Start, request: Request, context: CaseContext) -> str:
 
 
 def _picture(context: CaseContext, path: Path) -> Path:
-    """The CT through the target, with what was found of the body and beside it."""
-    explained = context.explain(0.0, 0.0)
+    """The CT through the target, toward a limb that was found, else toward what the body lies on, else the front."""
+    anatomy, case = context.anatomy, context.case
+    beside = next((one.mesh for one in anatomy.surroundings if one.name == ATTACHED_LIMB), anatomy.couch)
+    theta, beta = 0.0, 0.0
+    if beside is not None:
+        toward = (beside.bounds.mean(axis=0) - case.target_ct) * (1.0, 1.0, 0.0)
+        theta, beta = map(float, angles((toward / np.linalg.norm(toward)) @ case.T_ct_entry[:3, :3]))
+    explained = context.explain(theta, beta)
     write_sheet(draw_slices(Subject(context.case, context.anatomy, Pick(explained.candidates, 0))), path)
     return path
 
