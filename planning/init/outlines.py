@@ -78,7 +78,8 @@ def skin_problems(found: SkinOf, segmentations: Sequence[Segmentation]) -> Itera
     low, high = found.segmentation.surface(found.label).bounds
     held = [bool(np.all((one[0] >= low - SLACK_MM) & (one[1] <= high + SLACK_MM))) for one in boxes]
     if sum(held) < LEAST_HELD * len(held):
-        yield f"'{found.name}' is named like the skin, but holds {sum(held)} of the {len(held)} other structures"
+        noun = "meshes" if found.segmentation.voxel_ct is None else "structures"
+        yield f"'{found.name}' is named like the skin, but holds {sum(held)} of the {len(held)} other {noun}"
 
 
 class Agreement(NamedTuple):

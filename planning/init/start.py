@@ -160,7 +160,7 @@ def _checked(found: Found, point: Floats | None, request: Request) -> Body:
     problems = list(found.problems)
     cts, stated = _holding(found.cts, point), request.wanted.overrides.skin
     if len(cts) > 1:
-        what = f"several CTs: {', '.join(one.source for one in cts)}"
+        what = f"several CTs: {', '.join(one.source for one in cts)} (--ct says which)"
         problems.append(_problem(what, "several_cts", "--ct with the one that is meant"))
     if not found.segmentations and not problems:
         problems.append(_problem(f"no segmentation (label map, masks or meshes){_lies(found)}", "no_segmentation"))
@@ -229,7 +229,7 @@ def _doubled(segmentations: Sequence[Segmentation]) -> Iterator[str]:
     twice = [name for name, count in counts.items() if count > 1]
     if twice:
         sources = ", ".join(one.source for one in segmentations if set(one.names.values()) & set(twice))
-        yield f"{sources} hold structures of one name, such as '{twice[0]}'"
+        yield f"{sources} hold structures of one name, such as '{twice[0]}' (--segmentation says which)"
 
 
 def _refuse_outside(point: Floats, ct: Ct, skin: Skin, space: Space) -> None:

@@ -25,6 +25,9 @@ LEAST_OPEN = 0.1
 ROUND_ABOUT = ("front", "back", "right", "left")
 """The sides that are spoken of; through feet and head no image shows skin."""
 
+NOT_SHOWN = "lies on what no image shows"
+"""Of the back of a patient without a CT, while the front is open."""
+
 AXES = {"front": "anterior", "back": "posterior", "right": "right", "left": "left", "feet": "feet", "head": "head"}
 FRONT, BACK, WHOLE = '"bed"', '{ z = "posterior", x = "head" }', (0.0, 180.0)
 
@@ -82,7 +85,11 @@ def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
         is_open, searched = (float(cell[side & some].sum() / whole) for some in (free, within))
         near = float(np.fmin.reduce(paths.path_length[side]))
         sides.append(Side(name, is_open, searched, near, "" if is_open >= LEAST_OPEN else most[0]))
-    return tuple(sides)
+    front, back, *rest = sides
+    known = anatomy.scan is not None or case.ct.table == "none" or case.region == "phantom"
+    if front.is_open and not known:
+        back = back._replace(open=0.0, why=NOT_SHOWN)
+    return (front, back, *rest)
 
 
 def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) -> list[tuple[str, Bools]]:
