@@ -34,6 +34,12 @@ ALLOWED = (
 )
 
 
+PHANTOM = (
+    'region = "phantom": no limb is looked for, and what holds together is the phantom; it lies on nothing unless '
+    "[ct] table says so or something detached lies below it"
+)
+
+
 @dataclass(frozen=True)
 class Request:
     """What the user wants.
@@ -267,6 +273,8 @@ def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> 
     yield from carved_notes(parts.sources)
     if request.region is None:
         yield f'region = "{parts.region}" is told by the structures; --region says otherwise'
+    if parts.region == "phantom":
+        yield PHANTOM
     if parts.markers:
         names = ", ".join(one.source for one in parts.markers)
         yield f"{names}: may be markers, named in comments; without [registration] no arm is checked"

@@ -199,6 +199,7 @@ def test_a_phantom_is_taken_as_one(tmp_path, capfd):
     """The region is written, and no limb is looked for."""
     write_ct(tmp_path)
     write_labels(tmp_path, tuple(BALLS))
-    assert init(capfd, tmp_path, "--region", "phantom")[0] == 0
+    code, said = init(capfd, tmp_path, "--region", "phantom")
+    assert code == 0 and "no limb is looked for" in said
     context = prepare(tmp_path, arm=False)
     assert context.case.region == "phantom" and not [s for s in context.anatomy.checked if s.name == "attached_limb"]
