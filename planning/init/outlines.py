@@ -98,12 +98,12 @@ class Outlines:
     Attributes:
         segmentations: Of a folder.
         skin: Of the body.
-        stated: The structure that the skin is, or None.
+        stated: The names of those that a person states to be the skin, or to be left out.
     """
 
     segmentations: Sequence[Segmentation]
     skin: Skin
-    stated: str | None = None
+    stated: frozenset[str] = frozenset()
 
     @cached_property
     def _named(self) -> dict[str, tuple[TriangleMesh, Agreement]]:
@@ -118,7 +118,7 @@ class Outlines:
     def at(self, point_ct: Floats) -> frozenset[str]:
         """The names of those that are outlines of the body about a point (3,), LPS mm."""
         found = [name for name, (mesh, found) in self._named.items() if _is_one(found, mesh, point_ct)]
-        return frozenset(found if self.stated is None else [*found, self.stated])
+        return self.stated.union(found)
 
     def notes(self, point_ct: Floats) -> Iterator[str]:
         """What a person should know of those that are none, one sentence each."""

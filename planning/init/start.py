@@ -99,12 +99,12 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     skin = body.skin()
     if point is not None and body.ct is not None:
         _refuse_outside(point, body.ct, skin, space)
-    outlines = Outlines(found.segmentations, skin, None if body.structure is None else body.structure.name)
+    stated = dict(overrides.roles) | ({} if body.structure is None else {body.structure.name: "skin"})
+    gone = frozenset(name for name, kind in stated.items() if kind != "unknown")
+    outlines = Outlines(found.segmentations, skin, gone)
     target = _target(request, point, outlines)
     region = request.region or likely_region(names, target.holding.target)
-    left_out, stated = outlines.at(target.point_ct), dict(overrides.roles)
-    if body.structure is not None:
-        stated[body.structure.name] = "skin"
+    left_out = outlines.at(target.point_ct)
     parts = CaseParts(
         name=request.folder.resolve().name,
         space=space,

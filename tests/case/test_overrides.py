@@ -52,7 +52,7 @@ def write_masks(folder):
 
 def init(capfd, folder, *words):
     """Run it; returns exit code and stderr."""
-    code = main(["init", str(folder), *TARGET, *words])
+    code = main(["init", str(folder), *(() if any("--target" in word for word in words) else TARGET), *words])
     return code, capfd.readouterr().err
 
 
@@ -111,6 +111,15 @@ def test_roles_are_stated_by_name(tmp_path, capfd, write):
     assert code == 0 and "left out as stated (ignore)" in said
     found = roles(tmp_path)
     assert found["aorta"] == "unknown" and found["nodule"] == "target" and "odd" not in found
+
+
+def test_what_is_left_out_holds_no_target(tmp_path, capfd):
+    """Else the rest of the body would be the target's structure, and every path into it safe."""
+    write_ct(tmp_path)
+    write_labels(tmp_path, (*BALLS, "rest"))
+    assert init(capfd, tmp_path, "--target=-10,0,10", "--ignore", "rest")[0] == 0
+    context = prepare(tmp_path, arm=False)
+    assert context.case.own_target and "rest" not in roles(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,6 @@ from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.planning.search.sides import grid_of, sides_text
 from puncture_twin.twin.jobs.patient.run import SLICES
-from puncture_twin.twin.report.numbers import needle_text
 from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
 from puncture_twin.twin.report.slices.subject import Subject
 
@@ -135,6 +134,7 @@ def init_text(run: InitRun) -> str:
     """What was found, and the next command."""
     parts, counts = run.start.parts, Counter(row.kind for row in run.start.parts.rows)
     position = ", ".join(f"{one:.1f}" for one in to_lps(parts.target_ct[None], parts.space)[0])
+    needle = run.context.case.needle
     roles = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
     lines = [
         f"{run.path}",
@@ -142,7 +142,7 @@ def init_text(run: InitRun) -> str:
         f"  structures     {roles}, of {', '.join(_source(one.source) for one, _ in parts.sources)}",
         f"  target         {position} mm {parts.space}, in {parts.structure or 'no structure'}",
         f"  region         {parts.region}",
-        f"  needle         {needle_text(run.context.case).removeprefix('needle ')}",
+        f"  needle         {needle.length_mm:g} mm, shaft {needle.shaft_mm:g} mm, diameter {needle.diameter_mm:g} mm",
         f"  looked         {sides_text(run.context.sides)}",
         *([] if run.picture is None else [f"  look at        {run.picture}"]),
         f"next: run-twin search {run.path.parent}",
