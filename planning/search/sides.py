@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from puncture_twin.planning.case.entry import ANATOMICAL_LPS, GRID_SLACK, angles
 from puncture_twin.planning.geometry.crossings import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.search.explain import finite
 
 STEP = np.radians(10.0)
 """Between the directions that look around: each side has about a hundred of them."""
@@ -53,6 +54,10 @@ class Side(NamedTuple):
     def is_open(self) -> bool:
         """Whether it is a side to puncture from."""
         return self.open >= LEAST_OPEN
+
+    def document(self) -> dict[str, Any]:
+        """As it stands under ``sides`` of ``--json``."""
+        return {**self._asdict(), "nearest_mm": finite(self.nearest_mm)}
 
 
 class Grid(NamedTuple):

@@ -58,7 +58,7 @@ class InitRun:
             "target_structure": parts.structure,
             "structures": dict(Counter(row.kind for row in parts.rows)),
             "looked": sides_text(self.context.sides),
-            "sides": [side._asdict() for side in self.context.sides],
+            "sides": [side.document() for side in self.context.sides],
             "warnings": list(self.warnings),
             "findings": self.context.provenance()["findings"],
             "inputs": inputs_document(self.context.case.inputs),

@@ -105,7 +105,7 @@ class Run:
             "headline": found_windows.headline,
             "largest_window": None if largest is None else window_summary(found, largest),
             "looked": sides_text(self.context.sides, searched=True),
-            "sides": [side._asdict() for side in self.context.sides],
+            "sides": [side.document() for side in self.context.sides],
             "directions": len(found),
             "counts": found.counts(),
             "best": [window_summary(found, window) for window in windows[:MOST_WINDOWS]],
