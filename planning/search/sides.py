@@ -23,6 +23,9 @@ STEP = np.radians(10.0)
 LEAST_OPEN = 0.1
 """Of a side's solid angle: what is less than that open is no side to puncture from."""
 
+LEAST_SEARCHED = 0.4
+"""Of a side's: a grid about the front holds half of what is to the right and to the left."""
+
 ROUND_ABOUT = ("front", "back", "right", "left")
 """The sides that are spoken of; through feet and head no image shows skin."""
 
@@ -145,14 +148,14 @@ def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
         searched: Whether the case's grid counts: what it does not hold is named.
     """
     spoken = [side for side in sides if side.name in ROUND_ABOUT]
-    here = [side.name for side in spoken if (side.searched >= 1.0 - LEAST_OPEN if searched else side.is_open)]
+    here = [side.name for side in spoken if (side.searched >= LEAST_SEARCHED if searched else side.is_open)]
     parts = [_listed(here) or "no side"]
     for why in dict.fromkeys(side.why for side in spoken if not side.is_open):
         names = [side.name for side in spoken if side.why == why]
         are = why.replace("is ", "are ", 1).replace("lies ", "lie ", 1)
         parts.append(f"the {_listed(names)} {why if len(names) == 1 else are}")
     missed = [side for side in spoken if searched and side.is_open and side.name not in here]
-    parts += [f"not all of the {side.name}, where skin is {side.nearest_mm:.0f} mm away" for side in missed]
+    parts += [f"not the {side.name}, where skin is {side.nearest_mm:.0f} mm away" for side in missed]
     return "; ".join(parts)
 
 
