@@ -16,7 +16,7 @@ from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.finder import Markers
-from puncture_twin.planning.init.overrides import with_keys, with_line
+from puncture_twin.planning.init.overrides import STATED, with_keys, with_line
 from puncture_twin.planning.init.segmentation import Assigned, Segmentation, quoted
 
 HEAD = """# Written by `init`: a start. Look at the roles and margins below before any result is trusted.
@@ -87,6 +87,7 @@ class CaseParts:
         skin: What the skin is, for a person: the CT, or a structure.
         sources: Each segmentation with what the case says of its structures.
         markers: Lists of points.
+        left_out: The files that a person states to be left out.
         keys: Key of the case to its value, where a person states it.
     """
 
@@ -100,6 +101,7 @@ class CaseParts:
     skin: str
     sources: tuple[tuple[Segmentation, Sequence[Assigned]], ...]
     markers: tuple[Markers, ...]
+    left_out: tuple[str, ...]
     keys: Mapping[str, str]
 
     @property
@@ -124,7 +126,10 @@ def case_text(parts: CaseParts) -> str:
     count = sum(row.kind != "ignore" for row in parts.rows) + (not of_structure)
     sections = "\n".join(segmentation.section(rows) for segmentation, rows in parts.sources)
     errors = _errors_text([segmentation for segmentation, _ in parts.sources])
-    text = head + skin + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
+    gone = "".join(
+        f"# Left out as {STATED}, so that what it shows counts as free: {quoted(one)}\n" for one in parts.left_out
+    )
+    text = head + skin + gone + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
     return with_keys(text, parts.keys)
 
 

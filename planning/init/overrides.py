@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections.abc import Collection, Iterable, Mapping
@@ -28,6 +29,9 @@ OWN_OPTION: Mapping[str, str] = MappingProxyType(
     }
 )
 """Keys by which `init` decides other things, so that each has an option of its own."""
+
+SKIN, SKIN_ROLE = "skin", 'role = "skin"'
+"""The structure whose ``cut`` is a key too, and the line after which that stands."""
 
 LISTS = frozenset(("structure", "structures", "obstacle", "end", "schema"))
 """What `--set` cannot write: tables that stand several times, and what belongs to the file."""
@@ -81,15 +85,15 @@ def overrides_of(skin: str | None, ignore: Iterable[str], unknown: Iterable[str]
         if not sign or not re.fullmatch(r"[A-Za-z_]+(\.[A-Za-z_]+)*", key):
             raise InputError(f"'{text[:80]}'", where="--set", allowed="KEY=VALUE, such as ct.arms=none", code="no_key")
         table = key.partition(".")[0]
-        if key in OWN_OPTION or table in LISTS or table not in {f.alias or n for n, f in CaseFile.model_fields.items()}:
+        tables = {one.alias or name for name, one in CaseFile.model_fields.items()} - LISTS
+        if key in OWN_OPTION or (table not in tables and key != f"{SKIN}.cut"):
             allowed = OWN_OPTION.get(key, "a key of the case's tables (docs/reference/case.md), such as ct.arms=none")
             raise InputError(f"key '{key}'", where="--set", allowed=allowed, code="no_key")
-        keys[key] = value if _is_toml(value) else _quoted(value)
+        keys[key] = value if _is_toml(value) else json.dumps(value)
     roles = dict.fromkeys(ignore, "ignore")
     if both := sorted(set(unknown) & set(roles)):
-        raise InputError(
-            f"'{both[0]}' is to be ignored too", where="--unknown", allowed="one of the two", code="no_role"
-        )
+        what = f"'{both[0]}' is to be ignored too"
+        raise InputError(what, where="--unknown", allowed="one of the two", code="two_roles")
     return Overrides(skin, roles | dict.fromkeys(unknown, "unknown"), keys)
 
 
@@ -98,10 +102,6 @@ def _is_toml(value: str) -> bool:
         return "\n" not in value and len(tomllib.loads(f"value = {value}")) == 1
     except tomllib.TOMLDecodeError:
         return False
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def with_keys(text: str, keys: Mapping[str, str], reasons: Mapping[str, str] = REASONS) -> str:
@@ -122,10 +122,11 @@ def with_line(text: str, table: str, line: str, name: str = "") -> str:
     """The text of a case with a line of a table: in place of a key's, else first in the table, made where it is not."""
     lines = text.split("\n")
     heads = [i for i, one in enumerate(lines) if one.startswith("[")]
-    if table and f"[{table}]" not in lines:
+    head = SKIN_ROLE if table == SKIN else f"[{table}]"
+    if table and head not in lines:
         lines[heads[-1] : heads[-1]] = [f"[{table}]", line, ""]  # before [end]
         return "\n".join(lines)
-    start = lines.index(f"[{table}]") + 1 if table else 0
+    start = lines.index(head) + 1 if table else 0
     stop = next((i for i in heads if i >= start), len(lines))
     there = [i for i in range(start, stop) if name and re.match(rf"{name}\s*=", lines[i])]
     at = there[0] if there else start

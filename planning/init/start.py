@@ -22,7 +22,7 @@ from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.init.case_text import CaseParts, case_text
-from puncture_twin.planning.init.finder import AIR_HU, Ct, Found, Markers, Wanted, find
+from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
 from puncture_twin.planning.init.outlines import Outlines, SkinOf, carved_notes, skin_of, skin_problems
 from puncture_twin.planning.init.roles import assign, likely_region, role_notes
 from puncture_twin.planning.init.segmentation import Place, Segmentation
@@ -118,6 +118,7 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
             (one, assign(one.names, region, target.holding, left_out, stated)) for one in found.segmentations
         ),
         markers=tuple(_markers_of_ct(found.markers, body.ct)),
+        left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),
         keys=overrides.keys,
     )
     notes = (*_notes(request, found, target, parts), *outlines.notes(target.point_ct))

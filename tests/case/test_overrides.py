@@ -84,7 +84,9 @@ def test_a_key_that_cannot_be_is_refused_and_leaves_nothing(tmp_path, capfd, wor
     assert not (tmp_path / "case.toml").exists()
 
 
-@pytest.mark.parametrize("text", ["arms", "nothing.here=1", "structure.name=liver", "region=chest", "end.structures=2"])
+@pytest.mark.parametrize(
+    "text", ["arms", "skin.role=avoid", "nothing.here=1", "structure.name=liver", "region=chest", "end.structures=2"]
+)
 def test_what_is_no_key_of_a_table_is_refused(text):
     """Lists of structures have options of their own, and so have region and target."""
     with pytest.raises(InputError) as refused:
@@ -144,6 +146,7 @@ def test_a_file_that_is_not_read_can_be_left_out(tmp_path, capfd):
     code, said = init(capfd, tmp_path, "--ignore", "seg/portal_vein.mgz")
     assert code == 0 and "portal_vein.mgz" in said
     assert roles(tmp_path).keys() >= set(BALLS)
+    assert "portal_vein.mgz" in (tmp_path / "case.toml").read_text()
 
 
 @pytest.mark.parametrize("name", ["skin", "body", "rest"])
@@ -174,8 +177,11 @@ def test_meshes_alone_start_with_the_skin_that_is_stated(tmp_path, capfd):
         ball(tmp_path / f"{name}.stl", radius, middle)
     code, said = init(capfd, tmp_path, "--unit", "mm")
     assert code == 2 and "surface" in said
-    assert init(capfd, tmp_path, "--unit", "mm", "--skin", "surface")[0] == 0
+    words = ("--unit", "mm", "--skin", "surface")
+    assert init(capfd, tmp_path, *words)[0] == 0
     assert set(roles(tmp_path)) == set(BALLS)
+    assert init(capfd, tmp_path, *words, "--force", "--set", "skin.cut=[]")[0] == 0
+    assert prepare(tmp_path, arm=False).case.skin_section.cut == ()
 
 
 def test_a_stated_skin_goes_before_the_cts_body(tmp_path, capfd):
