@@ -154,13 +154,20 @@ def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Fi
 
 def volume_ml(mesh: TriangleMesh) -> float:
     """What a closed surface encloses, ml."""
+    return float(_tetrahedra(mesh).sum()) / 6e3
+
+
+def _tetrahedra(mesh: TriangleMesh) -> Floats:
+    """Six times the volume between each triangle and the box's low corner, shape (n,), mm3, signed."""
     a, b, c = np.moveaxis(mesh.triangles - mesh.bounds[0], 1, 0)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6e3
+    return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)))
 
 
 def body_side(mesh: TriangleMesh, skin: Skin) -> str:
-    """The side of the body at which the middle of something lies: left, right, front or back."""
-    (x, y, _), half = mesh.bounds.mean(axis=0) - skin.mesh.bounds.mean(axis=0), np.ptp(skin.mesh.bounds, axis=0) / 2
+    """The side of the body at which a solid's centre of mass lies: left, right, front or back."""
+    low, weight = mesh.bounds[0], _tetrahedra(mesh)
+    middle = low + weight @ (mesh.triangles - low).sum(axis=1) / (4.0 * weight.sum())
+    (x, y, _), half = middle - skin.mesh.bounds.mean(axis=0), np.ptp(skin.mesh.bounds, axis=0) / 2
     if abs(x) / half[0] >= abs(y) / half[1]:
         return "left" if x > 0 else "right"
     return "back" if y > 0 else "front"

@@ -64,6 +64,7 @@ ERRORS = """
 # surface_mm = {known}  # by which contours may lie off; {reason}
 """
 PICTURE = "see slices.png"
+LEFT_OUT = f"# Left out, as {STATED}, so that what it shows counts as free: {{file}}\n"
 OF_VOXELS = "of {sources} by the voxels, at most; left out, every direction has its own"
 OF_MESHES = "of {sources} nobody knows it who did not draw them: left out it counts as 0, and every result says so"
 END = """
@@ -126,9 +127,7 @@ def case_text(parts: CaseParts) -> str:
     count = sum(row.kind != "ignore" for row in parts.rows) + (not of_structure)
     sections = "\n".join(segmentation.section(rows) for segmentation, rows in parts.sources)
     errors = _errors_text([segmentation for segmentation, _ in parts.sources])
-    gone = "".join(
-        f"# Left out as {STATED}, so that what it shows counts as free: {quoted(one)}\n" for one in parts.left_out
-    )
+    gone = "".join(LEFT_OUT.format(file=quoted(one)) for one in parts.left_out)
     text = head + skin + gone + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
     return with_keys(text, parts.keys)
 

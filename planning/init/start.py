@@ -34,6 +34,7 @@ ALLOWED = (
 )
 
 
+OUTSIDE_WAYS = "a point in the body, in mm, in the space that --space states; or --skin NAME for another skin"
 PHANTOM = (
     'region = "phantom": no limb is looked for, and what holds together is the phantom; it lies on nothing unless '
     "[ct] table says so or something detached lies below it"
@@ -250,7 +251,7 @@ def _refuse_outside(point: Floats, ct: Ct, skin: Skin, space: Space) -> None:
         place = "the body in" if _contains(grid, point) else "the CT"
         hint = readings_inside(point, space, in_body)
         what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
-        raise InputError(what, where="--target", allowed="a point in the body, in mm, in the space that --space states")
+        raise InputError(what, where="--target", allowed=OUTSIDE_WAYS)
 
 
 def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:

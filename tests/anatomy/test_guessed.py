@@ -6,6 +6,7 @@ import pytest
 from puncture_twin.planning.anatomy.anatomy import ball, body_side, guessed, volume_ml
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
 from puncture_twin.planning.base.findings import Severity
+from puncture_twin.planning.geometry.mesh import joined
 
 
 def test_a_guess_says_how_much_where_and_what_overrules_it():
@@ -31,3 +32,9 @@ def test_a_side_is_that_of_the_body(place, side):
     """Of LPS, measured in the body's own width and depth."""
     skin = skin_from_mesh(ball(np.zeros(3), 100.0))
     assert body_side(ball(np.array(place, float), 10.0), skin) == side
+
+
+def test_a_side_is_that_of_most_of_it():
+    """A large ball at the left and a speck far back are at the left, though the middle of their box is not."""
+    both = joined([ball(np.array([100.0, 0.0, 0.0]), 30.0), ball(np.array([60.0, 400.0, 0.0]), 1.0)])
+    assert body_side(both, skin_from_mesh(ball(np.zeros(3), 100.0))) == "left"
