@@ -120,12 +120,25 @@ def init(
     trust_labels: Annotated[
         bool, typer.Option("--trust-labels", help="You have looked: structures lie right.")
     ] = False,
+    skin: Annotated[
+        str | None, typer.Option("--skin", metavar="NAME", help="Structure that is the skin; else the CT's body.")
+    ] = None,
+    ignore: Annotated[
+        list[str] | None, typer.Option("--ignore", metavar="NAME", help="Structure or file to be left out.")
+    ] = None,
+    unknown: Annotated[
+        list[str] | None, typer.Option("--unknown", metavar="NAME", help="Structure that no path may cross.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Of the case, such as ct.arms=none.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a case.toml that is there.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write FOLDER/case.toml from what is in the folder: roles and margins from the table of default roles."""
     from puncture_twin.planning.case.case_file import Region
     from puncture_twin.planning.init.finder import Wanted
+    from puncture_twin.planning.init.overrides import overrides_of
     from puncture_twin.planning.init.start import Request
     from puncture_twin.twin.jobs.patient.init_job import init_case, init_text
 
@@ -135,9 +148,11 @@ def init(
         raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
     if hit_radius is not None and (target is None or not 0 < hit_radius <= 100):
         raise InputError(f"{hit_radius:g}", where="--hit-radius", allowed="mm, above 0, at most 100, beside --target")
-    wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation, up)
+    stated = [*(settings or []), *(["search.trust_labels=true"] if trust_labels else [])]
+    overrides = overrides_of(skin, ignore or [], unknown or [], stated)
+    wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation, up, overrides)
     with progress_display() as progress:
-        request = Request(folder, target, target_label, region, wanted, space is not None, hit_radius, trust_labels)
+        request = Request(folder, target, target_label, region, wanted, space is not None, hit_radius)
         run = init_case(request, force=force, watcher=progress)
     for warning in run.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -21,7 +21,7 @@ from puncture_twin.planning.anatomy.structure import Role as Role, Structure as 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.findings import Finding
+from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.case.case import Case
@@ -40,10 +40,9 @@ OUTSIDE_NOT_KNOWN = (
     "outside of the body: not known (no CT; [ct] file names one), so table, clothes and arms count as air"
 )
 
-LIMB_ATTACHED = (
-    f"a limb seems to be pressed against the part of the body that holds the target; paths through it are "
-    f"unknown_region ({ATTACHED_LIMB})"
-)
+LIMB_ATTACHED = "a limb seems to be pressed against the part of the body that holds the target"
+NO_ARMS, NO_TABLE = '[ct] arms = "none"', '[ct] table = "none"'
+"""The lines that overrule the rules."""
 
 UNNAMED_FREE = '[ct] unnamed = "free": what the CT shows inside the body beside the structures is not checked'
 
@@ -116,6 +115,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     _check_demands(case, structures)
     structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
+    guesses: list[Finding] = []
     couch: TriangleMesh | None = None
     scan, left_out = loader.scan(case.skin_section, skin, structures), loader.unnamed_warnings()
     if scan is None:
@@ -123,8 +123,8 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     else:
         shown = scan.outside(case.ct.air_hu)
         outside, couch = _outside(case, scan, shown, structures, loader.warnings), shown.couch
-        if any(structure.name == ATTACHED_LIMB for structure in outside):
-            loader.warnings.append(LIMB_ATTACHED)
+        for limb in (structure.mesh for structure in outside if structure.name == ATTACHED_LIMB):
+            guesses.append(guessed(ATTACHED_LIMB, LIMB_ATTACHED, limb.volume / 1e3, body_side(limb, skin), NO_ARMS))
         if case.ct.unnamed == "free":
             loader.warnings.append(UNNAMED_FREE)
         structures.extend(_unnamed(case, scan, structures))
@@ -134,7 +134,35 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     read = {one.name: one.mesh for one in structures if one.source != OWN_TARGET}  # the ball is ours
     of_meshes = kept_mesh_warnings(read, cache)
     warnings = (*loader.warnings, *beyond.warnings, *left_out, *skin.warnings, *of_meshes)
-    return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch)
+    return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch, tuple(guesses))
+
+
+def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Finding:
+    """What a rule guesses of an image: how much, where, which picture shows it, and the line that overrules it.
+
+    Args:
+        code: Of the finding; the structure that paths would pass through, where there is one.
+        what: The guess.
+        volume: Of what it takes, ml.
+        side: Of the body, as `body_side` names it.
+        overrule: The line of the case.
+    """
+    said = (
+        f"{what}: {volume / 1000:.1f} l at its {side} side (slices.png shows it); paths through it are unknown_region "
+        f"({code}); if that is wrong: {overrule}"
+    )
+    return Finding(code, Severity.WARNING, said, {"volume_ml": volume, "side": side, "overruled_by": overrule})
+
+
+def body_side(mesh: TriangleMesh, skin: Skin) -> str:
+    """The side of the body at which a solid's centre of mass lies: left, right, front or back."""
+    a, b, c = np.moveaxis(mesh.triangles - mesh.bounds[0], 1, 0)
+    weight = np.einsum("ij,ij->i", a, np.cross(b, c))  # of the tetrahedron between each triangle and the corner
+    middle = mesh.bounds[0] + weight @ (a + b + c) / (4.0 * weight.sum())
+    (x, y, _), half = middle - skin.mesh.bounds.mean(axis=0), np.ptp(skin.mesh.bounds, axis=0) / 2
+    if abs(x) / half[0] >= abs(y) / half[1]:
+        return "left" if x > 0 else "right"
+    return "back" if y > 0 else "front"
 
 
 def _outside(

@@ -36,6 +36,11 @@ Rgb = tuple[int, int, int]
 SAFE: Rgb = (0, 158, 115)
 """Safe, where no shade is meant: legends, the corridor in 3D."""
 
+UNSEEN_AIR: Rgb = (190, 190, 196)
+"""An unknown region outside of the body; one within it is darker, as `REASON_COLOURS` has it."""
+
+UNSEEN_AIR_TEXT, NOT_SEARCHED_TEXT = "unknown beside the body (image ends, or no air)", "outside the grid, not searched"
+
 REASON_COLOURS = MappingProxyType(
     {
         Reason.NO_SKIN_ENTRY: (221, 221, 221),
@@ -67,7 +72,7 @@ REASON_TEXT = MappingProxyType(
         Reason.TOUCH_LIKELY: "too likely to touch a structure",
         Reason.UNSAFE_WHEN_BREATHING: "unsafe at a phase of the breath",
         Reason.NEEDLE_BENDS: "may bend into a structure's margin",
-        Reason.UNKNOWN_REGION: "unknown region (image ends, or not named)",
+        Reason.UNKNOWN_REGION: "unknown in the body (image ends, or not named)",
         Reason.UNREACHABLE: "arm cannot reach the pose",
         Reason.ARM_COLLISION: "arm would collide",
         Reason.INSERTION_BLOCKED: "straight insertion not drivable",

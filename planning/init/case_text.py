@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, Anatomy, body_side
+from puncture_twin.planning.anatomy.body.field_of_view import SIDES
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables.errors_section import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.finder import Markers
+from puncture_twin.planning.init.overrides import STATED, with_keys, with_line
 from puncture_twin.planning.init.segmentation import Assigned, Segmentation, quoted
 
 HEAD = """# Written by `init`: a start. Look at the roles and margins below before any result is trusted.
@@ -36,14 +39,17 @@ diameter_mm = 1.2
 theta_deg = [0, 90]
 step_deg = 2.0
 max_skin_angle_deg = 60.0
-{trust}
+
 """
-TRUSTED = "trust_labels = true  # a person has looked: structures lie right\n"
 OWN_TARGET = "hit_radius_mm = {radius!r}  # it lies in no structure: what is hit is this ball about it"
 SKIN_OF_CT = """[[structure]]
 name = "skin"
 ct = {ct}  # the body is found in the CT
 role = "skin"
+
+"""
+CT_BESIDE = """[ct]
+file = {ct}
 
 """
 REGISTRATION = """
@@ -57,6 +63,8 @@ ERRORS = """
 # [errors]
 # surface_mm = {known}  # by which contours may lie off; {reason}
 """
+PICTURE = "see slices.png"
+LEFT_OUT = f"# Left out, as {STATED}, so that what it shows counts as free: {{file}}\n"
 OF_VOXELS = "of {sources} by the voxels, at most; left out, every direction has its own"
 OF_MESHES = "of {sources} nobody knows it who did not draw them: left out it counts as 0, and every result says so"
 END = """
@@ -76,10 +84,12 @@ class CaseParts:
         target_ct: Shape (3,), LPS mm.
         structure: Which holds the target, or None.
         hit_radius_mm: Of the ball that is hit, where none does.
-        ct: The CT whose body is the skin, or None where a mesh is.
+        ct: The CT, or None.
+        skin: What the skin is, for a person: the CT, or a structure.
         sources: Each segmentation with what the case says of its structures.
         markers: Lists of points.
-        trust_labels: Whether a person has seen that the structures lie right.
+        left_out: The files that a person states to be left out.
+        keys: Key of the case to its value, where a person states it.
     """
 
     name: str
@@ -89,9 +99,11 @@ class CaseParts:
     structure: str | None
     hit_radius_mm: float
     ct: str | None
+    skin: str
     sources: tuple[tuple[Segmentation, Sequence[Assigned]], ...]
     markers: tuple[Markers, ...]
-    trust_labels: bool
+    left_out: tuple[str, ...]
+    keys: Mapping[str, str]
 
     @property
     def rows(self) -> list[Assigned]:
@@ -109,13 +121,43 @@ def case_text(parts: CaseParts) -> str:
         space=parts.space,
         position=", ".join(repr(float(one)) for one in position),
         structure=own if parts.structure is None else f"structure = {quoted(parts.structure)}",
-        trust=TRUSTED if parts.trust_labels else "",
     )
-    skin = "" if parts.ct is None else SKIN_OF_CT.format(ct=quoted(parts.ct))
-    count = sum(row.kind != "ignore" for row in parts.rows) + (parts.ct is not None)
+    of_structure = any(row.kind == "skin" for row in parts.rows)
+    skin = "" if parts.ct is None else (CT_BESIDE if of_structure else SKIN_OF_CT).format(ct=quoted(parts.ct))
+    count = sum(row.kind != "ignore" for row in parts.rows) + (not of_structure)
     sections = "\n".join(segmentation.section(rows) for segmentation, rows in parts.sources)
     errors = _errors_text([segmentation for segmentation, _ in parts.sources])
-    return head + skin + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
+    gone = "".join(LEFT_OUT.format(file=quoted(one)) for one in parts.left_out)
+    text = head + skin + gone + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
+    return with_keys(text, parts.keys)
+
+
+IMAGE = """# What the image shows, as rules find it. A line without its # states it: then no rule guesses.
+# arms: {arms}:
+# arms = "none"
+# table: {table}:
+# table = "none"
+# beyond: {beyond}:
+# beyond_mm = 150"""
+
+
+def with_image_seen(text: str, anatomy: Anatomy) -> str:
+    """The text of a case with what rules find in its CT, as comments that state it where a person agrees."""
+    if anatomy.scan is None:
+        return text
+    limbs = [one.numbers for one in anatomy.findings if one.code == ATTACHED_LIMB]
+    arms = [f"{float(str(one['volume_ml'])) / 1000:.1f} l at the {one['side']} side, {PICTURE}" for one in limbs]
+    couch = None if anatomy.couch is None else f"at the {body_side(anatomy.couch, anatomy.skin)} side, {PICTURE}"
+    view = anatomy.skin.field_of_view
+    cut = [] if view is None else [name for name, (axis, end) in SIDES.items() if view.cut[axis, end]]
+    seen = IMAGE.format(
+        arms=f"{arms[0]}; if that is no arm" if arms else "none found; to state it",
+        table="none found; to state it" if couch is None else f"{couch}; if the body lies on nothing",
+        beyond=f"the image cuts the body at its {', '.join(cut)} side; the body is at most so much wider there"
+        if cut
+        else "the image shows the body whole; where it does not, the body is at most so much wider",
+    )
+    return with_line(text, "ct", seen)
 
 
 def _errors_text(sources: Sequence[Segmentation]) -> str:

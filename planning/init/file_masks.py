@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.tables.structures_section import StructuresSection
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.init.segmentation import Assigned, Place, quoted, rules_text
@@ -48,6 +50,15 @@ class FileMasks:
         """The surface of one structure, LPS mm."""
         surfaces, value = self.parts[self.names[label]]
         return surfaces.label(value)
+
+    def skin(self, label: int) -> Skin:
+        """None of them: a case takes its skin from a CT, a mesh, or a label of a map.
+
+        Raises:
+            InputError: Always.
+        """
+        what = f"'{self.names[label]}' cannot be the skin, as one of the overlapping structures of a file"
+        raise InputError(what, where=self.source, allowed="a CT, a mesh, or a label of a label map", code="no_skin")
 
     def section(self, rows: Sequence[Assigned]) -> str:
         """A ``[[structures]]`` of the file."""

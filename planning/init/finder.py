@@ -38,6 +38,7 @@ from puncture_twin.planning.geometry.units import Unit
 from puncture_twin.planning.init.file_masks import file_masks
 from puncture_twin.planning.init.label_files import Mask, Masks, is_named_by_table, label_file, mask_of
 from puncture_twin.planning.init.mesh_folder import is_mesh, mesh_folder
+from puncture_twin.planning.init.overrides import Overrides
 from puncture_twin.planning.init.segmentation import Place, Segmentation
 
 DEPTH = 2
@@ -51,6 +52,7 @@ MANY_PAIRS, LEAST_ALIKE = 1000, 0.5
 MOST_AIR = 200
 """Up to here the most frequent value of an image without Hounsfield units is taken for air that is stored from 0 on."""
 OTHER = "other"
+LEFT_OUT = "--ignore"
 DRAWN = {Kind.SEGMENTATION: "seg", Kind.STRUCTURE_SET: "rtstruct"}
 """DICOM files of structures, and the key of the case for each."""
 POINT_ENDINGS = (".csv", ".mrk.json", ".fcsv")
@@ -71,6 +73,7 @@ class Wanted:
         up: The axis of meshes that is up.
         ct: The CT, where there are several.
         segmentation: The label map or folder, where there are several.
+        overrides: What else a person states.
     """
 
     space: Space
@@ -79,9 +82,12 @@ class Wanted:
     ct: str | None = None
     segmentation: str | None = None
     up: Up | None = None
+    overrides: Overrides = field(default_factory=Overrides)
 
     def takes(self, kind: str, name: str) -> bool:
         """Whether a file may be the CT (``ct``), or a segmentation (``labels``)."""
+        if self.overrides.leaves_out(name):
+            return False
         stated = self.ct if kind == "ct" else self.segmentation
         return stated is None or name == stated or name.startswith(f"{stated.rstrip('/')}/")
 
@@ -168,6 +174,7 @@ class _Looker:
         self._source = folder.relative_to(place.folder).as_posix()
         self._names = [self._name(one.name) for one in listed if one.what == FILE]
         self._read: set[str] = set()
+        self._left_out = [name for one in listed if wanted.overrides.leaves_out(name := self._name(one.name))]
         self._only = ""
 
     def _name(self, entry: str) -> str:
@@ -178,7 +185,9 @@ class _Looker:
         self._dicom()
         volumes = [name for name in self._names if name.lower().endswith(NIFTI_ENDINGS + NRRD_ENDINGS)]
         meshes = [name for name in self._names if is_mesh(name)]
-        self._read.update(volumes, meshes, (self._name(one) for one in entered if not self._hollow(one)))
+        named = (self._name(one) for one in entered if not self._hollow(one))
+        self._read.update(volumes, meshes, named, self._left_out)
+        self._found.passed += [(name, LEFT_OUT) for name in self._left_out]
         self._volumes(volumes)
         if meshes and not volumes:
             self._only = "meshes"
@@ -208,7 +217,8 @@ class _Looker:
         wanted = [one for one in left if self._wanted.takes("labels", self._name(one.name))]
         lost = {one.name: said for one in wanted if (said := one if self._only else self._like_structure(one))}
         if lost:
-            self._found.problems.append(not_read([*lost.values()], self._only or "files", self._folder))
+            with self._noting(self._name(next(iter(lost)))):
+                raise not_read([*lost.values()], self._only or "files", self._folder)
         self._found.passed += [(self._name(one.name), one.what or NOT_READ) for one in left if one.name not in lost]
 
     def _like_structure(self, one: Entry) -> Entry | None:
@@ -239,32 +249,37 @@ class _Looker:
         self._found.passed += [(self._source, f"{count} {kind}") for kind, count in sorted(others.items())]
 
     @contextmanager
-    def _noting(self) -> Iterator[None]:
-        """What is refused within is a problem, one of all."""
+    def _noting(self, name: str = "") -> Iterator[None]:
+        """What is refused within is a problem, one of all; a file can be left out."""
         try:
             yield
         except InputError as error:
-            self._found.problems.append(error)
+            way = f"; or --ignore {name}, so that what it shows counts as free" if name else ""
+            code, numbers = error.code, error.numbers
+            self._found.problems.append(
+                type(error)(error.what, where=error.where, allowed=error.allowed + way, code=code, numbers=numbers)
+            )
 
     def _volumes(self, names: Sequence[str]) -> None:
         """CTs and label maps one by one; masks together, as a folder of masks where it holds nothing else."""
         masks: list[Mask] = []
         empty: list[str] = []
         for name in names:
-            with self._noting():
+            with self._noting(name):
                 self._volume(name, masks, empty)
         aside = {one.source for one in self._found.cts} | {name for name, _ in self._found.passed}
         only = len(set(names) - aside) == 1
         for mask in tuple(masks):
-            with self._noting():
+            with self._noting(mask.file):
                 if is_named_by_table(self._place, mask.file, mask.label, only):
                     masks.remove(mask)
                     self._label_file(mask.file, self._place.volume(mask.file))
         if not masks:
             return
-        with self._noting():
+        with self._noting("FILE"):
             refuse_one_name([one.file for one in masks], where=self._folder)
         alone = len(masks) + len(empty) == len(names) and all(one.lower().endswith(MASK_ENDINGS) for one in names)
+        alone = alone and not self._left_out
         self._only = "masks" if alone else ""
         numbered = dict(enumerate(masks, start=1))
         said = () if alone or not empty else (f"empty masks, so that nothing is there: {', '.join(empty)}",)
@@ -311,7 +326,7 @@ class _Looker:
     def _meshes(self, names: Sequence[str]) -> None:
         if not names:
             return
-        with self._noting():
+        with self._noting("FILE"):
             wanted = self._wanted
             found = mesh_folder(self._place, self._source, names, wanted.space, wanted.unit, wanted.up)
             self._found.segmentations.append(found)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.anatomy.default_roles import default_role
+from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
@@ -22,7 +23,7 @@ from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES
 from puncture_twin.planning.formats.labels.numbering import likely_numbering
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.init.segmentation import Assigned, Place, margin_line, quoted, rules_text
+from puncture_twin.planning.init.segmentation import Assigned, Place, margin_line, quoted, rules_text, skin_text
 
 NUMBERING_FOUND = "{source}: numbered as {naming}, told by where its organs lie"
 NUMBERING_UNSURE = (
@@ -62,10 +63,15 @@ class LabelFile:
         """The surface of one label, LPS mm."""
         return self.surfaces.label(label)
 
+    def skin(self, label: int) -> Skin:
+        """One label as the skin."""
+        return self.surfaces.imaged(label).skin()
+
     def section(self, rows: Sequence[Assigned]) -> str:
         """A ``[[structures]]`` of the map."""
         naming = "" if self.naming is None else f"naming = {quoted(self.naming)}\n"
-        return f"[[structures]]\nlabelmap = {quoted(self.source)}\n{naming}{rules_text(rows)}"
+        skins = (skin_text(row.name, self.source, row.label) for row in rows if row.kind == "skin")
+        return f"[[structures]]\nlabelmap = {quoted(self.source)}\n{naming}{rules_text(rows)}{''.join(skins)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +127,17 @@ class Masks:
         mask = self.masks[label]
         return self.place.volume(mask.file).label(mask.label)
 
+    def skin(self, label: int) -> Skin:
+        """One mask as the skin."""
+        mask = self.masks[label]
+        return self.place.volume(mask.file).imaged(mask.label).skin()
+
     def section(self, rows: Sequence[Assigned]) -> str:
         """A ``[[structures]]`` of the folder, or each mask as a ``[[structure]]``."""
         if self.whole_folder:
-            return f"[[structures]]\nmasks = {quoted(self.source)}\n{rules_text(rows)}"
+            masks = ((row.name, self.masks[row.label]) for row in rows if row.kind == "skin")
+            skins = (skin_text(name, mask.file, mask.label) for name, mask in masks)
+            return f"[[structures]]\nmasks = {quoted(self.source)}\n{rules_text(rows)}{''.join(skins)}"
         return "\n".join(self._single(row) for row in rows if row.kind != "ignore")
 
     def _single(self, row: Assigned) -> str:

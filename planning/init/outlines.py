@@ -36,6 +36,51 @@ POINTS, PLACES = 4_000, 200_000
 lie 3 mm apart, so that what is within 8 mm is found."""
 
 
+LEAST_HELD = 0.9
+"""Of the other structures, which the skin holds: a line or a bed may have been drawn too, and lies outside."""
+
+SLACK_MM = 2.0
+"""So far a structure may reach out of the skin's box: both were drawn."""
+
+
+class SkinOf(NamedTuple):
+    """A structure that is the skin."""
+
+    segmentation: Segmentation
+    label: int
+
+    @property
+    def name(self) -> str:
+        """Of the structure."""
+        return self.segmentation.names[self.label]
+
+    def skin(self) -> Skin:
+        """The skin that it is."""
+        return self.segmentation.skin(self.label)
+
+
+def skin_of(segmentations: Sequence[Segmentation], stated: str | None) -> SkinOf | None:
+    """The structure that is stated to be the skin, else the largest that is named like the body; None for neither."""
+
+    def extent(one: SkinOf) -> float:
+        return float(np.ptp(one.segmentation.surface(one.label).bounds, axis=0).prod())
+
+    every = (SkinOf(one, label) for one in segmentations for label in one.names)
+    named = [one for one in every if (named_like_body(one.name) if stated is None else one.name == stated)]
+    return max(named, key=extent, default=None)
+
+
+def skin_problems(found: SkinOf, segmentations: Sequence[Segmentation]) -> Iterator[str]:
+    """Why what is named like the skin cannot be it: what lies outside of a skin counts as air beside the patient."""
+    every = [SkinOf(one, label) for one in segmentations for label in one.names]
+    boxes = [one.segmentation.surface(one.label).bounds for one in every if one != found]
+    low, high = found.segmentation.surface(found.label).bounds
+    held = [bool(np.all((one[0] >= low - SLACK_MM) & (one[1] <= high + SLACK_MM))) for one in boxes]
+    if sum(held) < LEAST_HELD * len(held):
+        noun = "meshes" if found.segmentation.voxel_ct is None else "structures"
+        yield f"'{found.name}' is named like the skin, but holds {sum(held)} of the {len(held)} other {noun}"
+
+
 class Agreement(NamedTuple):
     """How far a structure is the body's outline."""
 
@@ -52,10 +97,12 @@ class Outlines:
     Attributes:
         segmentations: Of a folder.
         skin: Of the body.
+        stated: The names of those that a person states to be the skin, or to be left out.
     """
 
     segmentations: Sequence[Segmentation]
     skin: Skin
+    stated: frozenset[str] = frozenset()
 
     @cached_property
     def _named(self) -> dict[str, tuple[TriangleMesh, Agreement]]:
@@ -69,7 +116,8 @@ class Outlines:
 
     def at(self, point_ct: Floats) -> frozenset[str]:
         """The names of those that are outlines of the body about a point (3,), LPS mm."""
-        return frozenset(name for name, (mesh, found) in self._named.items() if _is_one(found, mesh, point_ct))
+        found = [name for name, (mesh, found) in self._named.items() if _is_one(found, mesh, point_ct)]
+        return self.stated.union(found)
 
     def notes(self, point_ct: Floats) -> Iterator[str]:
         """What a person should know of those that are none, one sentence each."""

@@ -18,7 +18,7 @@ from puncture_twin.planning.anatomy.default_roles import (
 )
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.formats.labels.naming import DEMANDING
-from puncture_twin.planning.init.segmentation import Assigned
+from puncture_twin.planning.init.segmentation import STATED, Assigned
 
 LEAST_SHOWN = 0.3
 """Of a region's usual organs; with fewer the region is found by nothing."""
@@ -49,7 +49,13 @@ class Holding(NamedTuple):
     others: frozenset[str]
 
 
-def assign(names: Mapping[int, str], region: str, holding: Holding, outlines: Collection[str] = ()) -> list[Assigned]:
+def assign(
+    names: Mapping[int, str],
+    region: str,
+    holding: Holding,
+    outlines: Collection[str] = (),
+    stated: Mapping[str, str] = MappingProxyType({}),
+) -> list[Assigned]:
     """What a case says of each structure, by label.
 
     Args:
@@ -57,8 +63,20 @@ def assign(names: Mapping[int, str], region: str, holding: Holding, outlines: Co
         region: As the case states it.
         holding: What holds the target.
         outlines: Of those that are named like the body the ones that are its outline.
+        stated: Name to the kind that a person states: ``skin``, ``ignore`` or ``unknown``.
     """
-    return [_assigned(label, names[label], region, holding, outlines) for label in sorted(names)]
+    return [
+        _assigned(label, names[label], region, holding, outlines)
+        if names[label] not in stated
+        else _stated(label, names[label], region, stated[names[label]])
+        for label in sorted(names)
+    ]
+
+
+def _stated(label: int, name: str, region: str, kind: str) -> Assigned:
+    line = default_role(name, region)
+    line = line if line is not None and line.kind in DEMANDING else UNKNOWN_NAME
+    return Assigned(label, name, kind, line.margin_mm, STATED)
 
 
 def _assigned(label: int, name: str, region: str, holding: Holding, outlines: Collection[str]) -> Assigned:
@@ -89,7 +107,7 @@ def role_notes(rows: Sequence[Assigned], holding: Holding) -> Iterator[str]:
         yield f"not in the table of default roles, so avoided by {UNKNOWN_NAME.margin_mm:g} mm: {_list(unknown)}"
     if left_open := [row.name for row in rows if row.line == NOT_ANNOTATED and row.kind == "unknown"]:
         yield f"{NOT_ANNOTATED.group}, so paths through them are unknown_region: {_list(left_open)}"
-    doubted = [row.name for row in rows if row.kind == "unknown" and row.line != NOT_ANNOTATED]
+    doubted = [row.name for row in rows if row.kind == "unknown" and row.line not in {NOT_ANNOTATED, STATED}]
     if doubted:
         yield (
             f"they hold the target too, and are not known as organs that a needle crosses, so paths through them are "
@@ -98,7 +116,9 @@ def role_notes(rows: Sequence[Assigned], holding: Holding) -> Iterator[str]:
     crossed = [row.name for row in rows if row.name in holding.others and row.kind == "traverse"]
     if crossed:
         yield f"they hold the target too, so paths cross them (traverse): {_list(crossed)}"
-    outlines = [row.name for row in rows if row.kind == "ignore"]
+    if left_out := [row.name for row in rows if row.kind == "ignore" and row.line == STATED]:
+        yield f"left out as stated (ignore), so that paths through them may be safe: {_list(left_out)}"
+    outlines = [row.name for row in rows if row.kind == "ignore" and row.line != STATED]
     if outlines:
         yield f"taken for the outline of the body, so not checked (ignore): {_list(outlines)}"
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from puncture_twin.planning.anatomy.default_roles import NOT_ANNOTATED, DefaultRole
+from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
@@ -20,6 +21,9 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 CASE_FILE = "case.toml"
 """What the new case will be called."""
+
+STATED = DefaultRole("stated", (), "unknown", 0.0, "stated to init")
+"""Of a role that a person states."""
 
 HOLDS_TARGET = "it holds the target too, and its name is not known as that of an organ that a needle crosses"
 """Why a structure is unknown."""
@@ -67,6 +71,13 @@ class Segmentation(Protocol):
 
     def surface(self, label: int) -> TriangleMesh:
         """The surface of one structure, LPS mm."""
+
+    def skin(self, label: int) -> Skin:
+        """One structure as the skin of the body, with what the image cut.
+
+        Raises:
+            InputError: It cannot be one.
+        """
 
     def section(self, rows: Sequence[Assigned]) -> str:
         """The part of the case file that names all of its structures."""
@@ -119,22 +130,30 @@ def margin_line(row: Assigned) -> str:
         return ""
     change = f'# {HOLDS_TARGET}: role = "traverse", without a margin, if a path may cross it\n'
     reason = f"margin_mm = {row.margin_mm:g}  # {row.line.group}: {row.line.reason}\n"
-    return reason + (change if row.kind == "unknown" and row.line != NOT_ANNOTATED else "")
+    return reason + (change if row.kind == "unknown" and row.line not in {NOT_ANNOTATED, STATED} else "")
 
 
 def rules_text(rows: Sequence[Assigned]) -> str:
-    """The lists and the table of a ``[[structures]]``: each structure by its own name, with the reason of its line."""
+    """The lists and the table of a ``[[structures]]``: each structure by its own name, with the reason of its line.
+
+    The skin is ignored among them: a ``[[structure]]`` of its own, `skin_text`, says what it is.
+    """
     parts = []
     for kind in ("target", "traverse", "ignore"):
-        names = [row.name for row in rows if row.kind == kind]
+        names = [row.name for row in rows if row.kind == kind or (row.kind, kind) == ("skin", "ignore")]
         if names:
             parts.append(f"{kind} = [\n" + "".join(f"    {quoted(name)},\n" for name in names) + "]\n")
     for kind, head in (("avoid", ""), ("unknown", f"# {HOLDS_TARGET}: into traverse = [...] if a path may cross it\n")):
         demanding = [row for row in rows if row.kind == kind]
         if demanding:
-            head = "" if all(row.line == NOT_ANNOTATED for row in demanding) else head
+            head = "" if all(row.line in {NOT_ANNOTATED, STATED} for row in demanding) else head
             parts.append(f"\n[structures.{kind}]  # margins, mm\n{head}{_grouped(demanding)}")
     return "".join(parts)
+
+
+def skin_text(name: str, file: str, label: int) -> str:
+    """The ``[[structure]]`` of a label that is the skin."""
+    return f'\n[[structure]]\nname = {quoted(name)}\nlabelmap = {quoted(file)}\nlabel = {label}\nrole = "skin"\n'
 
 
 def _grouped(rows: Sequence[Assigned]) -> str:

@@ -6,10 +6,11 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.default_roles import BODY
+from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError, InputListError
@@ -21,14 +22,23 @@ from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.init.case_text import CaseParts, case_text
-from puncture_twin.planning.init.finder import AIR_HU, Ct, Found, Markers, Wanted, find
-from puncture_twin.planning.init.mesh_folder import SkinMesh, skin_mesh, skin_problems
-from puncture_twin.planning.init.outlines import Outlines, carved_notes
+from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
+from puncture_twin.planning.init.outlines import Outlines, SkinOf, carved_notes, skin_of, skin_problems
 from puncture_twin.planning.init.roles import assign, likely_region, role_notes
-from puncture_twin.planning.init.segmentation import Assigned, Place, Segmentation
+from puncture_twin.planning.init.segmentation import Place, Segmentation
 from puncture_twin.planning.init.target import Target, label_target, parse_point, typed_target
 
-ALLOWED = "a folder with a CT (NIfTI, NRRD or a DICOM series) and a segmentation, see docs/how-to/your-own-ct.md"
+ALLOWED = (
+    "a folder with a segmentation, and a CT (NIfTI, NRRD or a DICOM series) or a structure named skin or body, see "
+    "docs/how-to/your-own-ct.md"
+)
+
+
+OUTSIDE_WAYS = "a point in the body, in mm, in the space that --space states; or --skin NAME for another skin"
+PHANTOM = (
+    'region = "phantom": no limb is looked for, and what holds together is the phantom; it lies on nothing unless '
+    "[ct] table says so or something detached lies below it"
+)
 
 
 @dataclass(frozen=True)
@@ -43,7 +53,6 @@ class Request:
         space_stated: Whether the user said in which space the target is.
         hit_radius_mm: Of the ball that the target is, if the user says that it lies in no structure; else None.
         wanted: What the user says of the files.
-        trust_labels: Whether a person has seen that the structures lie right.
     """
 
     folder: Path
@@ -53,7 +62,6 @@ class Request:
     wanted: Wanted
     space_stated: bool = True
     hit_radius_mm: float | None = None
-    trust_labels: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,22 +90,22 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     Raises:
         InputError: All that keeps a case from being made, in one line.
     """
-    space = request.wanted.space
+    space, overrides = request.wanted.space, request.wanted.overrides
     point = None if request.target is None else parse_point(request.target, space)
     found = find(Place(request.folder, cache, progress), request.wanted)
-    body = _checked(found, point, request)
-    ct = body if isinstance(body, Ct) else None
-    if point is not None and ct is not None:
-        _refuse_outside(point, ct, space)
-    skin = body.surfaces.imaged().skin() if isinstance(body, Ct) else body.skin()
-    outlines = Outlines(found.segmentations, skin)
-    target = _target(request, point, outlines)
     names = [name for one in found.segmentations for name in one.names.values()]
+    if not found.problems:
+        overrides.check_names(names, [name for name, _ in found.passed])
+    body = _checked(found, point, request)
+    skin = body.skin()
+    if point is not None and body.ct is not None:
+        _refuse_outside(point, body.ct, skin, space)
+    stated = dict(overrides.roles) | ({} if body.structure is None else {body.structure.name: "skin"})
+    gone = frozenset(name for name, kind in stated.items() if kind != "unknown")
+    outlines = Outlines(found.segmentations, skin, gone)
+    target = _target(request, point, outlines)
     region = request.region or likely_region(names, target.holding.target)
     left_out = outlines.at(target.point_ct)
-    rows = [assign(one.names, region, target.holding, left_out) for one in found.segmentations]
-    if isinstance(body, SkinMesh):
-        rows = [_with_skin(some, body) for some in rows]
     parts = CaseParts(
         name=request.folder.resolve().name,
         space=space,
@@ -105,10 +113,14 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         target_ct=target.point_ct,
         structure=target.holding.target,
         hit_radius_mm=target.hit_radius_mm,
-        ct=None if ct is None else ct.source,
-        sources=tuple(zip(found.segmentations, rows, strict=True)),
-        markers=tuple(_markers_of_ct(found.markers, ct)),
-        trust_labels=request.trust_labels,
+        ct=None if body.ct is None else body.ct.source,
+        skin=body.source,
+        sources=tuple(
+            (one, assign(one.names, region, target.holding, left_out, stated)) for one in found.segmentations
+        ),
+        markers=tuple(_markers_of_ct(found.markers, body.ct)),
+        left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),
+        keys=overrides.keys,
     )
     notes = (*_notes(request, found, target, parts), *outlines.notes(target.point_ct))
     return Start(case_text(parts), parts, notes)
@@ -121,44 +133,78 @@ def _target(request: Request, point: Floats | None, outlines: Outlines) -> Targe
     return label_target(str(request.target_label), outlines, request.wanted.space)
 
 
-def _checked(found: Found, point: Floats | None, request: Request) -> Ct | SkinMesh:
-    """The one CT, or the mesh that is the skin.
+class Body(NamedTuple):
+    """Where the skin comes from.
+
+    Attributes:
+        ct: The CT, where there is one.
+        structure: The structure that is the skin, where the CT is not asked.
+    """
+
+    ct: Ct | None
+    structure: SkinOf | None
+
+    def skin(self) -> Skin:
+        """The body's."""
+        if self.structure is not None:
+            return self.structure.skin()
+        assert self.ct is not None
+        return self.ct.surfaces.imaged().skin()
+
+    @property
+    def source(self) -> str:
+        """For a person."""
+        if self.structure is not None:
+            return f"'{self.structure.name}' of {self.structure.segmentation.source}"
+        return "" if self.ct is None else self.ct.source
+
+
+def _checked(found: Found, point: Floats | None, request: Request) -> Body:
+    """The one CT, and what is the skin.
 
     Raises:
         InputError: Everything that is missing, doubled or could not be read.
     """
     problems = list(found.problems)
-    cts = _holding(found.cts, point)
+    cts, stated = _holding(found.cts, point), request.wanted.overrides.skin
     if len(cts) > 1:
-        problems.append(
-            _problem(f"several CTs: {', '.join(one.source for one in cts)} (--ct says which)", "several_cts")
-        )
+        what = f"several CTs: {', '.join(one.source for one in cts)} (--ct says which)"
+        problems.append(_problem(what, "several_cts", "--ct with the one that is meant"))
     if not found.segmentations and not problems:
         problems.append(_problem(f"no segmentation (label map, masks or meshes){_lies(found)}", "no_segmentation"))
-    mesh = None if cts else skin_mesh(found.segmentations)
-    if mesh is not None:
-        problems += [_problem(one, "no_skin") for one in skin_problems(mesh, found.segmentations)]
-    elif not cts and not found.problems:
-        what = f"no CT in Hounsfield units (min below {AIR_HU}), and no mesh named like the skin{_lies(found)}"
-        problems.append(_problem(what, "no_ct"))
-    problems += [_problem(one, "doubled") for one in _doubled(found.segmentations)]
-    body = cts[0] if cts else mesh
-    if problems or body is None:
+    skin = None if cts and stated is None else skin_of(found.segmentations, stated)
+    if skin is None and not cts and not found.problems:
+        problems.append(_no_skin(found))
+    elif skin is not None and stated is None:
+        wrong = skin_problems(skin, found.segmentations)
+        problems += [_problem(one, "no_skin", "--skin NAME with the structure that is the skin") for one in wrong]
+    problems += [
+        _problem(one, "doubled", "--segmentation with the one that is meant") for one in _doubled(found.segmentations)
+    ]
+    if problems:
         said = [
             one.what if one.where == HERE else f"{_below(one.where, request.folder)}: {one.what}" for one in problems
         ]
         ways = dict.fromkeys(one.allowed for one in problems)
-        code = problems[0].code if problems else ""
+        code = problems[0].code
         raise InputListError("; ".join(said), where=request.folder, allowed="; ".join(ways), code=code)
-    return body
+    return Body(cts[0] if cts else None, skin)
+
+
+def _no_skin(found: Found) -> InputListError:
+    """Nothing says where the body ends; what is there may."""
+    what = f"no CT in Hounsfield units (min below {AIR_HU}), and no structure named like the skin{_lies(found)}"
+    names = [name for one in found.segmentations for name in one.names.values()]
+    way = f"; --skin NAME where one of these is the skin: {first_few(names)}" if names else ""
+    return _problem(what, "no_ct", f"{ALLOWED}{way}")
 
 
 HERE = "folder"
 """Where a problem of the folder itself is."""
 
 
-def _problem(what: str, code: str) -> InputListError:
-    return InputListError(what, where=HERE, allowed=ALLOWED, code=code)
+def _problem(what: str, code: str, allowed: str = ALLOWED) -> InputListError:
+    return InputListError(what, where=HERE, allowed=allowed, code=code)
 
 
 def _lies(found: Found) -> str:
@@ -194,23 +240,18 @@ def _doubled(segmentations: Sequence[Segmentation]) -> Iterator[str]:
         yield f"{sources} hold structures of one name, such as '{twice[0]}' (--segmentation says which)"
 
 
-def _refuse_outside(point: Floats, ct: Ct, space: Space) -> None:
+def _refuse_outside(point: Floats, ct: Ct, skin: Skin, space: Space) -> None:
     """A target outside of the CT or of the body in it."""
     grid = ct.surfaces.source.grid
 
     def in_body(one: Floats) -> bool:
-        return _contains(grid, one) and side_of(ct.surfaces.imaged().skin().mesh, one) is not Side.OUTSIDE
+        return _contains(grid, one) and side_of(skin.mesh, one) is not Side.OUTSIDE
 
     if not in_body(point):
         place = "the body in" if _contains(grid, point) else "the CT"
         hint = readings_inside(point, space, in_body)
         what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
-        raise InputError(what, where="--target", allowed="a point in the body, in mm, in the space that --space states")
-
-
-def _with_skin(rows: Sequence[Assigned], skin: SkinMesh) -> list[Assigned]:
-    """The same rows, with the mesh that is the skin as such; names are told apart before."""
-    return [row._replace(kind="skin", line=BODY) if row.name == skin.name else row for row in rows]
+        raise InputError(what, where="--target", allowed=OUTSIDE_WAYS)
 
 
 def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:
@@ -234,6 +275,8 @@ def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> 
     yield from carved_notes(parts.sources)
     if request.region is None:
         yield f'region = "{parts.region}" is told by the structures; --region says otherwise'
+    if parts.region == "phantom":
+        yield PHANTOM
     if parts.markers:
         names = ", ".join(one.source for one in parts.markers)
         yield f"{names}: may be markers, named in comments; without [registration] no arm is checked"

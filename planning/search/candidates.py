@@ -230,6 +230,12 @@ class Candidates(Columns):
         return self.verdict.reason == Reason.NONE.value
 
     @property
+    def unseen_air(self) -> Bools:
+        """Which rows are rejected for what is unknown outside of the body alone: beyond its skin, shape (n,)."""
+        beyond = self.verdict.depth > self.path.length
+        return (self.verdict.reason == Reason.UNKNOWN_REGION.value) & beyond
+
+    @property
     def arm_checked(self) -> bool:
         """Whether "safe" includes the arm."""
         return self.arm_note == ARM_CHECKED

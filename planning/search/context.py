@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -42,6 +42,7 @@ from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases.moving_weights import breath_warnings
 from puncture_twin.planning.search.search import search
+from puncture_twin.planning.search.sides import Side, sides_of
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
@@ -90,6 +91,11 @@ class CaseContext:
     def pose_error(self) -> PoseError | None:
         """Of the needle, where the case declares errors and has markers, also where the arm is not checked."""
         return pose_error(self.case, None if self.placement is None else self.placement.registration)
+
+    @cached_property
+    def sides(self) -> tuple[Side, ...]:
+        """From where a needle can come, and where the case's grid looks."""
+        return sides_of(self.case, self.anatomy)
 
     def search(self) -> Candidates:
         """Check the case's whole grid."""
@@ -215,6 +221,7 @@ def prepare(
         read = (*case.warnings, *anatomy.warnings)
         found = (
             *(Finding("reading", Severity.WARNING, one) for one in read),
+            *anatomy.findings,
             *findings(case, anatomy, placement, cache),
             *(Finding("breathing", Severity.WARNING, one) for one in breath_warnings(case, anatomy)),
         )

@@ -21,9 +21,6 @@ from puncture_twin.planning.search.bending.insertion import Insertion, insertion
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.doubt import Doubt
 
-MOST = 0.5
-"""Of all directions: a needle that is too short for more of them was likely not meant for this target."""
-
 NEAREST = 8
 """Structures that are listed where nobody wants all: a case has a hundred, and those far away decide nothing."""
 
@@ -305,13 +302,17 @@ def _beside(clearance_mm: float, short: bool) -> str:
 
 
 def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
-    """What to say where the needle is too short for most of the directions."""
-    short = int((candidates.verdict.reason == Reason.TOO_LONG.value).sum())
-    if short <= MOST * len(candidates):
+    """What to say where a longer needle would free more directions than this one does."""
+    short = candidates.verdict.reason == Reason.TOO_LONG.value
+    crossed = (candidates.clearance.distance < candidates.clearance.margins).any(axis=1)
+    freed = short & ~crossed & (candidates.path.skin_angle <= case.search.max_skin_angle)
+    if freed.sum() <= candidates.safe.sum():
         return []
+    lengths = candidates.path.length[freed]
     return [
-        f"the needle is too short for {short} of {len(candidates)} directions: its longest path is "
-        f"{case.needle.longest_path_mm:g} mm"
+        f"the needle is too short for {short.sum()} of {len(candidates)} directions: its longest path is "
+        f"{case.needle.longest_path_mm:g} mm, and nothing else speaks against {freed.sum()} of {lengths.min():.0f} to "
+        f"{lengths.max():.0f} mm"
     ]
 
 

@@ -161,3 +161,16 @@ def test_nothing_safe_has_no_window():
     found = candidates()
     windows = find_windows(with_safe(found, np.zeros(len(found), bool)))
     assert windows.windows == () and (windows.of_row == 0).all()
+
+
+def test_a_window_is_as_wide_as_a_cone_of_its_solid_angle():
+    """Safe within 20 degrees of the pole: 40 degrees wide, to half a cell at each side; the largest is spoken of."""
+    found = candidates(step_deg=1.0)
+    far = np.abs(np.degrees(found.theta) - 70.0) < 3.0  # a ring: narrow, but longer
+    whole = find_windows(with_safe(found, np.degrees(found.theta) < 20.5))
+    assert whole.largest.wide_deg == pytest.approx(41.0, abs=0.1)
+    both = find_windows(with_safe(found, far | (np.degrees(found.theta) < 20.5)))
+    largest = max(both.windows, key=lambda one: one.entry_cm2)
+    assert both.largest == largest and both.headline.startswith("the largest window: ")
+    assert f"{largest.entry_cm2:.1f} cm2 on the skin, {largest.wide_deg:.0f} deg wide" in both.headline
+    assert find_windows(with_safe(found, np.zeros(len(found), bool))).headline == "no window: nothing is safe"

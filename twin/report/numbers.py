@@ -8,7 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Rgb
+from puncture_twin.planning.base.arrays import Bools
+from puncture_twin.planning.base.reasons import (
+    REASON_COLOURS,
+    REASON_TEXT,
+    SAFE,
+    UNSEEN_AIR,
+    UNSEEN_AIR_TEXT,
+    Reason,
+    Rgb,
+)
 from puncture_twin.planning.place.directions import ring_weights
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import step_of
@@ -44,18 +53,22 @@ class ReasonCount:
 def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
     """Safe first, then the reasons that occur, most frequent first."""
     weights = ring_weights(candidates.theta, step_of(candidates))
-    lines = []
+    lines: list[tuple[str, str, Rgb, Bools]] = []
+    air = candidates.unseen_air
     for value in np.unique(candidates.verdict.reason):
-        here = candidates.verdict.reason == value
+        here = (candidates.verdict.reason == value) & ~air
         reason = reason_of(str(value))
-        colour = REASON_COLOURS.get(reason, SAFE)
         text = REASON_TEXT[reason] if reason else candidates.safe_text
-        fraction, solid = float(here.mean()), float(weights[here].sum() / weights.sum())
-        count = int(here.sum())
-        lines.append(ReasonCount(text, reason.value or "safe", colour, count, fraction, solid))
+        lines.append((text, reason.value or "safe", REASON_COLOURS.get(reason, SAFE), here))
+    lines.append((UNSEEN_AIR_TEXT, Reason.UNKNOWN_REGION.value, UNSEEN_AIR, air))
+    counts = [
+        ReasonCount(text, code, colour, int(here.sum()), float(here.mean()), float(weights[here].sum() / weights.sum()))
+        for text, code, colour, here in lines
+        if here.any()
+    ]
     if not candidates.safe.any():
-        lines.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0, 0.0))
-    return tuple(sorted(lines, key=lambda line: (line.code != "safe", -line.count)))
+        counts.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0, 0.0))
+    return tuple(sorted(counts, key=lambda line: (line.code != "safe", -line.count)))
 
 
 def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:

@@ -38,6 +38,16 @@ class Window:
     entry_cm2: float
     widest_cone: float
 
+    @property
+    def wide_deg(self) -> float:
+        """Across a cone of the same solid angle, degrees."""
+        return 2.0 * float(np.degrees(np.arccos(1.0 - self.square_deg / SQUARE_DEGREES / (2.0 * np.pi))))
+
+    @property
+    def text(self) -> str:
+        """Its size for a person."""
+        return f"{self.entry_cm2:.1f} cm2 on the skin, {self.wide_deg:.0f} deg wide"
+
 
 @dataclass(frozen=True, eq=False)
 class Windows:
@@ -50,6 +60,19 @@ class Windows:
 
     of_row: Ints
     windows: tuple[Window, ...]
+
+    @property
+    def largest(self) -> Window | None:
+        """The window with the most skin; None where nothing is safe."""
+        return max(self.windows, key=lambda one: one.entry_cm2, default=None)
+
+    @property
+    def headline(self) -> str:
+        """The first thing that a search says of what is safe."""
+        one = self.largest
+        if one is None:
+            return "no window: nothing is safe"
+        return f"the largest window: {one.text}, {one.number} of {len(self.windows)}"
 
     def rows(self, number: int) -> Ints:
         """The candidates of one window."""

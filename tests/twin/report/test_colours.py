@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from puncture_twin.planning.base.reasons import REASON_COLOURS, SAFE, Reason
-from puncture_twin.twin.report.map.map_raster import HATCH
+from puncture_twin.planning.base.reasons import REASON_COLOURS, SAFE, UNSEEN_AIR, Reason
+from puncture_twin.twin.report.map.map_raster import HATCH, HATCH_AIR
 from puncture_twin.twin.report.palette import CUSTOM_COLOURS, ORGAN_COLOURS, SAFE_HIGH, SAFE_LOW, organ_colours
 
 DEUTERANOPIA = np.array(
@@ -84,6 +84,13 @@ def test_safe_is_told_from_unknown_by_more_than_its_hue(shade):
     unknown = REASON_COLOURS[Reason.UNKNOWN_REGION]
     assert difference(unknown, HATCH) > 30
     assert min(difference(shade, unknown), difference(shade, HATCH)) > 5
+
+
+def test_what_is_unknown_in_the_body_is_told_from_what_is_beside_it():
+    """By ground and by lines, to every reader; neither pair is of one lightness."""
+    for reader in READERS.values():
+        assert difference(REASON_COLOURS[Reason.UNKNOWN_REGION], UNSEEN_AIR, reader) > 20
+        assert difference(UNSEEN_AIR, HATCH_AIR, reader) > 30
 
 
 @pytest.mark.parametrize("reason", [r for r in REASON_COLOURS if r is not Reason.UNKNOWN_REGION])

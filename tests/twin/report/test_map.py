@@ -7,14 +7,15 @@ import pytest
 import report_world as world
 from PIL import Image
 
+from puncture_twin.planning.base.reasons import REASON_TEXT, UNSEEN_AIR_TEXT, Reason
 from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.planning.search.selection.choice import best_pick
 from puncture_twin.twin.report.canvas.canvas import Canvas
 from puncture_twin.twin.report.map.front import MOST_DOTS, shown_front
 from puncture_twin.twin.report.map.map_picture import draw_map
-from puncture_twin.twin.report.map.map_raster import row_colours
+from puncture_twin.twin.report.map.map_raster import HATCH, HATCH_AIR, HATCH_NOT_SEARCHED, map_raster, row_colours
 from puncture_twin.twin.report.map_view import map_view
-from puncture_twin.twin.report.numbers import ReasonCount
+from puncture_twin.twin.report.numbers import ReasonCount, reason_counts
 from puncture_twin.twin.report.page.page_map import map_data
 
 
@@ -161,3 +162,26 @@ LONG_LEGEND = (
     ReasonCount("may bend into a structure's margin", "needle_bends", (170, 68, 153), 1_234_567, 0.1, 0.1),
     ReasonCount("unknown region (image ends, or not named)", "unknown_region", (110, 110, 110), 8, 0.1, 0.1),
 )
+
+
+def test_the_greys_of_what_is_not_known_are_told_apart(case, candidates):
+    """In the body, beside it, and outside of the grid: a colour or lines of its own each; the legend has both."""
+    found = world.make_candidates(case, beta_deg=(0, 180))
+    refused = found.verdict.reason == "too_close"
+    depth = np.where(refused, found.path.length + np.where(np.degrees(found.theta) > 40.0, 1.0, -1.0), np.nan)
+    reason = np.where(refused, "unknown_region", found.verdict.reason)
+    found = replace(found, verdict=replace(found.verdict, reason=reason, depth=depth))
+    air, body = found.unseen_air, refused & ~found.unseen_air
+    assert air.any() and body.any() and np.array_equal(air, refused & (np.degrees(found.theta) > 40.0))
+    counts = {line.text: line.count for line in reason_counts(found)}
+    assert counts[UNSEEN_AIR_TEXT] == air.sum() and counts[REASON_TEXT[Reason.UNKNOWN_REGION]] == body.sum()
+    raster = map_raster(found, map_view(case, found), 400)
+    middle = np.arange(400) - 199.5
+    outside = (raster.rows < 0) & (np.hypot(middle[:, None], middle) < 190.0)
+    where = [np.append(rows, False)[raster.rows] for rows in (air, body)] + [outside]
+    dark = [np.median(raster.rgba[one][:, :3].mean(axis=1)) for one in where]
+    lines = [(raster.rgba[one][:, :3] == colour).all(axis=1).mean() for one, colour in zip(where, LINES, strict=True)]
+    assert dark[1] + 50 < dark[0] and dark[0] + 30 < dark[2] and all(0.1 < fraction < 0.4 for fraction in lines)
+
+
+LINES = (HATCH_AIR, HATCH, HATCH_NOT_SEARCHED)

@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.toml_file import parse_toml
+from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.case.read_case import ALLOWED_CASE
 from puncture_twin.planning.geometry.spaces import to_lps
+from puncture_twin.planning.init.case_text import with_image_seen
+from puncture_twin.planning.init.overrides import WAYS, with_keys
 from puncture_twin.planning.init.start import ALLOWED, Request, Start, start_case
 from puncture_twin.planning.search.context import CaseContext, prepare
+from puncture_twin.planning.search.selection.choice import Pick
+from puncture_twin.planning.search.sides import grid_of, sides_text
+from puncture_twin.twin.jobs.patient.run import SLICES
+from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
+from puncture_twin.twin.report.slices.subject import Subject
 
 CASE = "case.toml"
 
@@ -28,6 +42,7 @@ class InitRun:
     start: Start
     context: CaseContext
     warnings: tuple[str, ...]
+    picture: Path | None
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm, in the case's space."""
@@ -42,9 +57,12 @@ class InitRun:
             "target_mm": [float(one) for one in position],
             "target_structure": parts.structure,
             "structures": dict(Counter(row.kind for row in parts.rows)),
+            "looked": sides_text(self.context.sides),
+            "sides": [side.document() for side in self.context.sides],
             "warnings": list(self.warnings),
+            "findings": self.context.provenance()["findings"],
             "inputs": inputs_document(self.context.case.inputs),
-            "files": [str(self.path)],
+            "files": [str(path) for path in (self.path, self.picture) if path is not None],
         }
 
 
@@ -74,10 +92,37 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
         except InputError as error:
             what, where = (text.replace(draft.name, CASE) for text in (error.what, error.where))
             raise type(error)(
-                what, where=where, allowed=error.allowed, code=error.code, numbers=error.numbers
+                what, where=where, allowed=f"{error.allowed}; {WAYS}", code=error.code, numbers=error.numbers
             ) from error
+        text = _with_seen(start, request, context)
+        parse_toml(text.encode(), path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
+        draft.write_text(text, encoding="utf-8")
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
-    return InitRun(path, start, context, (*start.notes, *found))
+    picture = None if context.anatomy.scan is None else _picture(context, folder / SLICES)
+    return InitRun(path, replace(start, text=text), context, (*start.notes, *found), picture)
+
+
+def _with_seen(start: Start, request: Request, context: CaseContext) -> str:
+    """The case's text with what only the whole anatomy tells: what its CT shows, and where a search should look."""
+    text, where = with_image_seen(start.text, context.anatomy), grid_of(context.sides)
+    looked = f"where a needle can come from: {sides_text(context.sides)}"
+    keys = {"search.frame": where.frame, "search.theta_deg": "[{:g}, {:g}]".format(*where.theta_deg)}
+    if not request.wanted.overrides.keys.keys().isdisjoint(keys):
+        return text
+    return with_keys(text, keys, {"search.theta_deg": looked, "search.frame": "theta 0 is its z"})
+
+
+def _picture(context: CaseContext, path: Path) -> Path:
+    """The CT through the target, toward a limb that was found, else toward what the body lies on, else the front."""
+    anatomy, case = context.anatomy, context.case
+    beside = next((one.mesh for one in anatomy.surroundings if one.name == ATTACHED_LIMB), anatomy.couch)
+    theta, beta = 0.0, 0.0
+    if beside is not None:
+        toward = (beside.bounds.mean(axis=0) - case.target_ct) * (1.0, 1.0, 0.0)
+        theta, beta = map(float, angles((toward / np.linalg.norm(toward)) @ case.T_ct_entry[:3, :3]))
+    explained = context.explain(theta, beta)
+    write_sheet(draw_slices(Subject(context.case, context.anatomy, Pick(explained.candidates, 0))), path)
+    return path
 
 
 def _source(place: str) -> str:
@@ -89,14 +134,17 @@ def init_text(run: InitRun) -> str:
     """What was found, and the next command."""
     parts, counts = run.start.parts, Counter(row.kind for row in run.start.parts.rows)
     position = ", ".join(f"{one:.1f}" for one in to_lps(parts.target_ct[None], parts.space)[0])
+    needle = run.context.case.needle
     roles = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
     lines = [
         f"{run.path}",
-        f"  skin           {parts.ct or 'a mesh'}",
+        f"  skin           {parts.skin}",
         f"  structures     {roles}, of {', '.join(_source(one.source) for one, _ in parts.sources)}",
         f"  target         {position} mm {parts.space}, in {parts.structure or 'no structure'}",
         f"  region         {parts.region}",
-        "  needle         200 mm, shaft 150 mm, diameter 1.2 mm",
+        f"  needle         {needle.length_mm:g} mm, shaft {needle.shaft_mm:g} mm, diameter {needle.diameter_mm:g} mm",
+        f"  looked         {sides_text(run.context.sides)}",
+        *([] if run.picture is None else [f"  look at        {run.picture}"]),
         f"next: run-twin search {run.path.parent}",
     ]
     return "\n".join(lines)

@@ -16,6 +16,7 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
+from puncture_twin.planning.search.sides import sides_text
 from puncture_twin.twin.jobs.patient.summaries import (
     plan_summary,
     rehearsal_failures,
@@ -94,12 +95,17 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""
         found, provenance = self.candidates, self.context.provenance()
-        windows = find_windows(found).windows
+        found_windows = find_windows(found)
+        windows, largest = found_windows.windows, found_windows.largest
         at_patient = {} if self.facts is None else self.facts.summary()
         return {
             **provenance,
             "warnings": [*provenance["warnings"], *needle_warnings(self.context.case, found)],
             "inputs": inputs_document(self.inputs),
+            "headline": found_windows.headline,
+            "largest_window": None if largest is None else window_summary(found, largest),
+            "looked": sides_text(self.context.sides, searched=True),
+            "sides": [side.document() for side in self.context.sides],
             "directions": len(found),
             "counts": found.counts(),
             "best": [window_summary(found, window) for window in windows[:MOST_WINDOWS]],

@@ -88,6 +88,7 @@ def window_summary(found: Candidates, window: Window) -> dict[str, Any]:
         "window_directions": window.directions,
         "window_square_deg": window.square_deg,
         "window_entry_cm2": window.entry_cm2,
+        "window_wide_deg": window.wide_deg,
         "window_widest_cone_deg": finite(np.degrees(window.widest_cone)),
     }
 

@@ -11,6 +11,8 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.explain import deep_text, needle_warnings, reason_text
+from puncture_twin.planning.search.selection.windows import find_windows
+from puncture_twin.planning.search.sides import sides_text
 from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.jobs.patient.budget import budget_lines
 from puncture_twin.twin.jobs.patient.correction import correction_lines
@@ -62,7 +64,9 @@ def _notice(run: Run) -> list[str]:
 
 def _search(run: Run) -> list[str]:
     found = run.candidates
-    lines = [f"case {run.context.case.name}: {len(found)} direction{'s' if len(found) != 1 else ''}"]
+    lines = [f"case {run.context.case.name}: {find_windows(found).headline}"]
+    looked = f", looked from: {sides_text(run.context.sides, searched=True)}" if run.context.sides else ""
+    lines += [f"{len(found)} direction{'s' if len(found) != 1 else ''}{looked}"]
     counts = ((found.safe_text if reason == "safe" else reason, count) for reason, count in found.counts().items())
     lines += [f"  {count:7d}  {reason}" for reason, count in counts]
     lines += needle_warnings(run.context.case, found)

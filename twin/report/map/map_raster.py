@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.reasons import REASON_COLOURS, Reason, Rgb
+from puncture_twin.planning.base.reasons import REASON_COLOURS, UNSEEN_AIR, Reason, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import MapCells, MapView
 from puncture_twin.twin.report.palette import reason_of, safe_shades
@@ -30,6 +30,8 @@ EVEN_SHADE = 0.5
 """The shade of such a map, 0..1: neither that of the least clearance nor that of the greatest."""
 
 HATCH: Rgb = (235, 235, 235)
+HATCH_AIR: Rgb = (95, 95, 95)
+NOT_SEARCHED, HATCH_NOT_SEARCHED = (255, 255, 255), (205, 205, 205)
 HATCHES, HATCH_LEAST = 80, 5
 """Lines across the picture, and pixels between two of them at least."""
 
@@ -87,6 +89,7 @@ def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
         if reason in REASON_COLOURS:
             colours[candidates.verdict.reason == value] = REASON_COLOURS[reason]
     safe = candidates.safe
+    colours[candidates.unseen_air] = UNSEEN_AIR
     colours[safe] = clearance_scale(candidates).shades(candidates.least_clearance[safe])
     return colours
 
@@ -113,16 +116,28 @@ def map_raster(candidates: Candidates, view: MapView, size: int = PIXELS) -> Map
     opaque = fine[..., 3:] / 255.0
     mean = (fine[..., :3] * opaque).mean(axis=0) / np.maximum(opaque.mean(axis=0), 1.0 / 255.0)
     rgba[line, column] = np.round(np.concatenate([mean, 255.0 * opaque.mean(axis=0)], axis=-1))
-    _hatch_unknown(rgba, rows, candidates)
+    _hatch(rgba, rows, candidates)
     return MapRaster(rgba, rows)
 
 
-def _hatch_unknown(rgba: NDArray[np.uint8], rows: NDArray[np.int64], candidates: Candidates) -> None:
-    """White lines over what is unknown, in place: its grey alone is near the green of safe for the colour-blind."""
-    unknown = np.append(candidates.verdict.reason == Reason.UNKNOWN_REGION.value, False)[rows]  # outside
+def _hatch(rgba: NDArray[np.uint8], rows: NDArray[np.int64], candidates: Candidates) -> None:
+    """Lines over what is not known, in place: its grey alone is near the green of safe for the colour-blind.
+
+    They rise over what is unknown in the body, fall over what is unknown beside it, and lie within the disc where
+    nobody looked.
+    """
+    unknown, air = candidates.verdict.reason == Reason.UNKNOWN_REGION.value, candidates.unseen_air
     line, column = np.arange(len(rows))[:, None], np.arange(len(rows))
+    middle = (len(rows) - 1) / 2
+    not_searched = (rows < 0) & (np.hypot(line - middle, column - middle) < middle - 1.0) & (rgba[..., 3] == 0)
+    rgba[not_searched] = (*NOT_SEARCHED, 255)
     period = max(HATCH_LEAST, len(rows) // HATCHES)
-    rgba[unknown & ((line + column) % period < max(1, period // 5)), :3] = HATCH
+    for where, phase, colour in (
+        (np.append(unknown & ~air, False)[rows], line + column, HATCH),
+        (np.append(air, False)[rows], line - column, HATCH_AIR),
+        (not_searched, line + 0 * column, HATCH_NOT_SEARCHED),
+    ):
+        rgba[where & (phase % period < max(1, period // 5)), :3] = colour
 
 
 def _to_disc(pixels: NDArray[np.float64], size: int) -> NDArray[np.float64]:

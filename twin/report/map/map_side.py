@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, Reason, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.doubt import chance_text
 from puncture_twin.planning.search.selection.choice import Pick, best_pick
@@ -17,8 +17,8 @@ from puncture_twin.twin.report.map.chance_layer import chance_legend
 from puncture_twin.twin.report.map.front import shown_front
 from puncture_twin.twin.report.map.map_layout import POINT, SIDE_HEIGHT, SIDE_WIDTH, side_pixels
 from puncture_twin.twin.report.map.map_marks import mark_dot, mark_ring, mark_star
-from puncture_twin.twin.report.map.map_raster import SCALE_DIGITS, ClearanceScale, clearance_scale
-from puncture_twin.twin.report.map_view import BEYOND, MapView
+from puncture_twin.twin.report.map.map_raster import HATCH, HATCH_AIR, SCALE_DIGITS, ClearanceScale, clearance_scale
+from puncture_twin.twin.report.map_view import BEYOND, MapView, step_of
 from puncture_twin.twin.report.numbers import ReasonCount, arm_text, nearest_text, number, percent, reason_counts
 from puncture_twin.twin.report.palette import safe_shades
 
@@ -48,6 +48,8 @@ def draw_side(canvas: Canvas, candidates: Candidates, view: MapView, pick: Pick 
     y = chance_legend(canvas, candidates, y)
     y = _mark_legend(canvas, candidates, view, y + 0.05)
     _chosen(canvas, candidates, pick, y + 0.04)
+    whole = candidates.grid is None or (candidates.grid.full_circle and candidates.theta.min() < step_of(candidates))
+    outside = "" if whole else f"White with lines: {NOT_SEARCHED_TEXT}.\n"
     toward = f"Centre (+), θ = 0: {view.centre}.\n" if view.centre else ""
     if view.theta_max > BEYOND:
         toward += "Beyond the thick ring (θ 90°) it comes from the far side.\n"
@@ -56,7 +58,7 @@ def draw_side(canvas: Canvas, candidates: Candidates, view: MapView, pick: Pick 
         "from OUTSIDE, along −z of the entry frame. A point is\n"
         "where the needle comes from: θ grows from the centre\n"
         "to the rim, β runs counter-clockwise.\n"
-        f"{toward}{_folded(arm_text(candidates), 52)}"
+        f"{outside}{toward}{_folded(arm_text(candidates), 52)}"
     )
     left, bottom = side_pixels(0.0, 0.995)
     high = HOW_TO_READ.size * HOW_TO_READ.spacing * text.count("\n")
@@ -76,7 +78,7 @@ def _legend(canvas: Canvas, counts: Sequence[ReasonCount]) -> float:
     for one, text, y in zip(counts, texts, (ends - unit * heights / 2).tolist(), strict=True):
         face: Face = "bold" if one.code == "safe" else "plain"
         look = Words(min(ENTRY, unit * SIDE_HEIGHT / 1.08), face, spacing=1.08)
-        canvas.rectangle(_box(0.0, y - 0.016, PATCH, 0.032 * min(1.0, unit / 0.015)), one.colour, 0.8 * POINT)
+        _patch(canvas, _box(0.0, y - 0.016, PATCH, 0.032 * min(1.0, unit / 0.015)), one)
         canvas.write(side_pixels(TEXT_AT, y), text, look, anchor="lm")
         for x, value in (
             (COUNT_ENDS, f"{one.count:,}"),
@@ -85,6 +87,17 @@ def _legend(canvas: Canvas, counts: Sequence[ReasonCount]) -> float:
         ):
             canvas.write(side_pixels(x, y), value, look, anchor="rm")
     return float(ends[-1])
+
+
+def _patch(canvas: Canvas, box: tuple[float, float, float, float], one: ReasonCount) -> None:
+    """A reason's colour, with the lines that the map has over it."""
+    left, top, right, bottom = box
+    canvas.rectangle(box, one.colour, 0.8 * POINT)
+    if one.code == Reason.UNKNOWN_REGION.value:
+        (start, end), colour = ((top, bottom), HATCH_AIR) if one.colour == UNSEEN_AIR else ((bottom, top), HATCH)
+        x, y = (left + right) / 2, (top + bottom) / 2
+        lines = [((left, start), (right, end)), ((left, y), (x, end)), ((x, start), (right, y))]
+        canvas.segments(np.array(lines), POINT, colour)
 
 
 def _beside_count(one: ReasonCount) -> str:

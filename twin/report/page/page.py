@@ -179,13 +179,7 @@ def _cards(
     if safe == 0:
         return []
     cards = [] if doubt is None else [chance_card(doubt)]
-    cards.append(
-        Card(
-            "safe directions" if candidates.arm_checked else f"directions {candidates.safe_text}",
-            percent(next(line.solid_angle for line in reason_counts(candidates) if line.code == "safe")),
-            f"of the solid angle, in {_counted(len(find_windows(candidates).windows), 'window')}",
-        )
-    )
+    cards.append(_window_card(candidates))
     if pick is not None:
         cards.append(_direction_card(*pick, best=pick == best_pick(candidates)))
     if not candidates.arm_checked:
@@ -204,6 +198,20 @@ def _cards(
             expected = f"{rehearsal.standing.text}; {expected}"
         cards.append(Card("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))
     return cards
+
+
+def _window_card(candidates: Candidates) -> Card:
+    """What a person can aim at, before how much of all directions that is."""
+    windows = find_windows(candidates)
+    largest = windows.largest
+    value, wide = ("", "") if largest is None else (f"{largest.entry_cm2:.1f} cm²", f"{largest.wide_deg:.0f}° wide")
+    solid = percent(next(line.solid_angle for line in reason_counts(candidates) if line.code == "safe"))
+    return Card(
+        "safe directions" if candidates.arm_checked else f"directions {candidates.safe_text}",
+        value,
+        f"the largest window on the skin, {wide}; in {_counted(len(windows.windows), 'window')} {solid} "
+        "of the solid angle",
+    )
 
 
 def _counted(count: int, noun: str) -> str:

@@ -13,11 +13,12 @@ import numpy as np
 from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.base.reasons import Reason, css
+from puncture_twin.planning.base.reasons import UNSEEN_AIR, Reason, css
 from puncture_twin.planning.plan.html import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.numbers import (
+    ReasonCount,
     arm_text,
     clearance_text,
     expected_text,
@@ -131,7 +132,7 @@ def counts_table(candidates: Candidates) -> Markup:
     rows = [
         (
             Markup('<span class="patch {}" style="background-color:{}"></span>{}').format(
-                "hatched" if line.code == Reason.UNKNOWN_REGION.value else "", css(line.colour), line.text
+                _hatches(line), css(line.colour), line.text
             ),
             percent(line.solid_angle),
             f"{line.count:,}",
@@ -141,6 +142,13 @@ def counts_table(candidates: Candidates) -> Markup:
     ]
     text = faint(f"{arm_text(candidates)}.")
     return table(("verdict", "of solid angle", "directions", "code"), rows, kind="numbers") + text
+
+
+def _hatches(line: ReasonCount) -> str:
+    """The class of a patch with the lines that the map has over its colour."""
+    if line.code != Reason.UNKNOWN_REGION.value:
+        return ""
+    return "hatched air" if line.colour == UNSEEN_AIR else "hatched"
 
 
 TRE_TEXT = "expected TRE at the target (rms), markers alone"

@@ -1,0 +1,170 @@
+"""The sides of a body, each as far as a needle can come from there: where a grid should look, and where one looked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, OUTSIDE_BODY, Anatomy
+from puncture_twin.planning.anatomy.skin_entry import SkinPaths, skin_paths
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS, GRID_SLACK, angles, grid
+from puncture_twin.planning.geometry.crossings import crossings
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.search.explain import finite
+
+STEP = np.radians(10.0)
+"""Between the directions that look around: each side has about a hundred of them."""
+
+LEAST_OPEN = 0.1
+"""Of a side's solid angle: what is less than that open is no side to puncture from."""
+
+LEAST_SEARCHED = 0.4
+"""Of a side's: a grid about the front holds half of what is to the right and to the left."""
+
+ROUND_ABOUT = ("front", "back", "right", "left")
+"""The sides that are spoken of; through feet and head no image shows skin."""
+
+NOT_SHOWN = "lies on what no image shows"
+"""Of the back of a patient without a CT, while the front is open."""
+
+AXES = {"front": "anterior", "back": "posterior", "right": "right", "left": "left", "feet": "feet", "head": "head"}
+FRONT, BACK, WHOLE = '"bed"', '{ z = "posterior", x = "head" }', (0.0, 180.0)
+
+
+class Side(NamedTuple):
+    """What is nearest to one axis of the body, seen from the target.
+
+    Attributes:
+        name: For a person.
+        open: Of its solid angle, the fraction from where a needle can come, whatever organs are in its path.
+        searched: The fraction that the case's grid holds.
+        nearest_mm: The shortest path to its skin; NaN where none is known.
+        why: What closes most of it; "" where it is open.
+    """
+
+    name: str
+    open: float
+    searched: float
+    nearest_mm: float
+    why: str
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is a side to puncture from."""
+        return self.open >= LEAST_OPEN
+
+    def document(self) -> dict[str, Any]:
+        """As it stands under ``sides`` of ``--json``."""
+        return {**self._asdict(), "nearest_mm": finite(self.nearest_mm)}
+
+
+class Grid(NamedTuple):
+    """Which directions are searched: the range of theta, degrees, and the entry frame as TOML writes it."""
+
+    theta_deg: tuple[float, float]
+    frame: str
+
+
+def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
+    """Look around from the target, at the skin, what lies outside of it and the needle's length; organs do not count.
+
+    Args:
+        case: The validated case; none of a patient has no sides.
+        anatomy: Its structures.
+    """
+    if case.space is Space.LOCAL:
+        return ()
+    around = grid((0.0, np.pi), (0.0, 2.0 * np.pi), STEP, np.eye(3))
+    assert around.grid is not None
+    cell, outward = around.grid.solid_angle(), around.outward_ct
+    nearest = (outward @ np.array([ANATOMICAL_LPS[axis] for axis in AXES.values()]).T).argmax(axis=1)
+    paths, within = skin_paths(anatomy.skin, case.target_ct, outward, case.needle.length_mm), _within(case, outward)
+    closed = _closed(case, anatomy, paths, outward)
+    free = ~np.any([rows for _, rows in closed], axis=0)
+    sides = []
+    for number, name in enumerate(AXES):
+        side = nearest == number
+        whole, most = cell[side].sum(), max(closed, key=lambda one: float(cell[side & one[1]].sum()))
+        is_open, searched = (float(cell[side & some].sum() / whole) for some in (free, within))
+        near = float(np.fmin.reduce(paths.path_length[side]))
+        sides.append(Side(name, is_open, searched, near, "" if is_open >= LEAST_OPEN else most[0]))
+    front, back, *rest = sides
+    known = anatomy.scan is not None or case.ct.table == "none" or case.region == "phantom"
+    if front.is_open and not known:
+        back = back._replace(open=0.0, why=NOT_SHOWN)
+    return (front, back, *rest)
+
+
+def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) -> list[tuple[str, Bools]]:
+    """Why no needle comes from some directions, and from which, whatever organs are there."""
+    length, needle = paths.path_length, case.needle
+    unseen = np.isnan(length) | ~np.isnan(paths.unknown_depth)
+    table = "lies on the table" if anatomy.couch is not None else "is near to where the image ends"
+    closed = [("is beyond where the image ends", np.asarray(unseen))]
+    for name, why in ((OUTSIDE_BODY, table), (ATTACHED_LIMB, "lies at what seems to be a limb")):
+        meshes = [one.mesh for one in anatomy.checked if one.name == name]
+        for mesh in meshes:
+            closed.append((why, ~unseen & _crosses(mesh, case.target_ct, outward_ct, needle.length_mm)))
+    return [
+        *closed,
+        (f"is farther than the needle's longest path, {needle.longest_path_mm:g} mm", length > needle.longest_path_mm),
+        ("is met too obliquely", paths.skin_angle > case.search.max_skin_angle),
+        ("is left and entered again", ~np.isnan(paths.reentry_depth)),
+    ]
+
+
+def _crosses(mesh: TriangleMesh, target_ct: Floats, outward_ct: Floats, length_mm: float) -> Bools:
+    """Which straight needles meet a surface, shape (n,)."""
+    return np.asarray(crossings(mesh, target_ct, outward_ct, length_mm).count > 0)
+
+
+def _within(case: Case, outward_ct: Floats) -> Bools:
+    """Which directions the case's grid holds, shape (n,)."""
+    theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
+    (low, high), (first, last), slack = case.search.theta, case.search.beta, GRID_SLACK
+    turned = (first - slack <= beta) & (beta <= last + slack)
+    return np.asarray((low - slack <= theta) & (theta <= high + slack) & (turned | (np.sin(theta) < slack)))
+
+
+def grid_of(sides: Sequence[Side]) -> Grid:
+    """The grid that covers the sides that are open: front or back with what is beside it, or all around."""
+    is_open = {side.name: side.is_open for side in sides}
+    if is_open["back"] and not is_open["front"]:
+        return Grid((0.0, 90.0), BACK)
+    beside = not is_open["front"] and (is_open["left"] or is_open["right"])
+    return Grid(WHOLE if is_open["back"] or beside else (0.0, 90.0), FRONT)
+
+
+def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
+    """From where a needle can come, and why not from the others.
+
+    Args:
+        sides: As `sides_of` found them.
+        searched: Whether the case's grid counts: what it does not hold is named.
+    """
+    spoken = [side for side in sides if side.name in ROUND_ABOUT]
+    here = [side.name for side in spoken if (side.searched >= LEAST_SEARCHED if searched else side.is_open)]
+    parts = [_listed(here) or "no side"]
+    for why in dict.fromkeys(side.why for side in spoken if not side.is_open):
+        names = [side.name for side in spoken if side.why == why]
+        are = why.replace("is ", "are ", 1).replace("lies ", "lie ", 1)
+        parts.append(f"the {_listed(names)} {why if len(names) == 1 else are}")
+    missed = [side for side in spoken if searched and side.is_open and side.name not in here]
+    parts += [f"not the {side.name}, where skin is {side.nearest_mm:.0f} mm away" for side in missed]
+    return "; ".join(parts)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Both sides as one.
+
+    >>> _listed(["front", "right", "left"])
+    'front and sides'
+    """
+    both = {"right", "left"} <= set(names)
+    said = [*(one for one in names if not (both and one in {"right", "left"})), *(["sides"] if both else [])]
+    return " and ".join([", ".join(said[:-1]), said[-1]] if len(said) > 1 else said)
