@@ -55,9 +55,10 @@ STRAIGHT_MM, TILT, WIDTH_MM = 6.0, 0.7, (5.0, 40.0)
 descends at 45 degrees), and is so wide."""
 ASIDE, LATERAL_FRACTION = 0.5, 0.8
 """It lies so far from the middle, of the half width; in so many slices no other bone of its side is more lateral."""
-FLAT, SLACK_MM = 1.5, 5.0
-"""From its bone a limb that is pressed flat reaches so many times as far as the air is away, and so much farther."""
-BEYOND_ENDS_MM = 50.0
+FLAT, SLACK_MM = 1.25, 5.0
+"""From its bone a limb that is pressed flat reaches so many times as far as the air is away, and so much farther: that
+holds .994 and more of the arms of drawn patients, beside two thirds as much of the trunk at most."""
+BEYOND_ENDS_MM = 30.0
 """So far beyond the end of its bone a limb goes on, to a joint and the next bone."""
 
 FULL = np.ones((3, 3, 3), bool)
