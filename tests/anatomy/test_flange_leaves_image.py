@@ -236,3 +236,25 @@ def test_no_reported_depth_exceeds_the_flange(tmp_path):
     assert 20 < close.sum() < 300
     assert (found.verdict.depth[close] <= flange[close] + 1e-9).all()
     np.testing.assert_array_equal(close, 295.0 - np.cos(tilt) * flange < 0.6)
+
+
+def test_a_catalogue_says_what_a_case_with_that_needle_says(tmp_path):
+    """Each needle's count is that of a case of its own; the shortest that fits the best path, straight in, is named."""
+    context = cut_case(tmp_path, "lengths_mm = [110.0, 210.0, 160.0]")
+    context = replace(context, case=replace(context.case, search=replace(context.case.search, step=10 * DEG)))
+    (said,) = (one for one in context.search().findings if one.code == "needle_catalogue")
+    expected = []
+    for shaft in (50.0, 100.0, 150.0):
+        needle = replace(context.case.needle, length_mm=shaft + 60.0, shaft_mm=shaft, lengths_mm=())
+        expected.append(replace(context, case=replace(context.case, needle=needle)).search().safe.sum())
+    assert said.numbers["lengths_mm"] == [110.0, 160.0, 210.0]
+    assert said.numbers["safe"] == expected
+    assert expected[0] == 0 and min(expected[1:]) > 100
+    assert said.numbers["shortest_mm"][0] == 160.0
+
+
+@pytest.mark.parametrize("lengths", ["[160.0]", "[60.0, 210.0]"])
+def test_a_catalogue_without_the_needle_or_with_one_that_has_no_shaft_is_refused(tmp_path, lengths):
+    """``length_mm`` is one of them, and each is longer than the holder by 10 mm at least."""
+    with pytest.raises(InputError, match="lengths_mm"):
+        cut_case(tmp_path, f"lengths_mm = {lengths}")
