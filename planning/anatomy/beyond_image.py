@@ -55,10 +55,11 @@ def beyond_images(case: Case, skin: Skin, scan: Scan | None) -> Beyond:
     ends = [end for end in [*ends, *([] if of_scan is None else [of_scan])] if end[0].cut.any()]
     if not ends:
         return Beyond((), ())
-    found, moved = [assumed(case, view) for view, _ in ends], _breath(case)
-    mesh = joined([beyond_image(*end, one.wider_mm, moved) for end, one in zip(ends, found, strict=True)])
+    found = [assumed(case, view) for view, _ in ends]
+    mesh = joined([beyond_image(*end, one.wider_mm, _breath(case)) for end, one in zip(ends, found, strict=True)])
     solid = Structure(BEYOND_IMAGE, Role.UNKNOWN, case.ct.margin_mm, mesh, "beyond the image", True, np.zeros((3, 3)))
-    return Beyond((solid,), tuple(_finding(view, one) for (view, _), one in zip(ends, found, strict=True)))
+    said = [_finding(view, one) for (view, _), one in zip(ends, found, strict=True)]
+    return Beyond((solid,), tuple({one.sentence: one for one in said}.values()))
 
 
 def assumed(case: Case, view: FieldOfView) -> Assumed:
