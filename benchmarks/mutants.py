@@ -72,7 +72,7 @@ PLAIN = MappingProxyType(
             f"puncture_twin.planning.reach.{module}": tuple(
                 f"tests/reach/test_standoff.py::{test}" for test in STANDOFF
             )
-            for module in ("standoff", "skin_gap", "axis_lengths")
+            for module in ("standoff", "skin_gap")
         },
         "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),
         "puncture_twin.planning.search.constraints": ("tests/search/test_verdict_order.py",),

@@ -43,8 +43,9 @@ def _triangles(triangles, pairs, turns):
     triangles, pairs = bare(triangles), bare(pairs)
     for i in range(0, turns, 16):
         for k in range(16):
+            pairs[11, k] = 210.0
             bring_into_frame(Z, X, Y, triangles, (i + k) & 255, (0.0, 0.0, 0.0), pairs, k)
-        measure_beside(pairs, 16, 210.0)
+        measure_beside(pairs, 16)
 
 
 def unit_costs() -> tuple[float, float, float]:

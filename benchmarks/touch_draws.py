@@ -25,7 +25,7 @@ from benchmarks.timing import least_seconds
 from benchmarks.trust import Scene, punctures, scenes
 from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
 from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.reach.axis_lengths import axis_lengths
+from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.chances import demanding
 from puncture_twin.planning.uncertainty.lines.line_sampling import line_chance
@@ -54,7 +54,7 @@ def model_of(scene: Scene, size: float) -> ChanceModel:
 def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
     """Rows: by draws, then as in `NAMES`, seconds of lines; of each direction, structure and threshold."""
     case, anatomy, engine, rng = scene.context.case, scene.context.anatomy, scene.context.engine, _rng()
-    columns, lengths = demanding(anatomy.checked), axis_lengths(case, anatomy.checked)
+    columns, lengths = demanding(anatomy.checked), own_lengths(case, anatomy, scene.outward_ct)
     needles, rows = model.needles(scene.outward_ct, scene.q), []
     cov_ct, near = needles.cov_ct, needles.near
     for i, outward in enumerate(scene.outward_ct):
@@ -62,7 +62,7 @@ def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
         origins, along = case.target_ct + errors[:, :3], exp_rotation(errors[:, 3:]) @ outward
         doubt = needle_doubt(case.target_ct, outward, cov_ct[i], 0.0)
         for place, column in enumerate(columns):
-            length = float(lengths[column])
+            length = float(lengths[i, column])
             for threshold in case.needle.radius_mm + np.array([0.0, anatomy.checked[column].margin_mm]):
                 first = touch_chance(near, threshold)[i, place]
                 start = time.thread_time()
@@ -79,7 +79,7 @@ def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
                     one = one_line(faces, doubt, length, float(threshold), gradient)
                     ten = ten_distances(faces, doubt, length, float(threshold), gradient)
                     rows.append((drawn, first, lines, one, ten, took))
-                    _measured_again(scene, int(column), origins, along, threshold, distance)
+                    _measured_again(scene, int(column), (origins, along, length), threshold, distance)
     return np.array(rows).reshape(-1, 6)
 
 
@@ -110,12 +110,12 @@ def _rng() -> np.random.Generator:
 
 
 def _measured_again(
-    scene: Scene, column: int, origins: np.ndarray, along: np.ndarray, threshold: float, distance: np.ndarray
+    scene: Scene, column: int, axes: tuple[np.ndarray, np.ndarray, float], threshold: float, distance: np.ndarray
 ) -> None:
     """The needle that passes nearest to touching, by the whole engine: the same."""
     row = int(np.argmin(np.abs(distance - 0.9 * threshold)))
-    lengths = axis_lengths(scene.context.case, scene.context.anatomy.checked)
-    whole = scene.context.engine.measure(origins[row], along[row][None], lengths, shown=False).distance[0, column]
+    origins, along, length = axes
+    whole = scene.context.engine.measure(origins[row], along[row][None], length, shown=False).distance[0, column]
     if min(whole, distance[row]) < threshold and abs(whole - distance[row]) > AGREE_MM:
         raise AssertionError(f"the engine says {whole} mm, the faces near the needle {distance[row]} mm")
 
@@ -125,7 +125,7 @@ def cost(scene: Scene, model: ChanceModel) -> tuple[float, float, float, float]:
     case, anatomy, engine = scene.context.case, scene.context.anatomy, scene.context.engine
     many = 4000 // len(scene.q)
     outward, q = np.tile(scene.outward_ct, (many, 1)), np.tile(scene.q, (many, 1))
-    lengths, rows = axis_lengths(case, anatomy.checked), np.arange(len(q))
+    lengths, rows = own_lengths(case, anatomy, outward), np.arange(len(q))
     axes = engine.measure(case.target_ct, outward, lengths, shown=False)
     works = (
         lambda: engine.measure(case.target_ct, outward, lengths, shown=False),

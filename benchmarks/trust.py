@@ -34,7 +34,7 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.clearance.near_faces import near_faces
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.reach.axis_lengths import axis_lengths
+from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
@@ -327,7 +327,8 @@ def _came(of: Scene, puncture: Puncture, error: PoseError, rooms: Rooms) -> tupl
 def _touched(of: Scene, puncture: Puncture, rooms: Rooms, shift: float) -> np.ndarray:
     """Which rooms touch what, shape (n, k); their tips are no farther off than a shift."""
     case, checked = of.context.case, of.context.anatomy.checked
-    columns, lengths, radius = demanding(checked), axis_lengths(case, checked), case.needle.radius_mm
+    columns, radius = demanding(checked), case.needle.radius_mm
+    lengths = own_lengths(case, of.context.anatomy, puncture.outward_ct[None])[0]
     turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1).max(initial=0.0)
     touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.beyond_image import beyond_images
 from puncture_twin.planning.anatomy.beyond_labels import beyond_labels
 from puncture_twin.planning.anatomy.body.limbs import NamedBones
 from puncture_twin.planning.anatomy.body.tables import support_warnings
@@ -128,13 +129,15 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         if case.ct.unnamed == "free":
             loader.warnings.append(UNNAMED_FREE)
         structures.extend(_unnamed(case, scan, structures))
-    beyond = beyond_labels(case, skin, structures)
+    unseen, beyond = beyond_images(case, skin, scan), beyond_labels(case, skin, structures)
+    outside = (*outside, *unseen.structures)
     structures.extend(beyond.structures)
     _check_names(case, [*structures, *outside])
     read = {one.name: one.mesh for one in structures if one.source != OWN_TARGET}  # the ball is ours
     of_meshes = kept_mesh_warnings(read, cache)
     warnings = (*loader.warnings, *beyond.warnings, *left_out, *skin.warnings, *of_meshes)
-    return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch, tuple(guesses))
+    found = (*guesses, *unseen.findings)
+    return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch, found)
 
 
 def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Finding:

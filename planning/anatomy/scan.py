@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,11 +13,11 @@ import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
+from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
 from puncture_twin.planning.anatomy.body.limbs import NamedBones, limb_search
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_LONG_MM,
     OutsideImage,
-    beyond_body,
     beyond_face,
     beyond_table,
     outside_mask,
@@ -24,14 +25,15 @@ from puncture_twin.planning.anatomy.body.outside_body import (
 )
 from puncture_twin.planning.anatomy.body.tables import FACES, TableSide, find_support
 from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
-from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.anatomy.skin import Skin, field_of_view
 from puncture_twin.planning.anatomy.surfaces import Imaged, kept_mesh, mesh_arrays
-from puncture_twin.planning.base.arrays import Bools
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.mesh_guard import fits
 from puncture_twin.planning.formats.volumes.nearest_voxel import nearest
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 
 SKIN_TOLERANCE_MM = 3.0
@@ -92,12 +94,29 @@ class Scan:
         """What is outside of the body, what lies beyond tables, and what beyond each open face."""
         measured = mask & ~image.unscanned.voxels
         support = find_support(measured, image.body, image.spacing_mm, self._tables, self._ct.shown)
-        solids = [outside_surface(image, mask, where=self._ct.where)]
-        solids += [] if self.skin is None else beyond_body(image)
         supports = [beyond_table(image, side) for side in (*self._tables, *support.drawn)]
         wider = image.beyond_mm[0]
         faces = [beyond_face(image, *face, wider_mm=wider) if face in support.open_faces else None for face in FACES]
-        return [_joined(solids), _joined(supports), *faces]
+        return [outside_surface(image, mask, where=self._ct.where), _joined(supports), *faces]
+
+    def end(self) -> tuple[FieldOfView, Floats] | None:
+        """Where this image cuts a body whose skin is not its own, and points (n, 3) of its outlines there, LPS mm.
+
+        None where it does nowhere, or the skin is its own and tells.
+        """
+        if self.skin is None:
+            return None
+
+        def make() -> Arrays:
+            body, T = self._body, self._ct.T_ct_index
+            view, last = field_of_view(body, T), body.copy()
+            last[1:-1, 1:-1, 1:-1] = False
+            corners = [np.argwhere(last) + 0.5 * np.array(to) for to in itertools.product((-1, 1), repeat=3)]
+            points = apply(T, np.concatenate(corners))
+            return {"T": view.T_ct_box, "size": view.size_mm, "cut": view.cut, "points": points}
+
+        kept = self.source.kept({"what": "end", "skin": self.skin.mesh.digest}, make, dict, by=__name__)
+        return (FieldOfView(kept["T"], kept["size"], kept["cut"]), kept["points"]) if kept["cut"].any() else None
 
     @property
     def _tables(self) -> tuple[TableSide, ...]:

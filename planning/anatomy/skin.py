@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, filled_slices
-from puncture_twin.planning.anatomy.body.cut_ends import Box, shifted, spacing_of
-from puncture_twin.planning.anatomy.body.field_of_view import SIDES, FieldOfView, cut_warnings, open_to_air
+from puncture_twin.planning.anatomy.body.cut_ends import SIDES, Box, FieldOfView, shifted, spacing_of
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import field_surface
@@ -108,7 +107,6 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
     Args:
         mesh: In LPS mm (or the local frame, without cuts).
         cut: Sides at which the body was cut flat, as `SIDES` names them: there the mesh ends, and the body goes on.
-            Air beside a cut is unknown too, however far away: the box is open to all other sides.
 
     Raises:
         InputError: If no triangle lies in the plane where a side was cut.
@@ -129,8 +127,7 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
         if not in_plane.any():
             raise InputError(f"no flat end at its {name}", where="skin mesh", allowed="a side where the body was cut")
         cut_faces |= in_plane
-    view = open_to_air(pose(np.eye(3), low), high - low, sides)
-    return Skin(mesh, cut_faces, view, warnings + cut_warnings(view))
+    return Skin(mesh, cut_faces, FieldOfView(pose(np.eye(3), low), high - low, sides), warnings)
 
 
 def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
@@ -157,19 +154,19 @@ def _skin(
     where: str | Path,
 ) -> Skin:
     mesh = field_surface(field, T_ct_index, where=where)
-    view = _field_of_view(found.body, T_ct_index)
+    view = field_of_view(found.body, T_ct_index)
     centres = mesh.triangles.mean(axis=1)
     cut_faces = _on_cut_border(view, spacing_of(T_ct_index), centres) | _at_unscanned(found, T_ct_index, centres)
-    return Skin(mesh, cut_faces, view, found.warnings + cut_warnings(view))
+    return Skin(mesh, cut_faces, view, found.warnings)
 
 
-def _field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
+def field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
     """Up to the outer faces of the border voxels that the body reaches."""
     spacing = spacing_of(T_ct_index)
     axes, origin = T_ct_index[:3, :3], T_ct_index[:3, 3]
     T_ct_image = pose(axes / spacing, origin - 0.5 * axes.sum(axis=1))
     cut = [[bool(body.take(side, axis=axis).any()) for side in (0, -1)] for axis in range(3)]
-    return open_to_air(T_ct_image, spacing * body.shape, np.array(cut))
+    return FieldOfView(T_ct_image, spacing * body.shape, np.array(cut))
 
 
 def _on_cut_border(

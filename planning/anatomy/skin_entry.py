@@ -21,9 +21,8 @@ class SkinPaths:
         path_length: Shape (n,), target to entry.
         skin_angle: Shape (n,), between the path and the skin's inward normal.
         reentry_depth: Shape (n,), where the needle would meet skin again, before where its flange waits.
-        unknown_depth: Shape (n,), where the path leaves what the scan shows through a face that cuts the body, before
-            where the inserted needle's flange is, or where the skin's crossings do not add up.
-        view_depth: Shape (n,), where the path leaves the image through a face that cuts the body, however far.
+        unknown_depth: Shape (n,), where the path leaves the body through a cut, or 0 where the skin's crossings do not
+            add up.
     """
 
     entry_ct: Floats
@@ -31,22 +30,17 @@ class SkinPaths:
     skin_angle: Floats
     reentry_depth: Floats
     unknown_depth: Floats
-    view_depth: Floats
 
 
-def skin_paths(
-    skin: Skin, target_ct: Floats, outward_ct: Floats, length: float, farthest: float | None = None
-) -> SkinPaths:
+def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: float) -> SkinPaths:
     """Follow every path from the target outward.
 
     Args:
         skin: The body's surface.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
-        length: Needle length, tip to flange: how far unknown regions matter to an inserted needle, mm.
-        farthest: How far skin matters, mm: to where the flange can be while the tip waits; ``length`` if left out.
+        farthest: How far skin matters, mm: to where the flange can be while the tip waits.
     """
-    view = view_depth(skin, target_ct, outward_ct)
     found, settled = settled_crossings(skin.mesh, target_ct, outward_ct)
     has = found.count > 0
     first = found.first[has]
@@ -55,33 +49,13 @@ def skin_paths(
     again = found.count > 1
     reentry = np.full(len(outward_ct), np.nan)
     reentry[again] = found.depth[found.first[again] + 1]
-    reentry[reentry > (length if farthest is None else farthest)] = np.nan
+    reentry[reentry > farthest] = np.nan
     cut = has & skin.cut_faces[face]
-    unknown = np.where(view < length, view, np.nan)
-    unknown[cut] = depth[cut]
+    unknown = np.where(cut, depth, np.nan)
     if skin.mesh.closed:
         unknown[~settled] = 0.0
     depth[cut] = np.nan
     entry = target_ct + depth[:, None] * outward_ct
     cosine = np.abs(np.einsum("ij,ij->i", smooth_normals(skin.mesh, face, entry), outward_ct))
     angle = np.where(np.isnan(depth), np.nan, np.arccos(np.minimum(cosine, 1)))
-    return SkinPaths(entry, depth, angle, reentry, unknown, view)
-
-
-def view_depth(skin: Skin, target_ct: Floats, outward_ct: Floats) -> Floats:
-    """Where each path leaves the field of view through a face beyond which the body goes on, NaN elsewhere.
-
-    Also in the air: what lies beside the image at that face is a body of which nothing is known.
-
-    Args:
-        skin: With its field of view.
-        target_ct: Shape (3,), where the paths start, mm.
-        outward_ct: Shape (n, 3), unit.
-
-    Raises:
-        InputError: The target lies outside the image.
-    """
-    if skin.field_of_view is None:
-        return np.full(len(outward_ct), np.nan)
-    out = skin.field_of_view.exit(target_ct, outward_ct)
-    return np.where(out.cut, out.depth_mm, np.nan)
+    return SkinPaths(entry, depth, angle, reentry, unknown)

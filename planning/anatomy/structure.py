@@ -31,8 +31,7 @@ class Structure:
         margin_mm: The clearance that it demands, where its role demands one.
         mesh: In the CT frame, mm.
         source: The file it comes from, and the label in it.
-        outside: Whether it is outside of the body, where the needle waits at its standoff: it is then checked
-            against the needle's axis up to where the flange waits, not only to where the flange ends.
+        outside: Whether it is outside of the body: then it is checked up to where the flange waits at its standoff.
         voxel_ct: Shape (3, 3), the edges of the voxels that it was made of as columns, mm; None for one that no volume
             shows, such as a mesh: nobody knows then how far its surface may lie off.
     """

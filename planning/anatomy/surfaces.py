@@ -15,13 +15,13 @@ from puncture_twin.planning.anatomy.body.body_mask import CtImage, ct_image
 from puncture_twin.planning.anatomy.body.cut_ends import (
     Box,
     Content,
+    FieldOfView,
     content_of,
     cut_ends,
     end_warnings,
     shifted,
     stated_ends,
 )
-from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_label, skin_from_mesh, skin_of_image
 from puncture_twin.planning.base.arrays import Floats

@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.breathing.breathing import Breathing
@@ -18,6 +17,7 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.needle.deflection import Bending
 from puncture_twin.planning.needle.shaft import GAUGES, Shaft
+from puncture_twin.planning.reach.standoff import own_paths
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_uncertainty
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty
@@ -72,7 +72,7 @@ def bent_path(case: Case, anatomy: Anatomy, outward_ct: Floats) -> BentPath | No
     """
     if case.bending is None:
         return None
-    paths = skin_paths(anatomy.skin, case.target_ct, outward_ct[None], case.needle.length_mm)
+    paths = own_paths(case, anatomy.skin, outward_ct[None])
     length = float(paths.path_length[0])
     return BentPath(case, anatomy, outward_ct, length, case.bending) if np.isfinite(length) else None
 

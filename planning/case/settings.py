@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -23,7 +23,7 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 @dataclass(frozen=True)
 class Needle:
-    """The needle on the flange; lengths in mm, from the tip."""
+    """The needle on the flange; lengths in mm, from the tip. ``lengths_mm``: of those there are, tip to flange."""
 
     length_mm: float
     shaft_mm: float
@@ -31,11 +31,16 @@ class Needle:
     standoff_mm: float | None
     skin_gap_mm: float
     holder_diameter_mm: float
+    lengths_mm: tuple[float, ...] = ()
 
     @property
     def radius_mm(self) -> float:
         """Half the diameter."""
         return self.diameter_mm / 2
+
+    def of_length(self, length_mm: float) -> Needle:
+        """A needle of the same kind: the same holder, and a shaft that is as much shorter or longer."""
+        return replace(self, length_mm=length_mm, shaft_mm=self.shaft_mm + length_mm - self.length_mm)
 
     @property
     def longest_path_mm(self) -> float:

@@ -35,10 +35,11 @@ from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_
 from puncture_twin.planning.certify.html import certificate_html
 from puncture_twin.planning.certify.question import Question
 
-CERTIFICATE_VERSION = 6
+CERTIFICATE_VERSION = 7
 """Version of the file's layout and of what a cell claims. 3: lists its inputs with their roles, files that a file names
 included; a length each structure is checked to. 4: a safe cell keeps the image up to the flange at standoff. 5: a
-chance to touch that no safe cell exceeds, to first order. 6: whatever the structure's shape."""
+chance to touch that no safe cell exceeds, to first order. 6: whatever the structure's shape. 7: what is outside of
+the body, and beyond the image, counts up to each direction's own flange."""
 
 MAX_CERTIFICATE_BYTES = 500_000_000
 """A certificate has some ten thousand cells; a larger file is something else."""
@@ -48,7 +49,7 @@ CERTIFICATE_ALLOWED = f"a certificate of version {CERTIFICATE_VERSION}, as searc
 NAMES = frozenset({
     *("version", "case", "inputs", "target_ct_mm", "R_ct_entry", "theta_rad", "beta_rad", "length_mm", "standoff_mm"),
     *("skin_gap_mm", "farthest_flange_mm", "radius_mm", "longest_path_mm", "max_skin_angle_rad", "margins_mm"),
-    *("lengths_mm", "touch", "size_rad", "queries", "summary", "tree", "witness"),
+    *("touch", "size_rad", "queries", "summary", "tree", "witness"),
 })  # fmt: skip
 """The keys of a certificate."""
 
@@ -57,7 +58,7 @@ CONE_ROUNDING_RAD = 1e-7
 
 CERTIFIED = (
     "clearance to every structure with a margin",
-    "field of view up to the flange at standoff, and faces that cut the body",
+    "what is outside of the body, or beyond the image, up to the flange at standoff; faces that cut the body",
     "skin entry",
     "skin re-entry up to the flange at standoff",
     "path length",
@@ -227,7 +228,6 @@ def write_certificate(certificate: Certificate, path: Path) -> None:
         "longest_path_mm": question.longest,
         "max_skin_angle_rad": question.max_skin_angle,
         "margins_mm": dict(zip(question.structures, question.margins.tolist(), strict=True)),
-        "lengths_mm": dict(zip(question.structures, question.lengths.tolist(), strict=True)),
         "touch": question.touch,
         "size_rad": certificate.size,
         "queries": certificate.queries,
@@ -305,9 +305,7 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
 
 def _question(document: dict[str, Any]) -> Question:
     names, standoff, touch = tuple(document["margins_mm"]), document["standoff_mm"], document["touch"]
-    if set(document["lengths_mm"]) != set(names):
-        raise ValueError("lengths_mm and margins_mm name other structures")
-    margins, lengths = ([document[key][name] for name in names] for key in ("margins_mm", "lengths_mm"))
+    margins = [document["margins_mm"][name] for name in names]
     return Question(
         case_name=field(document, "case", text),
         inputs=field(document, "inputs", read_inputs),
@@ -324,7 +322,6 @@ def _question(document: dict[str, Any]) -> Question:
         max_skin_angle=field(document, "max_skin_angle_rad", number),
         structures=names,
         margins=array(margins, (len(names),)),
-        lengths=array(lengths, (len(names),)),
         touch=None if touch is None else number(touch),
     )
 

@@ -19,7 +19,7 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.certificate import Certificate
-from puncture_twin.planning.certify.plain_skin import PlainSkin, SkinFacts, leaves_view
+from puncture_twin.planning.certify.plain_skin import PlainSkin, SkinFacts
 from puncture_twin.planning.certify.question import question_of
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.reach.standoff import waiting_flange
@@ -81,16 +81,16 @@ class _Cell:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What is proven all over a cell: which triangles may be near, the skin, whether needles leave the image.
+    """What is proven all over a cell: which triangles may be near, the skin, where the flanges of waiting needles are.
 
-    Needles count up to the flange while the tip waits, in directions along which one may wait.
+    Those count along which a tip may wait; at least and at most so far from the target, mm.
     """
 
     skin: Ints
     organs: Ints
+    flange: tuple[float, float]
     facts: SkinFacts | None = None
     skin_good: bool = False
-    leaves: bool | None = None
 
 
 def verify(
@@ -137,21 +137,22 @@ class _Checker:
         self._certificate = certificate
         self._question = certificate.question
         self._needle = case.needle
-        self._view = anatomy.skin.field_of_view
         self._skin = PlainSkin(anatomy.skin, case.target_ct)
         self._even = self._skin.closed and not self._skin.odd()
-        meshes = [s.mesh for s in anatomy.checked if s.demands_margin]
+        demanding = [s for s in anatomy.checked if s.demands_margin]
+        meshes, self._beside = [s.mesh for s in demanding], np.array([s.outside for s in demanding], bool)
         self._organs = np.concatenate([m.triangles for m in meshes] or [np.empty((0, 3, 3))]) - case.target_ct
         self._first = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)])
         self._limits = self._question.margins + self._question.radius
         self._limit = np.repeat(self._limits, np.diff(self._first))
-        self._length = np.repeat(self._question.lengths, np.diff(self._first))
+        self._outside = np.repeat(self._beside, np.diff(self._first))
         self._inside = [side_of(mesh, case.target_ct) is Side.INSIDE for mesh in meshes]
 
     def run(self, progress: Count | None) -> Verification:
         """Walk the tree, level by level; the leaves come in the certificate's order."""
         question = self._question
-        nothing = _Known(np.arange(len(self._skin.corners)), np.arange(len(self._organs)))
+        flange = float(waiting_flange(self._needle, 0.0, 0.0)), question.farthest
+        nothing = _Known(np.arange(len(self._skin.corners)), np.arange(len(self._organs)), flange)
         cells = [(_Cell(question.theta, question.beta, question.R_ct_entry), nothing)]
         leaf, total = 0, len(self._certificate.leaves)
         for level in self._certificate.tree:
@@ -173,32 +174,32 @@ class _Checker:
         question = self._question
         if cell.rho > WIDEST:
             return whole
-        skin, organs, facts, good, leaves = whole.skin, whole.organs, None, whole.skin_good, whole.leaves
-        limit = self._limit[organs] + CLEARANCE_PAD_MM
-        organs = organs[~_apart(self._organs[organs], limit, cell, self._length[organs])]
-        if leaves is None:
-            leaves = self._leaves(cell, None)
-        if not good or leaves is None:
+        skin, facts, good, flange = whole.skin, None, whole.skin_good, whole.flange
+        organs = self._narrowed(whole.organs, cell, flange)
+        if not good or self._outside[organs].any():
             everywhere = np.full(len(skin), CONTACT_MM), cell, np.full(len(skin), question.farthest)
             skin = skin[~_apart(self._skin.corners[skin], *everywhere)]
             if cell.rho <= SKIN_BELOW:
                 lengths = {"length": question.farthest, "longest": question.longest}
                 facts = self._skin.facts(skin, cell.u, cell.rho, cell.ray(0.4142, 0.5432), **lengths)
                 good = good or self._skin_good(facts)
-                leaves = self._leaves(cell, facts) if leaves is None else leaves
-        return _Known(skin, organs, facts, good, leaves)
+                flange = self._flange(facts, flange)
+                organs = self._narrowed(organs, cell, flange)
+        return _Known(skin, organs, flange, facts, good)
 
-    def _leaves(self, cell: _Cell, skin: SkinFacts | None) -> bool | None:
-        """Whether flanges of the cell leave the image, as far as the skin's facts, or none of them, tell (lemma 9)."""
-        near, far, low, high = 0.0, np.inf, 0.0, np.inf
-        if skin is not None:
-            near, far, low, high = skin.least_skin, skin.farthest, skin.least_angle, skin.largest_angle
+    def _narrowed(self, organs: Ints, cell: _Cell, flange: tuple[float, float]) -> Ints:
+        """The triangles, of some, that are not proven clear of a cell whose flanges wait there."""
+        limit = self._limit[organs] + CLEARANCE_PAD_MM
+        length = np.where(self._outside[organs], flange[1] + DEPTH_PAD_MM, self._question.length)
+        return organs[~_apart(self._organs[organs], limit, cell, length)]
+
+    def _flange(self, skin: SkinFacts, known: tuple[float, float]) -> tuple[float, float]:
+        """Where the flanges are by the skin's facts, and by what was known before (lemma 9)."""
         longest, largest = self._question.longest, self._question.max_skin_angle
-        shallow, steep = max(low - ANGLE_PAD_RAD, 0.0), high + ANGLE_PAD_RAD
-        least = waiting_flange(self._needle, min(near, longest), min(shallow, largest))
-        most = waiting_flange(self._needle, min(far, longest), min(steep, largest))
-        flange = float(least), float(most)
-        return leaves_view(self._view, self._question.target_ct, cell.u, cell.rho, flange, DEPTH_PAD_MM)
+        shallow, steep = max(skin.least_angle - ANGLE_PAD_RAD, 0.0), skin.largest_angle + ANGLE_PAD_RAD
+        least = waiting_flange(self._needle, min(skin.least_skin, longest), min(shallow, largest))
+        most = waiting_flange(self._needle, min(skin.farthest, longest), min(steep, largest))
+        return max(known[0], float(least)), min(known[1], float(most))
 
     def _check_leaf(self, cell: _Cell, whole: _Known, letter: str, row: int) -> None:
         reason, structure = str(self._certificate.reason[row]), str(self._certificate.structure[row])
@@ -207,7 +208,7 @@ class _Checker:
         elif letter == "S":
             proven = not reason and self._safe(self._learn(cell, whole))
         elif reason == "too_close":
-            proven = self._too_close(cell, structure, int(self._certificate.triangle[row]))
+            proven = self._too_close(cell, whole, structure, int(self._certificate.triangle[row]))
         else:
             proven = self._skin_rejects(self._learn(cell, whole), reason)
         if not proven:
@@ -217,11 +218,11 @@ class _Checker:
             raise InputError(what, where="certificate", allowed="claims that follow from the case")
 
     def _safe(self, known: _Known) -> bool:
-        """No structure comes near, and the skin is met once, soon enough and steeply enough, in what was imaged."""
+        """No structure comes near, and the skin is met once, soon enough and steeply enough."""
         lost = any(self._inside) or self._even
-        return not lost and len(known.organs) == 0 and known.skin_good and known.leaves is False
+        return not lost and len(known.organs) == 0 and known.skin_good
 
-    def _too_close(self, cell: _Cell, structure: str, triangle: int) -> bool:
+    def _too_close(self, cell: _Cell, whole: _Known, structure: str, triangle: int) -> bool:
         """The axes at all corners come so near to one triangle that all between them do too (lemma 2)."""
         if structure not in self._question.structures:
             return False
@@ -232,7 +233,8 @@ class _Checker:
         if not self._first[column] <= row < self._first[column + 1] or cell.rho > WIDEST:
             return False
         surface = _bvh(self._organs[row], np.array([[0, 1, 2]]))
-        length = self._question.lengths[column]
+        outside = self._beside[column]
+        length = self._learn(cell, whole).flange[0] - DEPTH_PAD_MM if outside else self._question.length
         ends = cell.corners * length
         axes = [_bvh(np.stack([np.zeros(3), end]), np.array([[0, 1, 1]])) for end in ends]
         worst = max(max(0.0, fcl.distance(axis, surface)) for axis in axes)
@@ -248,8 +250,8 @@ class _Checker:
         )
 
     def _skin_rejects(self, known: _Known, reason: str) -> bool:
-        """No skin soon enough (whatever else is there), a second crossing, too flat an entry, or out of the image."""
-        if reason == "unknown_region" and (self._even or known.leaves is True):
+        """No skin soon enough (whatever else is there), a second crossing, or too flat an entry."""
+        if reason == "unknown_region" and self._even:
             return True
         facts = known.facts
         if facts is None:
@@ -280,7 +282,7 @@ def _apart(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools
     behind = np.flatnonzero(~found & (middle @ cell.u <= -np.sin(cell.rho)))
     found[behind] = np.einsum("kci,ki->kc", corners[behind], middle[behind]).min(axis=1) >= limit[behind]
     found |= _separated(corners, depth, limit, middle - (middle @ cell.u)[:, None] * cell.u, cell)
-    found |= _behind_own_plane(corners, limit, cell)
+    found |= _before_own_plane(corners, limit, cell, length)
     rest = np.flatnonzero(~found) if cell.rho <= NEAR_BELOW else np.empty(0, np.int64)
     beside = corners[rest] - depth[rest, :, None] * cell.u
     edge = beside[:, [1, 2, 0]] - beside
@@ -291,14 +293,18 @@ def _apart(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools
     return np.asarray(found)
 
 
-def _behind_own_plane(corners: Floats, limit: Floats, cell: _Cell) -> Bools:
-    """Where the triangle's own plane, moved through the target, has every direction of the cell on its other side."""
+def _before_own_plane(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools:
+    """Where every axis of the cell ends before the triangle's own plane, or leads away from it."""
     normal = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     height = np.einsum("kci,ki->kc", corners, normal)
     side = np.where(height[:, :1] >= 0.0, 1.0, -1.0)
     normal, height = normal * side, height * side
-    away = (normal @ cell.corners.T).max(axis=1) + cell.bulge <= 0.0
-    return np.asarray(away & (height.min(axis=1) >= limit))
+    toward, ahead, nearest = (normal @ cell.corners.T).max(axis=1), (cell.corners @ cell.u).min(), height.min(axis=1)
+    away = (toward + cell.bulge <= 0.0) & (nearest >= limit)
+    if ahead <= cell.bulge:
+        return np.asarray(away)
+    most = np.maximum(toward, 0.0) * (1.0 + cell.bulge) / ahead + cell.bulge
+    return np.asarray(away | (nearest - length * most >= limit))
 
 
 def _separated(corners: Floats, depth: Floats, limit: Floats, aside: Floats, cell: _Cell) -> Bools:

@@ -1,7 +1,7 @@
 """Which cells of directions are clear of the organs, and which come too near, by planes and by convexity.
 
-docs/concepts/certificate.md, lemmas 2 to 4. No distance is needed to prove a cell clear: a plane through the target
-that keeps a triangle at the limit from every axis of the cell is proof enough, however it was found.
+docs/concepts/certificate.md, lemmas 2 to 4. No distance is needed to prove a cell clear: a plane that keeps a triangle
+at the limit from every axis of the cell is proof enough, however it was found.
 """
 
 from __future__ import annotations
@@ -37,14 +37,12 @@ class Organs:
         group: Shape (m,), the structure of each, 0 to k - 1.
         limits: Shape (k,), needle radius plus margin, mm.
         zones: The directions to which each triangle matters.
-        lengths: Shape (k,), how far the needle's axis is checked against each structure, mm.
     """
 
     corners: Floats
     group: Ints
     limits: Floats
     zones: Zones
-    lengths: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +65,7 @@ class OrganFacts:
 
 
 def organ_facts(
-    organs: Organs, lists: Lists, parent: Ints, witness: Ints, cones: Cones, *, wide: float, pad: float
+    organs: Organs, lists: Lists, parent: Ints, witness: Ints, cones: Cones, lengths: Floats, *, wide: float, pad: float
 ) -> OrganFacts:
     """Evaluate cells against the triangles that matter to their parents.
 
@@ -77,6 +75,7 @@ def organ_facts(
         parent: Shape (n,), row of each cell's parent.
         witness: Shape (n,), the triangle that nearly rejected each parent, or -1.
         cones: The n cells.
+        lengths: Shape (n, 2), how far their axes are checked, at least and at most, mm.
         wide: Cells with a larger radius are only narrowed, rad.
         pad: Kept from every limit, mm.
     """
@@ -85,7 +84,7 @@ def organ_facts(
     zone = organs.zones.axis, organs.zones.cosine, organs.zones.sine, organs.zones.nearest
     shape = cones.centres, cones.corners, cones.radius, cones.bulge
     start, items, measured = _checked(
-        organs.corners, organs.group, organs.limits, zone, organs.lengths, lists.start, lists.items, parent, witness,
+        organs.corners, organs.group, organs.limits, zone, lengths, lists.start, lists.items, parent, witness,
         shape, wide, pad, (found, rejected, largest),
     )  # fmt: skip
     return OrganFacts(Lists(start, items), found, rejected, largest, measured)
@@ -108,14 +107,14 @@ def _checked(  # type: ignore[no-untyped-def]  # numba infers
             kept = _grown(kept, filled, 2 * (filled + len(candidates)))
         if narrow and witness[i] >= 0:
             t = witness[i]
-            hit, worst = _corners(corners[t], four, lengths[group[t]], limits[group[t]] - pad, bulge[i])
+            hit, worst = _corners(corners[t], four, lengths[i, 0], limits[group[t]] - pad, bulge[i])
             if hit == 4:
                 rejected[i], largest[i], found[i] = True, worst, t
                 continue
             if hit > 0 and radius[i] <= SURELY_MIXED:
                 narrow = False
                 found[i] = t
-        organs, cell = (corners, group, limits, lengths), (u, four, radius[i], bulge[i])
+        organs, cell = (corners, group, limits), (u, four, radius[i], bulge[i], (lengths[i, 0], lengths[i, 1]))
         count, t, looked, reject, worst = _near(organs, zone, candidates, cell, narrow, pad, kept[filled:])
         out_start[i + 1] = filled + count
         measured += looked
@@ -134,9 +133,9 @@ def _near(organs, zone, candidates, cell, narrow, pad, kept):  # type: ignore[no
         How many were kept, none of a rejected cell; the triangle that rejects it, or else lies nearest, -1 for none;
         whether one was measured; whether the cell is rejected, and how far an axis of it is from that triangle at most.
     """
-    corners, group, limits, lengths = organs
+    corners, group, limits = organs
     axis, cosine, sine, nearest = zone
-    u, four, radius, bulge = cell
+    u, four, radius, bulge, lengths = cell
     cos_radius, sin_radius = np.cos(radius), np.sin(radius)
     count, best, found, looked = 0, np.inf, -1, False
     for t in candidates:
@@ -146,7 +145,7 @@ def _near(organs, zone, candidates, cell, narrow, pad, kept):  # type: ignore[no
         if narrow:
             looked = True
             limit, unlike = limits[group[t]], HOPELESS * radius * nearest[t]
-            clear, hit, worst, gap = _beside_cell(corners[t], u, four, bulge, limit, pad, lengths[group[t]], unlike)
+            clear, hit, worst, gap = _beside_cell(corners[t], u, four, bulge, limit, pad, lengths, unlike)
             if clear:
                 continue
             if hit == 4:
@@ -166,17 +165,17 @@ def _elsewhere(toward, cosine, sine, cos_radius, sin_radius):  # type: ignore[no
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _beside_cell(t, u, four, bulge, limit, pad, length, unlike):  # type: ignore[no-untyped-def]  # numba infers
+def _beside_cell(t, u, four, bulge, limit, pad, lengths, unlike):  # type: ignore[no-untyped-def]  # numba infers
     """What a triangle is to a cell about u: clear of it or not; its `_corners`, where a witness is not too unlike.
 
     Last, by how much the line along u is farther from it than the limit.
     """
     width, side = _beside(u, t)
-    if _apart(t, side, u, four, bulge, limit + pad, length):
+    if _apart(t, side, u, four, bulge, limit + pad, lengths[1]):
         return True, 0, 0.0, 0.0
     hit, worst = 0, 0.0
     if width + unlike < limit or width <= 0.0:
-        hit, worst = _corners(t, four, length, limit - pad, bulge)
+        hit, worst = _corners(t, four, lengths[0], limit - pad, bulge)
     return False, hit, worst, width - limit
 
 
@@ -275,17 +274,18 @@ def _apart(t, n, u, four, bulge, limit, length):  # type: ignore[no-untyped-def]
     if low >= limit + length or -high >= limit:  # beyond the top of all, or behind the target
         return True
     need = limit * np.sqrt(1.0 + tilt * tilt)
-    least = np.inf
+    ahead, least = least, np.inf
     for corner in (0, 3, 6):
         least = min(least, _along(n, t, corner) - tilt * _along(u, t, corner))
-    return least >= need or _behind_own_plane(t, four, bulge, limit)
+    return least >= need or _before_own_plane(t, four, bulge, limit, length, ahead)
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _behind_own_plane(t, four, bulge, limit):  # type: ignore[no-untyped-def]  # numba infers
-    """Whether every axis of a cell leads away from the plane of a triangle, or along it, at the limit or farther.
+def _before_own_plane(t, four, bulge, limit, length, ahead):  # type: ignore[no-untyped-def]  # numba infers
+    """Whether every axis of a cell ends at the limit or farther before the plane of a triangle, or leads away from it.
 
-    A large triangle (a table) lies beside the axis as a ray and across it as a line: no plane along the axis helps.
+    A large triangle (a table, where the image ends) lies beside the axis as a ray and across it as a line: no plane
+    along the axis helps. ``ahead`` is the least cosine between the cell's middle and its corners.
     """
     ax, ay, az = t[3] - t[0], t[4] - t[1], t[5] - t[2]
     bx, by, bz = t[6] - t[0], t[7] - t[1], t[8] - t[2]
@@ -302,7 +302,8 @@ def _behind_own_plane(t, four, bulge, limit):  # type: ignore[no-untyped-def]  #
         m[0] * four[3, 0] + m[1] * four[3, 1] + m[2] * four[3, 2],
     )
     nearest = min(_along(m, t, 0), _along(m, t, 3), _along(m, t, 6))
-    return toward + bulge <= 0.0 and nearest >= limit
+    most = max(toward, 0.0) * (1.0 + bulge) / ahead + bulge
+    return nearest - length * most >= limit or (toward + bulge <= 0.0 and nearest >= limit)
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)

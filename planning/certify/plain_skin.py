@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -177,31 +176,3 @@ def _pierced(corners: Floats, ray: Floats) -> Ints:
     found[(np.abs(weights) <= doubt).any(axis=1)] = -1
     found[left & right] = 0
     return found
-
-
-def leaves_view(
-    view: FieldOfView | None, target_ct: Floats, u: Floats, rho: float, flange: tuple[float, float], pad: float
-) -> bool | None:
-    """Whether all needles of a cone leave the image through a face that cuts the body, none does, or unknown (None).
-
-    Args:
-        view: The image.
-        target_ct: Shape (3,).
-        u: Shape (3,), unit, the cone's axis.
-        rho: Its half-angle, rad.
-        flange: How far from the target the needles' flanges are, at least and at most, mm.
-        pad: Kept from limits on depths, mm.
-    """
-    if view is None:
-        return False
-    R, start = view.T_ct_box[:3, :3], view.to_box(target_ct[None])[0]
-    toward = np.concatenate([-(R.T @ u), R.T @ u])  # low faces, high faces
-    height = np.maximum(np.concatenate([start, view.size_mm - start]), 0.0)
-    cut, angle = view.cut.T.ravel(), np.arccos(np.clip(toward, -1, 1))
-    best, worst = np.cos(np.maximum(angle - rho, 0)), np.cos(np.minimum(angle + rho, np.pi))
-    soonest = np.where(best > 0, height / np.where(best > 0, best, 1.0), np.inf)
-    latest = np.where(worst > 0, height / np.where(worst > 0, worst, 1.0), np.inf)
-    first_cut = latest[cut].min(initial=np.inf)
-    if first_cut < flange[0] - pad and soonest[~cut].min(initial=np.inf) > first_cut + pad:
-        return True
-    return False if (soonest[cut] > min(flange[1], latest.min()) + pad).all() else None

@@ -12,7 +12,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.cells import Cells
-from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
+from puncture_twin.planning.reach.standoff import farthest_flange
 from puncture_twin.planning.uncertainty.any_pose import any_pose
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
@@ -39,7 +39,6 @@ class Question:
         max_skin_angle: The largest angle at the skin.
         structures: Names of the k structures that demand a margin.
         margins: Shape (k,), their margins; with ``touch`` at least so wide that the chance is kept.
-        lengths: Shape (k,), how far the needle's axis is checked against each.
         touch: The chance to touch each structure that no safe cell exceeds; None asks for none.
     """
 
@@ -58,7 +57,6 @@ class Question:
     max_skin_angle: float
     structures: tuple[str, ...]
     margins: Floats
-    lengths: Floats
     touch: float | None = None
 
     def cap(self) -> Cells:
@@ -103,7 +101,6 @@ def question_of(
         max_skin_angle=float(case.search.max_skin_angle),
         structures=tuple(s.name for s in demanding),
         margins=_margins(case, demanding, touch, error),
-        lengths=axis_lengths(case, demanding),
         touch=touch,
     )
 
@@ -119,7 +116,8 @@ def _margins(case: Case, demanding: list[Structure], touch: float | None, error:
         message = "a chance to touch cannot be certified: only markers and [errors] give the needle's error"
         raise InputError(message, where=case.path, allowed="[registration] with markers, and [errors]; or no chance")
     farthest = np.array([np.linalg.norm(s.mesh.vertices - case.target_ct, axis=1).max() for s in demanding])
-    lengths = axis_lengths(case, demanding)
+    waiting = farthest_flange(case.needle, case.search.max_skin_angle)
+    lengths = np.array([waiting if s.outside else case.needle.length_mm for s in demanding])
     surface_mm = np.sqrt([np.linalg.eigvalsh(error.surface_cov_ct(s.voxel_ct))[-1] for s in demanding])
     kept = any_pose(error).margin(touch, error.freedom, farthest, lengths, case.needle.radius_mm, surface_mm)
     return np.asarray(np.maximum(margins, kept))

@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Needle
-from puncture_twin.planning.certify.bounds import (
-    ANGLE_PAD_RAD,
-    CLEARANCE_PAD_MM,
-    DEPTH_PAD_MM,
-    FlangeBounds,
-    any_flange,
-    flange_bounds,
-    view_bounds,
-)
 from puncture_twin.planning.certify.cells import OFF_CENTRE, Cells, Cones, split
 from puncture_twin.planning.certify.certificate import REJECTED, SAFE, UNDECIDED, Certificate
 from puncture_twin.planning.certify.cones import Lists, narrowed, zones
 from puncture_twin.planning.certify.near_organs import Organs, organ_facts
 from puncture_twin.planning.certify.question import Question, question_of
-from puncture_twin.planning.certify.skin_cones import LENGTH_PAD_MM, skin_bounds
+from puncture_twin.planning.certify.skin_cones import LENGTH_PAD_MM, SkinBounds, skin_bounds
 from puncture_twin.planning.certify.skin_surface import SkinSurface, skin_surface
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.reach.standoff import waiting_flange
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 TOO_WIDE = np.radians(80)
@@ -46,6 +38,15 @@ MEASURE_BELOW = np.radians(4)
 
 SMALLEST_SIZE = np.radians(0.01)
 """A finer map would need millions of cells, and the padding against rounding would begin to count."""
+
+CLEARANCE_PAD_MM = 2e-4
+"""Kept from every margin: within 1e-4 mm of one the search leaves the verdict to FCL's capsule."""
+
+DEPTH_PAD_MM = 1e-4
+"""Kept from every limit on a depth, and from where a flange is."""
+
+ANGLE_PAD_RAD = 1e-7
+"""Kept from the largest skin angle: arccos near 0 rounds to 1e-8."""
 
 REASONS = tuple(Reason)
 """A reason as a number, while cells are checked."""
@@ -103,23 +104,23 @@ class _State:
     Attributes:
         parent: Shape (n,), row of each cell's lists.
         skin: Triangles of the skin that may matter.
-        organs: Triangles of the organs that may matter.
-        witness: Shape (n,), the organs' triangle that nearly rejected the whole, or -1.
+        organs: Triangles of the body's structures that may matter, and behind them those outside of the body.
+        witness: Shape (2, n), of both the triangle that nearly rejected the whole, or -1.
         skin_good: Shape (n,), the skin's constraints hold.
-        view_good: Shape (n,), the field of view is kept up to the flange at standoff.
+        flange: Shape (n, 2), how far from the target flanges are while the tip waits, at least and at most, mm.
     """
 
     parent: Ints
     skin: Lists
-    organs: Lists
+    organs: tuple[Lists, Lists]
     witness: Ints
     skin_good: Bools
-    view_good: Bools
+    flange: Floats
 
     def of(self, rows: Ints) -> _State:
         """For parts of the cells ``rows``."""
-        good = self.skin_good[rows], self.view_good[rows]
-        return _State(self.parent[rows], self.skin, self.organs, self.witness[rows], *good)
+        known = self.witness[:, rows], self.skin_good[rows], self.flange[rows]
+        return _State(self.parent[rows], self.skin, self.organs, *known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,19 +151,25 @@ class _Evaluator:
     def __init__(self, question: Question, anatomy: Anatomy, needle: Needle) -> None:
         self.queries = 0
         self._question, self._needle = question, needle
-        self._view = anatomy.skin.field_of_view
         self._skin: SkinSurface = skin_surface(anatomy.skin, question.target_ct)
         demanding = [s for s in anatomy.checked if s.demands_margin]
-        self._organs = _organs([s.mesh for s in demanding], question)
+        limits, outside = question.margins + question.radius, np.array([s.outside for s in demanding], bool)
+        self._organs = tuple(_organs(demanding, question, limits, which) for which in (~outside, outside))
+        group = np.concatenate([one.group for one in self._organs])
+        self._column = np.concatenate([group, [len(demanding)]])
+        self._first = np.array([np.argmax(self._column == column) for column in range(len(demanding) + 1)])
         self._inside = [_is_inside(s.mesh, question.target_ct) for s in demanding]
 
     def start(self) -> _State:
         """What the whole cap knows: nothing, but which triangles a needle can come to at all."""
-        limit = self._organs.limits.max(initial=0.0) + self._organs.lengths.max(initial=0.0)
-        organs = np.flatnonzero(self._organs.zones.nearest <= limit)
-        skin = np.flatnonzero(self._skin.zones.nearest <= self._question.farthest + LENGTH_PAD_MM)
-        first, no = np.zeros(1, np.int64), np.zeros(1, bool)
-        return _State(first, Lists.one(skin), Lists.one(organs), first - 1, no, no)
+        farthest = self._question.farthest + LENGTH_PAD_MM
+        near = [one.limits.max(initial=0.0) + farthest for one in self._organs]
+        organs = [
+            Lists.one(np.flatnonzero(one.zones.nearest <= limit)) for one, limit in zip(self._organs, near, strict=True)
+        ]
+        skin = np.flatnonzero(self._skin.zones.nearest <= farthest)
+        first, flange = np.zeros(1, np.int64), any_flange(self._needle, self._question, 1)
+        return _State(first, Lists.one(skin), (organs[0], organs[1]), np.full((2, 1), -1), np.zeros(1, bool), flange)
 
     def level(self, cells: Cells, cones: Cones, state: _State) -> _Verdicts:
         """Evaluate the cells of one level."""
@@ -171,28 +178,34 @@ class _Evaluator:
         if cones.radius.max() > TOO_WIDE:
             return _Verdicts.none(state)
         skin = narrowed(self._skin.zones, state.skin, state.parent, cones.centres, cones.radius)
-        organs = organ_facts(
-            self._organs, state.organs, state.parent, state.witness, cones, wide=MEASURE_BELOW, pad=CLEARANCE_PAD_MM
+        rows, good = np.arange(len(cells)), state.skin_good.copy()
+        known = _State(rows, skin, state.organs, state.witness.copy(), good, state.flange.copy())
+        verdicts = _Verdicts.none(known)
+        within = self._near(0, verdicts, cones, state, np.tile(self._question.length, (len(cells), 2)))
+        if cones.radius.max() <= SKIN_BELOW:  # it says where the flanges are, too
+            self._check_skin(verdicts, cells, cones, ~known.skin_good | _filled(state.organs[1])[state.parent])
+        around = self._near(1, verdicts, cones, state, known.flange)
+        clear = ~_filled(within) & ~_filled(around)
+        verdicts.letter[clear & known.skin_good & (verdicts.letter == UNDECIDED)] = SAFE
+        return replace(verdicts, state=replace(known, organs=(within, around)))
+
+    def _near(self, part: int, verdicts: _Verdicts, cones: Cones, state: _State, lengths: Floats) -> Lists:
+        """Structures within the body (0) or outside of it (1): reject cells by them, and what of them matters."""
+        witness, pad = state.witness[part], CLEARANCE_PAD_MM
+        found = organ_facts(
+            self._organs[part], state.organs[part], state.parent, witness, cones, lengths, wide=MEASURE_BELOW, pad=pad
         )
-        self.queries += organs.measured
-        rows, good = np.arange(len(cells)), (state.skin_good.copy(), state.view_good.copy())
-        verdicts = _Verdicts.none(_State(rows, skin, organs.near, organs.witness, *good))
-        verdicts.reject(organs.rejected, Reason.TOO_CLOSE, organs.largest - self._question.radius)
-        verdicts.triangle[organs.rejected] = organs.witness[organs.rejected]
-        if cones.radius.max() <= SKIN_BELOW:
-            open_rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~verdicts.state.view_good)
-            self._check_view(verdicts, cones, open_rows, any_flange(self._needle, self._question))
-            self._check_skin(verdicts, cells, cones)
-        clear = organs.near.start[1:] == organs.near.start[:-1]
-        good_skin = verdicts.state.skin_good & verdicts.state.view_good
-        verdicts.letter[clear & good_skin & (verdicts.letter == UNDECIDED)] = SAFE
-        return verdicts
+        self.queries += found.measured
+        first, fresh = part * len(self._organs[0].group), found.rejected & (verdicts.letter == UNDECIDED)
+        verdicts.reject(fresh, Reason.TOO_CLOSE, found.largest - self._question.radius)
+        verdicts.triangle[fresh] = found.witness[fresh] + first
+        verdicts.state.witness[part] = found.witness
+        return found.near
 
     def names(self, triangle: Ints) -> tuple[NDArray[np.str_], Ints]:
         """The structure of each triangle, and which of its triangles it is; "" and -1 for -1."""
-        group = self._organs.group
-        column = np.concatenate([group, [len(self._question.structures)]])[triangle]
-        face = np.where(triangle < 0, -1, triangle - np.searchsorted(group, column))
+        column = self._column[triangle]
+        face = np.where(triangle < 0, -1, triangle - self._first[column])
         return np.array([*self._question.structures, ""], dtype=np.str_)[column], face
 
     def _all_rejected(self, state: _State) -> _Verdicts:
@@ -201,19 +214,13 @@ class _Evaluator:
         everywhere = np.ones(len(state.parent), bool)
         if any(self._inside):
             verdicts.reject(everywhere, Reason.TOO_CLOSE, -self._question.radius)
-            verdicts.triangle[:] = np.searchsorted(self._organs.group, self._inside.index(True))
+            verdicts.triangle[:] = self._first[self._inside.index(True)]
         verdicts.reject(everywhere, Reason.UNKNOWN_REGION)
         return verdicts
 
-    def _check_view(self, verdicts: _Verdicts, cones: Cones, rows: Ints, flange: FlangeBounds) -> None:
-        target_ct, n = self._question.target_ct, len(cones.radius)
-        view = view_bounds(self._view, target_ct, cones.centres[rows], cones.radius[rows], flange)
-        verdicts.state.view_good[rows] |= view.kept
-        verdicts.reject(_spread(view.left, rows, n), Reason.UNKNOWN_REGION, _spread(view.depth, rows, n))
-
-    def _check_skin(self, verdicts: _Verdicts, cells: Cells, cones: Cones) -> None:
+    def _check_skin(self, verdicts: _Verdicts, cells: Cells, cones: Cones, which: Bools) -> None:
         question, state = self._question, verdicts.state
-        rows = np.flatnonzero((verdicts.letter == UNDECIDED) & ~(state.skin_good & state.view_good))
+        rows = np.flatnonzero((verdicts.letter == UNDECIDED) & which)
         if not len(rows):
             return
         found = skin_bounds(
@@ -240,17 +247,42 @@ class _Evaluator:
         verdicts.reject(_spread(found.count > 1, rows, n), Reason.REENTERS_SKIN)
         angle = np.degrees(found.least_angle)
         verdicts.reject(_spread(steep, rows, n), Reason.SKIN_ANGLE, _spread(angle, rows, n))
-        self._check_view(verdicts, cones, rows, flange_bounds(self._needle, question, found))
+        flange, known = flange_bounds(self._needle, question, found), state.flange
+        known[rows, 0] = np.maximum(known[rows, 0], flange[:, 0])
+        known[rows, 1] = np.minimum(known[rows, 1], flange[:, 1])
 
 
-def _organs(meshes: list[TriangleMesh], question: Question) -> Organs:
-    """The triangles of all structures that demand a margin, in one array."""
-    group = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
+def any_flange(needle: Needle, question: Question, count: int) -> Floats:
+    """Bounds for every path and angle that the case allows, whatever the skin: shape (count, 2), mm."""
+    return np.tile([waiting_flange(needle, 0.0, 0.0) - DEPTH_PAD_MM, question.farthest + DEPTH_PAD_MM], (count, 1))
+
+
+def flange_bounds(needle: Needle, question: Question, skin: SkinBounds) -> Floats:
+    """How far from the target the flanges over n cones are at least and at most, shape (n, 2), mm.
+
+    They hold for every direction whose path and skin angle the case allows; along others no tip ever waits. The flange
+    is the farther, the longer the path and the larger the angle.
+    """
+    longest, largest = question.longest, question.max_skin_angle
+    low = np.clip(skin.least_angle - ANGLE_PAD_RAD, 0.0, largest)
+    high = np.clip(skin.largest_angle + ANGLE_PAD_RAD, 0.0, largest)
+    least = waiting_flange(needle, np.minimum(skin.least_skin, longest), low) - DEPTH_PAD_MM
+    most = waiting_flange(needle, np.minimum(skin.farthest, longest), high) + DEPTH_PAD_MM
+    return np.stack([least, most], axis=1)
+
+
+def _organs(demanding: list[Structure], question: Question, limits: Floats, which: Bools) -> Organs:
+    """The triangles of some structures that demand a margin, in one array."""
+    columns = np.flatnonzero(which)
+    meshes = [demanding[column].mesh for column in columns]
+    group = np.repeat(columns, [len(mesh.faces) for mesh in meshes])
     corners = np.concatenate([mesh.triangles for mesh in meshes] or [np.empty((0, 3, 3))]) - question.target_ct
-    limits = question.margins + question.radius
-    return Organs(
-        corners.reshape(-1, 9), group, limits, zones(corners, limits[group] + CLEARANCE_PAD_MM), question.lengths
-    )
+    return Organs(corners.reshape(-1, 9), group, limits, zones(corners, limits[group] + CLEARANCE_PAD_MM))
+
+
+def _filled(lists: Lists) -> Bools:
+    """Which cells have a list that is not empty."""
+    return np.asarray(lists.start[1:] > lists.start[:-1])
 
 
 def _is_inside(mesh: TriangleMesh, point: Floats) -> bool:

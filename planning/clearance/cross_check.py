@@ -46,7 +46,7 @@ def cross_check(
         meshes: The k surfaces.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
-        length: Of the axes, one number or shape (k,), mm.
+        length: Of the axes, one number, shape (k,) or (n, k), mm.
         count: How many directions to measure again; all of them if there are fewer.
         rng: Chooses them.
 
@@ -54,7 +54,7 @@ def cross_check(
         CrossCheckError: A distance differs by more than rounding.
     """
     rows = rng.choice(len(outward_ct), min(count, len(outward_ct)), replace=False)
-    rated = FclEngine(meshes).measure(target_ct, outward_ct[rows], length)
+    rated = FclEngine(meshes).measure(target_ct, outward_ct[rows], np.broadcast_to(length, found.distance.shape)[rows])
     difference = np.abs(rated.distance - found.distance[rows])
     if difference.size and difference.max() > AGREE_MM:
         row, column = np.unravel_index(int(difference.argmax()), difference.shape)

@@ -93,7 +93,7 @@ class FastEngine:
         target = np.ascontiguousarray(target_ct, dtype=np.float64)
         outward = np.ascontiguousarray(outward_ct, dtype=np.float64).reshape(-1, 3)
         shape = (len(self._blocks), len(outward))
-        lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[:1])
+        lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[::-1]).T
         _refuse_unsound(target, outward, lengths)
         answer = AxisDistances(np.empty(shape), np.empty(shape), np.empty(shape, np.int32))
         pieces = self._pieces(target, outward, lengths, answer)
@@ -107,7 +107,7 @@ class FastEngine:
 
     def _pieces(
         self, target: Floats, outward: Floats, lengths: Floats, answer: AxisDistances
-    ) -> list[tuple[Tiles, Blocks, PlacedSurface, float, AxisDistances]]:
+    ) -> list[tuple[Tiles, Blocks, PlacedSurface, Floats, AxisDistances]]:
         """What `measure_structure` is given in turn: the largest structures first, in runs of directions.
 
         Here rows of ``answer`` are structures.
@@ -117,7 +117,7 @@ class FastEngine:
             blocks = self._blocks[row]
             own = AxisDistances(answer.distance[row], answer.depth[row], answer.nearest[row])
             for part in tiles.parts(2 + len(blocks.triangles) // PIECE_TRIANGLES):
-                pieces.append((part, blocks, seen[row], float(lengths[row]), own))
+                pieces.append((part, blocks, seen[row], lengths[row], own))
         return pieces
 
     def _seen_from(self, target: Floats) -> tuple[PlacedSurface, ...]:
@@ -180,7 +180,7 @@ def measure_structure(
     tiles: Tiles,
     blocks: Blocks,
     placed: PlacedSurface,
-    length: float,
+    lengths: Floats,
     answer: AxisDistances,
     counts: NDArray[np.int64],
 ) -> None:
@@ -191,7 +191,7 @@ def measure_structure(
         tiles: All or some of the n directions.
         blocks: The structure.
         placed: Itself as seen from the target.
-        length: Of the axes, mm.
+        lengths: Shape (n,), of the axes in the caller's order, mm.
         answer: Arrays of shape (n,) in the caller's order; rows of ``tiles`` are filled.
         counts: Shape (7,), added to: see `tile_search.COUNTED`.
     """
@@ -204,7 +204,7 @@ def measure_structure(
     surface = (blocks.triangles, blocks.local, blocks.base)
     bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
     search_tiles(
-        surface, placed.nodes, placed.slack, target, float(length), placed.distance, placed.nearest,
+        surface, placed.nodes, placed.slack, target, lengths[tiles.order], placed.distance, placed.nearest,
         bundles, scratch_for(len(placed.nodes)), found, LANES,
     )  # fmt: skip
     distance[tiles.order], depth[tiles.order], nearest[tiles.order] = np.sqrt(found.square), found.depth, found.triangle

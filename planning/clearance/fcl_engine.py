@@ -52,16 +52,18 @@ class FclEngine:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         shape = (len(outward_ct), len(self._objects))
         distance, depth, nearest = np.empty(shape), np.empty(shape), np.empty(shape, np.int32)
-        lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[1:])
+        lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape)
         for row, outward in enumerate(outward_ct):
-            distance[row], depth[row], nearest[row] = self._one_direction(target_ct, outward, lengths)
+            distance[row], depth[row], nearest[row] = self._one_direction(target_ct, outward, lengths[row])
             if shown and self._progress is not None:
                 self._progress(row + 1, len(outward_ct))
         for column, mesh in enumerate(self._meshes):
             touching = distance[:, column] <= 0
             distance[touching, column] = 0.0
             if touching.any():
-                depth[touching, column] = first_crossing(mesh, target_ct, outward_ct[touching], float(lengths[column]))
+                own = lengths[touching, column]
+                first = first_crossing(mesh, target_ct, outward_ct[touching], float(own.max()))
+                depth[touching, column] = np.minimum(first, own)
         return AxisDistances(distance, depth, nearest)
 
     def distances(self, target_ct: Floats, outward_ct: Floats, length: float) -> Floats:

@@ -25,7 +25,7 @@ def too_near(
     structure: int,
     target_ct: Floats,
     outward_ct: Floats,
-    length: float,
+    length: Floats | float,
     distance: Floats,
     limit: float,
 ) -> NDArray[np.bool_]:
@@ -36,14 +36,14 @@ def too_near(
         structure: Its place in the engine.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
-        length: Of the axes, mm.
+        length: Of the axes, one number or shape (n,), mm.
         distance: Shape (n,), of the axes from the surface, mm.
         limit: Needle radius plus margin, mm.
     """
-    nearer = distance < limit
+    nearer, lengths = distance < limit, np.broadcast_to(length, len(outward_ct))
     for row in np.flatnonzero(np.abs(distance - limit) < NEAR_THRESHOLD_MM):
         nearer[row] = distance[row] < limit - ROUNDING_MM or engine.collides(
-            structure, target_ct, outward_ct[row], length, limit
+            structure, target_ct, outward_ct[row], float(lengths[row]), limit
         )
     return nearer
 
@@ -83,11 +83,11 @@ def measure(
         structures: The k structures.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
-        length: How far the needle's axis goes from the target, one number or shape (k,), mm.
+        length: How far the needle's axis goes from the target, one number, shape (k,) or (n, k), mm.
         radius: Needle radius, mm.
         axes: What the engine has measured of them already; None measures them.
     """
-    lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), len(structures))
+    lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), (len(outward_ct), len(structures)))
     if axes is None:
         axes = engine.measure(target_ct, outward_ct, lengths)
         distance, depth = axes.distance, axes.depth
@@ -100,7 +100,7 @@ def measure(
         if structure.demands_margin:
             limit = radius + structure.margin_mm
             violated[:, column] = too_near(
-                engine, column, target_ct, outward_ct, float(lengths[column]), distance[:, column], limit
+                engine, column, target_ct, outward_ct, lengths[:, column], distance[:, column], limit
             )
     distance -= radius
     return Clearances(distance, depth, violated)

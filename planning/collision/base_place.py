@@ -40,8 +40,9 @@ def refuse_base_in(
         what = "the robot's base stands in the patient"
         raise BaseInPatientError(what, where="workcell", allowed="a base outside the skin")
     if surface is not patient and _encloses(surface, centre):
-        what = "the robot's base stands in what the CT shows outside of the body (its table?)"
-        raise BaseInPatientError(what, where="workcell", allowed="a base outside of it")
+        what = "the robot's base stands in what is not known to be free: the table that a CT shows, or beyond its end"
+        allowed = 'a base outside of it; where no body lies there, [ct] arms = "none" or beyond_mm'
+        raise BaseInPatientError(what, where="workcell", allowed=allowed, code="base_in_unseen")
 
 
 def _encloses(mesh: TriangleMesh, point: Floats) -> bool:

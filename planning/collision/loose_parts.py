@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
@@ -25,15 +25,8 @@ class LooseParts(NamedTuple):
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> LooseParts:
-        """Of a mesh that has been checked: its faces are connected where they share a corner."""
-        count = len(mesh.vertices)
-        used = np.flatnonzero(np.bincount(mesh.faces.ravel(), minlength=count))
-        starts, ends = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
-        links = scipy.sparse.coo_array((np.ones(len(starts), np.int8), (starts, ends)), shape=(count, count))
-        part = scipy.sparse.csgraph.connected_components(links, directed=False)[1][used]
-        order = np.argsort(part, kind="stable")
-        begins = np.flatnonzero(np.diff(part[order], prepend=-1))
-        points = mesh.vertices[used[order]]
+        """Of a mesh that has been checked."""
+        points, begins = _in_parts(mesh)
         sizes = np.maximum.reduceat(points, begins) - np.minimum.reduceat(points, begins)
         return cls(points[begins], sizes)
 
@@ -41,6 +34,23 @@ class LooseParts(NamedTuple):
         """Those about which a box is not longer than that from corner to corner."""
         small = np.linalg.norm(self.sizes, axis=1) <= mm
         return LooseParts(self.corners[small], self.sizes[small])
+
+
+def connected_parts(mesh: TriangleMesh) -> list[Floats]:
+    """The corners of each connected part of a surface, shapes (n, 3)."""
+    points, begins = _in_parts(mesh)
+    return np.split(points, begins[1:])
+
+
+def _in_parts(mesh: TriangleMesh) -> tuple[Floats, Ints]:
+    """Corners part by part, and where each part begins; faces are connected where they share a corner."""
+    count = len(mesh.vertices)
+    used = np.flatnonzero(np.bincount(mesh.faces.ravel(), minlength=count))
+    starts, ends = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
+    links = scipy.sparse.coo_array((np.ones(len(starts), np.int8), (starts, ends)), shape=(count, count))
+    part = scipy.sparse.csgraph.connected_components(links, directed=False)[1][used]
+    order = np.argsort(part, kind="stable")
+    return mesh.vertices[used[order]], np.flatnonzero(np.diff(part[order], prepend=-1))
 
 
 def half_spaces(corners: Floats) -> Floats:

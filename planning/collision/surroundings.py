@@ -10,13 +10,12 @@ from dataclasses import replace
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
-from puncture_twin.planning.anatomy.body.outside_body import BOX_FACES
 from puncture_twin.planning.arm.tool import Box, gantry_boxes
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Gantry, Obstacle
-from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
 
 GANTRY = "gantry"
@@ -26,9 +25,6 @@ OF_CASE_FILE = "case file"
 NOWHERE = (
     'obstacles of the frame "base" are not checked, since the case does not say where the robot\'s base is: {names}'
 )
-
-CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-"""Of a cube with edges of 1."""
 
 
 def case_boxes(case: Case, T_base_ct: Floats) -> tuple[Box, ...]:
@@ -139,18 +135,14 @@ def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
     """
     T = np.eye(4) if T_base_ct is None else T_base_ct
     fixed = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "ct" or T_base_ct is not None}
-    boxes = [box for box in case_boxes(case, T) if box.name in fixed]
+    boxes = [one for one in case_boxes(case, T) if one.name in fixed]
     T_ct_base = np.asarray(np.linalg.inv(T), dtype=np.float64)
-    structures = [_structure(box.name, _mesh(box, T_ct_base)) for box in boxes]
+    structures = [_structure(one.name, box(T_ct_base @ one.T_base_box, one.size_mm)) for one in boxes]
     if case.gantry is not None:
-        structures.append(_structure(GANTRY, joined([_mesh(box, np.eye(4)) for box in gantry_in_ct(case.gantry)])))
+        wall = [box(one.T_base_box, one.size_mm) for one in gantry_in_ct(case.gantry)]
+        structures.append(_structure(GANTRY, joined(wall)))
     return tuple(structures)
 
 
 def _structure(name: str, mesh: TriangleMesh) -> Structure:
     return Structure(name, Role.AVOID, 0.0, mesh, OF_CASE_FILE, True, np.zeros((3, 3)))  # as stated
-
-
-def _mesh(box: Box, T_ct_base: Floats) -> TriangleMesh:
-    T = T_ct_base @ box.T_base_box
-    return TriangleMesh(apply(T, CORNERS * box.size_mm), BOX_FACES)

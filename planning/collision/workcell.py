@@ -66,7 +66,7 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
             )
         except BaseInPatientError as error:
             where = f"{case.path}: {_placing_key(case)}"
-            raise BaseInPatientError(error.what, where=where, allowed=error.allowed) from error
+            raise BaseInPatientError(error.what, where=where, allowed=error.allowed, code=error.code) from error
 
     if memory is NO_MEMORY:
         return make()

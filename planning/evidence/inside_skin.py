@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy
-from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
+from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.arrays import Bools, Floats

@@ -21,6 +21,13 @@ Faces = NDArray[np.int32]
 MIXED = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 """Odd numbers without a pattern: weights of a place's coordinates, as bits, in a sum that tells nearly all apart."""
 
+BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+"""Of the unit cube about the origin, shape (8, 3)."""
+BOX_SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+"""Its sides: corners in order, seen from outside to the left."""
+BOX_FACES = np.array([triangle for a, b, c, d in BOX_SIDES for triangle in ((a, b, c), (a, c, d))])
+"""Its sides as triangles, shape (12, 3)."""
+
 MOST_IN_ONE = 2_000_000
 """So many places give triples that fit in 63 bits."""
 
@@ -184,6 +191,11 @@ def _read_only(array: Any, dtype: type) -> bool:
     while type(array) is np.ndarray and not array.flags.writeable:
         array = array.base
     return array is None or type(array) is bytes
+
+
+def box(T: Floats, size: Floats | Sequence[float]) -> TriangleMesh:
+    """A cuboid about the origin of a frame that ``T`` (4, 4) takes elsewhere, with full edge lengths ``size`` (3,)."""
+    return TriangleMesh(apply(T, BOX_CORNERS * np.asarray(size, dtype=np.float64)), BOX_FACES)
 
 
 def box_of(points: Floats) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, Anatomy, body_side
-from puncture_twin.planning.anatomy.body.field_of_view import SIDES
+from puncture_twin.planning.anatomy.body.cut_ends import SIDES
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables.errors_section import ErrorsSection

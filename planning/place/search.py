@@ -9,6 +9,8 @@ from functools import partial
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
+from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import map_all
@@ -18,8 +20,17 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.mount import mount_pose
 from puncture_twin.planning.case.tables.robot_section import MountSection
 from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.loose_parts import connected_parts
 from puncture_twin.planning.collision.surroundings import case_boxes
-from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool, home_configuration, outside_surface
+from puncture_twin.planning.collision.workcell import (
+    ARM_PADDING_MM,
+    case_tool,
+    home_configuration,
+    outside_surface,
+    patient_surface,
+)
+from puncture_twin.planning.geometry.mesh import box_of
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.place.arm_spheres import Surroundings
 from puncture_twin.planning.place.directions import wanted_directions
 from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
@@ -131,8 +142,9 @@ def search_placements(
     T_ct_bed = bed_frame(case)
     check = _placement_check(case, anatomy, found)
     CellChecker(check.model, check.tool)  # refuses shapes that hang on nothing before minutes are spent
+    near, beyond = _parted(anatomy)
     surroundings = Surroundings(
-        SkinField.of(check.patient), Boxes.of(check.fixed), Boxes.of(check.carried), ARM_PADDING_MM
+        SkinField.of(patient_surface(near)), Boxes.of((*check.fixed, *beyond)), Boxes.of(check.carried), ARM_PADDING_MM
     )
     startable = check.wanted.only(
         needle_can_start(check.tool, check.patient, case.target_ct, check.wanted, ARM_PADDING_MM)
@@ -189,6 +201,18 @@ def _worth(one: RatedPlacement) -> tuple[float, float, float]:
     """Less is better: most directions, then the least expected error, then the widest margin."""
     expected = 0.0 if one.expected_mm is None else round(one.expected_mm, ERROR_DIGITS)
     return -round(one.verdict.fraction, FRACTION_DIGITS), expected, -one.verdict.margin
+
+
+def _parted(anatomy: Anatomy) -> tuple[Anatomy, list[Box]]:
+    """The anatomy near the image, and boxes about what goes on beyond it for metres, CT frame."""
+    view, solids = anatomy.skin.field_of_view, anatomy.surroundings
+    T = np.eye(4) if view is None else view.T_ct_box
+    parts = [part for one in solids if one.name == BEYOND_IMAGE for part in connected_parts(one.mesh)]
+    boxes = []
+    for part in parts:
+        low, high = box_of((part - T[:3, 3]) @ T[:3, :3])
+        boxes.append(Box(BEYOND_IMAGE, T @ pose(np.eye(3), (low + high) / 2), tuple((high - low).tolist())))
+    return replace(anatomy, surroundings=tuple(one for one in solids if one.name != BEYOND_IMAGE)), boxes
 
 
 def _placement_check(case: Case, anatomy: Anatomy, found: Candidates) -> PlacementCheck:

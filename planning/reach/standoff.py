@@ -1,10 +1,16 @@
-"""How far from the target the tip waits before the insertion: just outside the skin, or where the case says."""
+"""Where tip and flange wait before the insertion, and how far from the target the needle's axis is checked."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.anatomy.skin_entry import SkinPaths, skin_paths
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.reach.skin_gap import skin_gaps
 
@@ -26,3 +32,30 @@ def standoffs(needle: Needle, path_length: Floats | float, skin_angle: Floats | 
 def waiting_flange(needle: Needle, path_length: Floats | float, skin_angle: Floats | float) -> Floats:
     """How far from the target, along the needle, the flange is while the tip waits; see `standoffs`; mm."""
     return np.asarray(needle.length_mm + standoffs(needle, path_length, skin_angle))
+
+
+def farthest_flange(needle: Needle, max_skin_angle: float) -> float:
+    """How far out the flange can be while the tip waits, on the longest path at the steepest angle (rad), mm."""
+    return float(waiting_flange(needle, needle.shaft_mm, max_skin_angle))
+
+
+def own_paths(case: Case, skin: Skin, outward_ct: Floats, shift_ct: Floats | float = 0.0) -> SkinPaths:
+    """The skin along paths, ``outward_ct`` (n, 3), unit, to the case's target, or to one that is shifted, mm."""
+    farthest = farthest_flange(case.needle, case.search.max_skin_angle)
+    return skin_paths(skin, case.target_ct + shift_ct, outward_ct, farthest)
+
+
+def axis_lengths(case: Case, structures: Sequence[Structure], paths: SkinPaths) -> Floats:
+    """How far from the target n needles' axes are checked against k structures, shape (n, k), mm.
+
+    Against the body's structures up to where the flange ends; against what is outside of the body up to where it waits
+    along this path. Where no tip ever waits, for want of skin or beyond a limit, that is where any could at most.
+    """
+    farthest = farthest_flange(case.needle, case.search.max_skin_angle)
+    waiting = np.fmin(waiting_flange(case.needle, paths.path_length, paths.skin_angle), farthest)
+    return np.where([s.outside for s in structures], waiting[:, None], case.needle.length_mm)
+
+
+def own_lengths(case: Case, anatomy: Anatomy, outward_ct: Floats) -> Floats:
+    """`axis_lengths` of paths to the case's target, ``outward_ct`` (n, 3), against everything that is checked."""
+    return axis_lengths(case, anatomy.checked, own_paths(case, anatomy.skin, outward_ct))

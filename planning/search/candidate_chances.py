@@ -15,6 +15,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances
+from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.selection.windows import find_windows
@@ -106,10 +107,11 @@ def refined_near_limits(found: Candidates, model: ChanceModel) -> Candidates:
 
 def _touch_bounds(found: Candidates, model: ChanceModel) -> Floats:
     """Shape (n, k), of the safe candidates' chances to touch; NaN for others."""
-    error, columns, length = model.error, model.columns, float(model.lengths.max())
+    error, columns = model.error, model.columns
     surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])
     bounds, rows = np.full((len(found), len(columns)), np.nan), np.flatnonzero(found.safe)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
+        length = float(own_lengths(model.case, model.anatomy, found.outward_ct[part])[:, columns].max())
         slack, cov_ct = found.clearance.distance[part][:, columns], error.covariance_ct(found.arm.q_insertion[part])
         bounds[part] = touch_bound(slack, found.outward_ct[part], cov_ct, length, surface_mm, error.freedom)
     return bounds

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32, Texts
 from puncture_twin.planning.base.brief import brief
+from puncture_twin.planning.base.findings import Finding
 from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
@@ -191,6 +192,7 @@ class Candidates(Columns):
             declares no tissue.
         grid: The regular grid that the rows are; None for any others.
         cone_source: `CONE_OF_GRID` or `CONE_CERTIFIED`; "" where there are no safe cones.
+        findings: What else would be safe (`planning.search.alternatives`).
     """
 
     theta: Floats
@@ -208,6 +210,7 @@ class Candidates(Columns):
     deflection: Floats | None = None
     grid: AngleGrid | None = None
     cone_source: str = ""
+    findings: tuple[Finding, ...] = ()
 
     def __len__(self) -> int:
         return len(self.theta)

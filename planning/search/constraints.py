@@ -13,7 +13,6 @@ from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.clearance.measure import Clearances
-from puncture_twin.planning.reach.standoff import waiting_flange
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 
 Column = NDArray[Any] | str | float
@@ -32,8 +31,8 @@ def first_broken(
 ) -> Verdict:
     """Apply every constraint; the reason given is the first that is broken, in the order of the code.
 
-    Unknown regions come first among those on the path: nothing behind them is known. Those that only the needle
-    enters whose tip waits at its standoff come after the constraints on the path without which no tip ever waits.
+    What the skin does not show comes first: nothing behind it is known. Structures come last: some count only for a tip
+    that waits at its standoff, and without the constraints on the path none ever waits.
 
     Args:
         paths: The skin along the n paths.
@@ -62,8 +61,6 @@ def first_broken(
     give(Reason.REENTERS_SKIN, ~np.isnan(paths.reentry_depth), SKIN, paths.reentry_depth)
     give(Reason.TOO_LONG, length > needle.longest_path_mm, SKIN, length, length)
     give(Reason.SKIN_ANGLE, paths.skin_angle > max_skin_angle, SKIN, length, np.degrees(paths.skin_angle))
-    waiting = paths.view_depth < waiting_flange(needle, length, paths.skin_angle)
-    give(Reason.UNKNOWN_REGION, waiting, SKIN, paths.view_depth)
     names = np.array([s.name for s in structures] or [""], dtype=object)[worst]
     unknown = np.array([s.role is Role.UNKNOWN for s in structures] or [False])[worst]
     rows = np.arange(count)

@@ -31,8 +31,9 @@ from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.collision.surroundings import with_surroundings
 from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.evidence.checks import findings
-from puncture_twin.planning.reach.axis_lengths import axis_lengths
+from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
+from puncture_twin.planning.search.alternatives import alternatives
 from puncture_twin.planning.search.arm_reach import ArmReach
 from puncture_twin.planning.search.bedside.entry_facts import EntryFacts, entry_facts
 from puncture_twin.planning.search.bedside.entry_place import Landmark
@@ -109,7 +110,8 @@ class CaseContext:
                 chance=self.chance,
                 progress=partial(self.watcher.count, "directions of the arm"),
             )
-        return replace(found, arm_note=self.arm)
+            others = tuple(alternatives(self.case, self.anatomy, self.engine, found))
+        return replace(found, arm_note=self.arm, findings=others)
 
     def check(self, theta: float, beta: float) -> Candidates:
         """Check a single direction (rad)."""
@@ -161,7 +163,7 @@ class CaseContext:
         with self.stages.time("cross-check"):
             case, outward = self.case, self.case.directions().outward_ct
             meshes = tuple(structure.mesh for structure in self.anatomy.checked)
-            length, rng = axis_lengths(case, self.anatomy.checked), np.random.default_rng(case.rehearsal.seed)
+            length, rng = own_lengths(case, self.anatomy, outward), np.random.default_rng(case.rehearsal.seed)
             found = self.engine.measure(case.target_ct, outward, length)
             return cross_check(found, meshes, case.target_ct, outward, length, count=count, rng=rng)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
@@ -13,7 +12,7 @@ from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngi
 from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.geometry.containment import holds
 from puncture_twin.planning.geometry.crossings import crossings
-from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
+from puncture_twin.planning.reach.standoff import axis_lengths, own_paths
 from puncture_twin.planning.search.bending.bent_needle import with_bending
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
 from puncture_twin.planning.search.constraints import first_broken
@@ -69,14 +68,12 @@ def organ_candidates(
         directions: What to check.
         axes: What `organ_distances` says of them; None measures them here.
     """
-    needle, outward = case.needle, directions.outward_ct
-    checked, farthest = anatomy.checked, farthest_flange(needle, case.search.max_skin_angle)
-    paths = skin_paths(anatomy.skin, case.target_ct, outward, needle.length_mm, farthest)
-    lengths = axis_lengths(case, checked)
+    needle, outward, checked = case.needle, directions.outward_ct, anatomy.checked
+    paths = own_paths(case, anatomy.skin, outward)
+    lengths = axis_lengths(case, checked, paths)
     clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes)
     verdicts = first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle)
-    demanding = np.array([s.demands_margin for s in checked], bool)
-    count = len(directions)
+    demanding, count = np.array([s.demands_margin for s in checked], bool), len(directions)
     found = Candidates(
         theta=directions.theta,
         beta=directions.beta,

@@ -7,7 +7,7 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
-from puncture_twin.planning.reach.axis_lengths import axis_lengths
+from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidate_chances import with_best_refined, with_chances, with_joint_chances
 from puncture_twin.planning.search.candidates import Candidates
@@ -49,4 +49,5 @@ def search(
 
 def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> AxisDistances:
     """How far the needle's axis is from every structure in every direction."""
-    return engine.measure(case.target_ct, directions.outward_ct, axis_lengths(case, anatomy.checked))
+    outward = directions.outward_ct
+    return engine.measure(case.target_ct, outward, own_lengths(case, anatomy, outward))

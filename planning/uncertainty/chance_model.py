@@ -17,7 +17,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.clearance.normals import normals_of
-from puncture_twin.planning.reach.axis_lengths import axis_lengths
+from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.uncertainty.chances import Chances, demanding, touch_limit
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_model, mean_over_faces
 from puncture_twin.planning.uncertainty.lines.line_sampling import Needles, Surroundings, refined
@@ -57,11 +57,6 @@ class ChanceModel:
         return tuple(self.anatomy.checked[column].name for column in self.columns)
 
     @property
-    def lengths(self) -> Floats:
-        """Of the needle's axis for each of them, shape (k,), mm."""
-        return axis_lengths(self.case, self.anatomy.checked)[self.columns]
-
-    @property
     def limits(self) -> Floats:
         """The greatest chance to touch each of them that the case allows, shape (k,)."""
         return np.array([touch_limit(self.case, name) for name in self.structures])
@@ -95,7 +90,8 @@ class ChanceModel:
         """Some needles, the doubt about them, and how they pass the structures; arguments as of `chances`."""
         target, columns = self.case.target_ct, self.columns
         if axes is None:
-            axes = self.engine.measure(target, outward_ct, axis_lengths(self.case, self.anatomy.checked), shown=False)
+            lengths = own_lengths(self.case, self.anatomy, outward_ct)
+            axes = self.engine.measure(target, outward_ct, lengths, shown=False)
         normal = normals_of(self.engine.triangles, target, outward_ct, axes)[:, columns]
         distance, depth = axes.distance[:, columns], axes.depth[:, columns]
         cov_ct = self.error.covariance_ct(q)
@@ -168,8 +164,8 @@ def refined_chances(
         wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
     """
     every = np.ones(first.touch.shape, bool)
-    blocks = model.engine.blocks
-    around = Surroundings(tuple(blocks[column] for column in model.columns), model.lengths, model.case.target_ct)
+    blocks, lengths = model.engine.blocks, own_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
+    around = Surroundings(tuple(blocks[column] for column in model.columns), lengths, model.case.target_ct)
     needles = model.needles(outward_ct, q)
     touch = refined(around, needles, model.touching, first.touch, every if wanted is None else wanted)
     margin = first.margin if wanted is not None else refined(around, needles, model.breaking, first.margin, every)

@@ -238,11 +238,11 @@ def test_the_table_below_a_posterior_target_is_no_air(scene):
 
 
 def test_a_trunk_alone_has_nothing_outside(scene):
-    """Arms up: no surface outside of the body, no warning of detached parts, and the same safe front as with a bed."""
+    """Arms up: nothing outside of the body but beyond the image, no warning of detached parts."""
     folder, _ = scene("alone")
     context = prepare(write_case(folder), arm=False)
 
-    assert context.anatomy.surroundings == ()
+    assert [one.name for one in context.anatomy.surroundings] == ["beyond_image"]
     assert "do not touch" not in " ".join(context.anatomy.warnings)
 
 

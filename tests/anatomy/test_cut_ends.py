@@ -10,8 +10,7 @@ import SimpleITK as sitk  # noqa: N813
 from case_world import skin_from_ct
 
 from puncture_twin.planning.anatomy.body.body_mask import ct_image
-from puncture_twin.planning.anatomy.body.cut_ends import content_of, cut_ends, end_warnings, stated_ends
-from puncture_twin.planning.anatomy.body.field_of_view import SIDES
+from puncture_twin.planning.anatomy.body.cut_ends import SIDES, content_of, cut_ends, end_warnings, stated_ends
 from puncture_twin.planning.anatomy.skin import skin_from_label, skin_of_image
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.formats.labels.label_surface import label_mesh

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from puncture_twin.planning.anatomy.body.field_of_view import FieldOfView
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.geometry.crossings import NUDGE, Crossings
@@ -135,20 +134,6 @@ def test_a_cut_face_is_no_entry_and_the_unknown_begins_there(box):
     np.testing.assert_allclose(paths.path_length, [np.nan, 50])
     assert np.isnan(paths.entry_ct[0]).all() and np.isnan(paths.skin_angle[0])
     np.testing.assert_allclose(paths.entry_ct[1], [1, 2, -50])
-
-
-def test_a_cut_field_of_view_is_unknown_before_the_needles_top_only(box):
-    """The image ends at z = 90 by a face that cuts the body: unknown for a longer needle, not for one of 90 mm.
-
-    Where the image ends is told for any needle, and not where it ends by a face that does not cut the body.
-    """
-    T, cut = np.eye(4), np.zeros((3, 2), bool)
-    T[:3, 3], cut[2, 1] = [-80, -80, -80], True
-    skin = Skin(box([100, 100, 100]), np.zeros(12, bool), FieldOfView(T, np.array([160.0, 160, 170]), cut), ())
-    target, directions = np.array([1.0, 2, 0]), np.vstack([UP, [[1.0, 0, 0]]])
-    np.testing.assert_allclose(skin_paths(skin, target, directions, 90.1).unknown_depth, [90, np.nan])
-    np.testing.assert_allclose(skin_paths(skin, target, directions, 90.0).unknown_depth, [np.nan, np.nan])
-    np.testing.assert_allclose(skin_paths(skin, target, directions, 10.0).view_depth, [90, np.nan])
 
 
 def tent(left, right):

@@ -172,3 +172,21 @@ def test_an_axis_that_is_not_finite_is_refused(ball, target, direction):
     """Nothing that is not a number reaches compiled code."""
     with pytest.raises(InputError, match="finite"):
         FastEngine([ball(20)]).measure(np.array(target), np.array([direction]), LENGTH)
+
+
+def test_every_axis_may_have_a_length_of_its_own(rng, ball):
+    """A length an axis and structure, neighbours in a bundle long and short: the oracle's distance, FCL's depth."""
+    meshes, target, directions = [soup(rng, 300), ball(60.0, (5, 8, 90))], np.array([3.0, -2.0, 5.0]), units(rng, 240)
+    directions[::2] = directions[1::2] + 0.01 * rng.normal(size=(120, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    lengths = rng.uniform(1.0, 160.0, (240, 2))
+    found, fcl = (engine(meshes).measure(target, directions, lengths) for engine in (FastEngine, FclEngine))
+    for column, mesh in enumerate(meshes):
+        ends = target + lengths[:, column, None] * directions
+        expected = [segment_mesh_distance(target, end, mesh) for end in ends]
+        np.testing.assert_allclose(found.distance[:, column], expected, atol=TIGHT_MM, rtol=0)
+    np.testing.assert_allclose(fcl.distance, found.distance, atol=1e-9)
+    assert (found.depth <= lengths).all() and (fcl.depth <= lengths + 1e-9).all()
+    crossed = found.distance == 0
+    assert crossed.sum() > 20
+    np.testing.assert_allclose(found.depth[crossed], fcl.depth[crossed], atol=1e-6)

@@ -28,11 +28,12 @@ def _in_pairs(axes, triangles, origin, length, pairs):
             (axes[k, 2, 0], axes[k, 2, 1], axes[k, 2, 2]),
         )
         bring_into_frame(u, e, f, triangles, k, (origin[0], origin[1], origin[2]), pairs, k)
-    measure_beside(pairs, len(axes), length)
+    pairs[11] = length
+    measure_beside(pairs, len(axes))
     marks = pairs[9].copy()
     for k in range(len(axes)):
         if pairs[9, k] < 0.0:
-            pairs[9, k], pairs[10, k] = measure_other(pairs, k, length)
+            pairs[9, k], pairs[10, k] = measure_other(pairs, k)
     return marks
 
 

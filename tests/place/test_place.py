@@ -22,8 +22,10 @@ from puncture_twin.planning.base.processes import map_all
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.mount import mount_pose
+from puncture_twin.planning.case.options import CaseOptions
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.arm_spheres import (
     ArmSpheres,
@@ -76,7 +78,7 @@ along_mm = [-100.0, 0.0]
 across_mm = [400.0, 500.0]
 height_mm = [450.0, 550.0]
 [place.rail]
-along_mm = [-300.0, -200.0]
+along_mm = [-150.0, -50.0]
 """
 
 
@@ -340,6 +342,9 @@ def test_place_from_the_command_line(case_folder, tmp_path, capsys):
     shares = [one["share"] for one in said["placements"][:-1]]
     assert shares == sorted(shares, reverse=True) and best["share"] > own["share"] * 0.5
     assert {one["placement"].split()[0] for one in said["placements"][:-1]} == {"ceiling", "rail"}
+    unseen = next(one.mesh for one in prepare(here, arm=False).anatomy.surroundings if one.name == "beyond_image")
+    for one in said["placements"][:-1]:
+        assert side_of(unseen, np.array(one["mount"]["position_mm"])) is Side.OUTSIDE
     rows = list(csv.DictReader((out / "placements.csv").open(encoding="utf-8")))
     assert [float(row["share"]) for row in rows] == [one["share"] for one in said["placements"]]
     assert all(one["share"] <= said["possible_share"] + 1e-9 for one in said["placements"])
@@ -380,3 +385,13 @@ def test_a_search_that_finds_nothing_safe_says_so(case_folder):
     found = organ_candidates(context.case, context.anatomy, context.engine, context.case.directions())
     with pytest.raises(Exception, match="no direction is safe"):
         search_placements(context.case, context.anatomy, found, None)
+
+
+@pytest.mark.parametrize("z", [450.0, -420.0])
+def test_a_base_in_what_nobody_saw_is_refused_with_a_way_out(case_folder, z):
+    """200 mm beyond the trunk's ends, at its own height; nothing that an image shows stands there."""
+    mount = {"position_mm": [0.0, 0.0, z], "x_axis": [1.0, 0.0, 0.0], "z_axis": [0.0, -1.0, 0.0]}
+    with pytest.raises(InputError) as refused:
+        prepare(case_folder(), options=CaseOptions({"mount": mount}))
+    assert refused.value.code == "base_in_unseen"
+    assert "beyond_mm" in refused.value.allowed

@@ -19,9 +19,8 @@ from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.directions import wanted_directions
 from puncture_twin.planning.place.needle_start import needle_can_start
-from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
 from puncture_twin.planning.reach.skin_gap import MAX_GAP_MM, UNEVEN_SKIN_MM, skin_gaps
-from puncture_twin.planning.reach.standoff import standoffs, waiting_flange
+from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange, standoffs, waiting_flange
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.organs import organ_candidates
 
@@ -122,7 +121,15 @@ def test_the_farthest_flange():
 
 
 def test_axes_are_as_long_as_what_they_are_checked_against_demands():
-    """Against the body up to an inserted needle's flange, against what is outside of it up to a waiting one's."""
+    """Against the body up to an inserted needle's flange, against what is outside of it up to a waiting one's.
+
+    Where none ever waits, up to where any could.
+    """
     case = SimpleNamespace(needle=needle(), search=SimpleNamespace(max_skin_angle=45.0 * DEG))
     structures = [SimpleNamespace(outside=outside) for outside in (False, True, False)]
-    np.testing.assert_allclose(axis_lengths(case, structures), [200.0, 361.6, 200.0])
+    paths = SimpleNamespace(
+        path_length=np.array([20.0, 150.0, 170.0, np.nan]), skin_angle=np.radians([0, 45, 0, np.nan])
+    )
+    found = axis_lengths(case, structures, paths)
+    np.testing.assert_allclose(found[:, [0, 2]], 200.0)
+    np.testing.assert_allclose(found[:, 1], [230.0, 361.6, 361.6, 361.6])

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from places import REAL_CT, TESTS
 
-from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.reach.standoff import waiting_flange
 from puncture_twin.planning.search.context import prepare
 
@@ -50,19 +49,49 @@ def test_every_structure_is_there_and_closed(searches):
         assert all(s.mesh.closed for s in structures)
 
 
-def test_the_cut_body_is_never_safe(searches):
-    """The field of view cuts four faces of this body; paths leaving there are unknown, also at standoff alone."""
+def flange_beyond(context, found):
+    """How far the flanges lie beyond the planes of the cuts while the tip waits, shape (n,), mm; below 0 before all."""
+    view, flange = context.anatomy.skin.field_of_view, waiting_flange(context.case.needle, *path_of(found))
+    at = view.to_box(context.case.target_ct + flange[:, None] * found.outward_ct)
+    beyond = np.stack([-at, at - view.size_mm], axis=2)
+    return np.where(view.cut, beyond, -np.inf).max(axis=(1, 2))
+
+
+def path_of(found):
+    """Length and skin angle of each path."""
+    return found.path.length, found.path.skin_angle
+
+
+def test_where_nothing_says_where_the_arms_lie_no_flange_leaves_the_image(searches):
+    """The field of view cuts four faces of this body: a needle keeps its radius and the margin from their planes."""
     context, found = searches["v2"]
-    field = context.anatomy.skin.field_of_view
-    assert field.cut.sum() == 4
-    out = field.exit(context.case.target_ct, found.outward_ct)
-    beyond = out.cut & (out.depth_mm < context.case.needle.length_mm)
-    assert beyond.any()
-    assert (found.verdict.reason[beyond] == Reason.UNKNOWN_REGION).all()
-    waiting = waiting_flange(context.case.needle, found.path.length, found.path.skin_angle)
-    later = out.cut & (out.depth_mm < waiting) & ~beyond
-    assert later.sum() > 20
-    assert not found.safe[later].any()
+    assert context.anatomy.skin.field_of_view.cut.sum() == 4
+    beyond = flange_beyond(context, found)
+    assert (beyond[found.safe] <= -0.6 - 2.0 + 1e-6).all()
+    alone = found.verdict.structure == "beyond_image"
+    assert alone.sum() > 20
+    assert (beyond[alone] > -0.6 - 2.0 - 1e-6).all()
+
+
+def test_what_hangs_on_the_body_beyond_is_what_a_search_without_it_adds(searches):
+    """The hub that passes a plane in air costs directions; as many as are said become safe where it is as wide as cut.
+
+    Of those none has its flange where the nearest voxel of the image is body.
+    """
+    context, found = searches["v2"]
+    path = context.case.path.with_name("case_declared.toml")
+    path.write_text(context.case.path.read_text() + "\n[ct]\nbeyond_mm = 0\n")
+    other, more = _searched(path)
+    (said,) = (one for one in found.findings if one.code == "hangs_on_beyond_image")
+    assert said.numbers["directions"] == more.safe.sum() - found.safe.sum() > 100
+    assert more.safe[found.safe].all()
+    body, T = other.anatomy.scan._body, other.anatomy.scan._ct.T_ct_index
+    for length in (waiting_flange(other.case.needle, *path_of(more)), waiting_flange(other.case.needle, 0.0, 0.0)):
+        at = other.case.target_ct + np.broadcast_to(length, len(more))[more.safe, None] * more.outward_ct[more.safe]
+        index = np.rint(np.linalg.solve(T[:3, :3], (at - T[:3, 3]).T).T).astype(int)
+        outside = ((index < 0) | (index >= body.shape)).any(axis=1)
+        nearest = np.clip(index, 0, np.array(body.shape) - 1)
+        assert not body[tuple(nearest[outside].T)].any()
 
 
 def test_some_paths_are_safe_and_keep_every_margin(searches):

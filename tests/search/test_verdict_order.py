@@ -1,6 +1,5 @@
 """Which reason is given, and with which numbers: paths and clearances made by hand, many rows at once."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,10 +20,10 @@ MAX_ANGLE = np.radians(60)
 
 
 def paths(rows):
-    """Skin paths of (length, angle in degrees, re-entry, unknown, end of the image if one is near) per row."""
-    length, angle, reentry, unknown, view = np.array([(*row, *[NAN] * (5 - len(row))) for row in rows], float).T
+    """Skin paths of (length, angle in degrees, re-entry, unknown) per row."""
+    length, angle, reentry, unknown = np.array(rows, float).T
     entry = np.zeros((len(length), 3))
-    return SkinPaths(entry, length, np.radians(angle), reentry, unknown, view)
+    return SkinPaths(entry, length, np.radians(angle), reentry, unknown)
 
 
 def structure(name, margin=2.0, role=Role.AVOID):
@@ -92,28 +91,6 @@ def test_the_first_broken_constraint_gives_the_reason():
         Reason.UNKNOWN_REGION, Reason.NO_SKIN_ENTRY, Reason.REENTERS_SKIN, Reason.TOO_LONG, Reason.SKIN_ANGLE,
         Reason.TOO_CLOSE,
     ]  # fmt: skip
-
-
-def test_a_waiting_flange_beyond_the_image_is_unknown():
-    """Path, gap and needle: 310 mm straight in. Before the structures, after what forbids the path; 310 itself is kept.
-
-    At 60 degrees the gap is 5 + 5.5 tan 60 + 1 mm; with a standoff of 170 mm the flange waits at 370 mm everywhere.
-    """
-    near = Clearances(np.array([[0.5]] * 5), np.array([[40.0]] * 5), np.ones((5, 1), bool))
-    oblique = 306 + 5.5 * np.sqrt(3)
-    rows = [
-        (100, 10, NAN, NAN, 309.9),
-        (100, 10, NAN, NAN, 310.0),
-        (100, 60, NAN, NAN, oblique - 0.1),
-        (100, 60, NAN, NAN, oblique + 0.1),
-        (151, 10, NAN, NAN, 250.0),
-    ]
-    unknown, close = (Reason.UNKNOWN_REGION, "skin"), (Reason.TOO_CLOSE, "vessel")
-    found = rated(rows, near, [structure("vessel")])
-    assert [row[:2] for row in found] == [unknown, close, unknown, close, (Reason.TOO_LONG, "skin")]
-    same(found[:1], [(*unknown, 309.9, NAN)])
-    stated = rated([(100, 10, NAN, NAN, 369.9), (100, 10, NAN, NAN, 370.0)], needle=replace(NEEDLE, standoff_mm=170.0))
-    assert [row[0] for row in stated] == [Reason.UNKNOWN_REGION, ""]
 
 
 def test_limits_themselves_are_kept():

@@ -16,7 +16,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.containment import inside_each
-from puncture_twin.planning.reach.axis_lengths import axis_lengths
+from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
 from puncture_twin.planning.registration.marker_noise import reading_noise, touches
 from puncture_twin.planning.registration.residual_test import INTERVAL, NoiseTest
@@ -263,9 +263,9 @@ def _measured(context: CaseContext, query: _Query, rooms: Rooms, off: Floats, se
 
 def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:
     """By what each structure's surface may lie off as a whole where the needle passes it; the target's anywhere; mm."""
-    checked = model.anatomy.checked
-    axes = model.engine.measure(puncture.target_ct, puncture.outward_ct[None], axis_lengths(model.case, checked))
-    normals = normals_of(model.engine.triangles, puncture.target_ct, puncture.outward_ct[None], axes)[0]
+    checked, outward_ct = model.anatomy.checked, puncture.outward_ct[None]
+    axes = model.engine.measure(puncture.target_ct, outward_ct, own_lengths(model.case, model.anatomy, outward_ct))
+    normals = normals_of(model.engine.triangles, puncture.target_ct, outward_ct, axes)[0]
     covs = [truth.surface_cov_ct(one.voxel_ct) for one in checked]
     passed = np.nan_to_num(np.sqrt(np.einsum("ka,kab,kb->k", normals, np.array(covs), normals)))
     column = _target_column(model.anatomy, model.case)
@@ -298,8 +298,9 @@ def _touches(context: CaseContext, puncture: Puncture, rooms: Rooms, off_mm: Flo
     where the axis meets it as it was drawn, as in `line_chance`.
     """
     case, checked = context.case, context.anatomy.checked
-    columns, lengths = demanding(checked), axis_lengths(context.case, checked)
-    distance = context.engine.measure(case.target_ct, puncture.outward_ct[None], lengths).distance[0]
+    columns, outward_ct = demanding(checked), puncture.outward_ct[None]
+    lengths = own_lengths(case, context.anatomy, outward_ct)[0]
+    distance = context.engine.measure(case.target_ct, outward_ct, lengths).distance[0]
     shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1)
     turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1)
     touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)

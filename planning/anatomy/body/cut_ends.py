@@ -13,16 +13,21 @@ says what is right.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.body.field_of_view import SIDES
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+
+SIDES: Mapping[str, tuple[int, int]] = MappingProxyType(
+    {"right": (0, 0), "left": (0, 1), "front": (1, 0), "back": (1, 1), "feet": (2, 0), "head": (2, 1)}
+)
+"""The patient's sides: LPS axis, and whether its low (0) or high (1) end."""
 
 SPECK_MM2 = 100.0
 """What is dense in a slice and smaller is noise, a line or a sheet."""
@@ -50,6 +55,32 @@ ENDS_FLAT = (
     "the phantom ends flat at its {names} side, where no structure is cut that does not run through it: it counts as "
     "whole (cut in the skin's table says otherwise)"
 )
+
+
+@dataclass(frozen=True, eq=False)
+class FieldOfView:
+    """What was imaged: beyond a face that cuts the body, the body goes on (`planning.anatomy.beyond_image`).
+
+    Attributes:
+        T_ct_box: Shape (4, 4), rigid; the box frame's origin is its low corner, its axes run mostly to the
+            patient's left, back and head.
+        size_mm: Shape (3,), of the image, or of the mesh that was cut.
+        cut: Shape (3, 2), which low and high face the body reaches: those of the image, or of a mesh that was cut.
+    """
+
+    T_ct_box: NDArray[np.float64]
+    size_mm: NDArray[np.float64]
+    cut: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("T_ct_box", np.float64), ("size_mm", np.float64), ("cut", np.bool_)):
+            array = np.array(getattr(self, name), dtype=dtype)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def to_box(self, points_ct: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (n, 3) from LPS mm to mm from the box's low corner along its axes."""
+        return np.asarray((points_ct - self.T_ct_box[:3, 3]) @ self.T_ct_box[:3, :3])
 
 
 @dataclass(frozen=True, eq=False)

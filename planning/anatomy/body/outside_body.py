@@ -20,7 +20,7 @@ from puncture_twin.planning.anatomy.body.tables import TableSide
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.formats.labels.label_surface import field_surface
-from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
 
 SMOOTH_MM = 3.0
@@ -43,13 +43,6 @@ CUT_AT_MM = (30.0, 120.0, 480.0)
 every needle, and the search would measure most axes from most of them."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
-
-
-BOX_FACES = np.array(
-    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
-     [1, 5, 7], [1, 7, 3]]
-)  # fmt: skip
-"""Triangles of a box whose corners run with x slowest and z fastest, outward."""
 
 FULL = np.ones((3, 3, 3), bool)
 """Voxels that share a face, an edge or a corner are neighbours."""
@@ -120,15 +113,6 @@ def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> T
     return joined([drawn, *_hulls_beyond(mask & ~image.unscanned.padded, image)])
 
 
-def beyond_body(image: OutsideImage) -> list[TriangleMesh]:
-    """Boxes beyond each face of the image that cuts the body: where the skin goes on and the image does not.
-
-    Of a skin that comes from the image itself the same is known from its cut triangles.
-    """
-    faces = itertools.product(range(3), (0, -1))
-    return [beyond_face(image, axis, end) for axis, end in faces if image.body.take(end, axis=axis).any()]
-
-
 def beyond_face(image: OutsideImage, axis: int, end: int, *, wider_mm: float = 0.0) -> TriangleMesh:
     """A box beyond a whole face of the image, at the low (0) or high (-1) end of an axis, and so much wider."""
     low, high = np.full(3, -0.5) - wider_mm / image.spacing_mm, image.hu.shape + wider_mm / image.spacing_mm - 0.5
@@ -140,8 +124,7 @@ def beyond_face(image: OutsideImage, axis: int, end: int, *, wider_mm: float = 0
 
 def _box(low: Floats, high: Floats, image: OutsideImage) -> TriangleMesh:
     """A box between two corners, voxels."""
-    index = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    return TriangleMesh(apply(image.T_ct_index, index), BOX_FACES)
+    return box(image.T_ct_index @ pose(np.eye(3), (low + high) / 2), high - low)
 
 
 def beyond_table(image: OutsideImage, side: TableSide) -> TriangleMesh:
@@ -282,24 +265,20 @@ def _hulls_beyond(mask: Bools, image: OutsideImage) -> list[TriangleMesh]:
         cut = np.argwhere(bulky.take(end, axis=axis))
         corners = (cut[:, None] + np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])).reshape(-1, 2)
         if len(corners):
-            prisms.append(_prism(corners, axis, end, image))
-    return [prism for prism in prisms if prism is not None]
+            rim = corners[scipy.spatial.ConvexHull(corners).vertices]  # whole voxels have an area
+            away = image.beyond_mm[axis] / image.spacing_mm[axis]
+            near, far = (-0.5, -away) if end == 0 else (image.hu.shape[axis] - 0.5, away)
+            prisms.append(prism(image.T_ct_index, rim, axis, (near, near + far)))
+    return prisms
 
 
-def _prism(section: Floats, axis: int, end: int, image: OutsideImage) -> TriangleMesh | None:
-    """What stands over the convex hull of points (n, 2) of one face of the image, from the face outward."""
-    try:
-        rim = section[scipy.spatial.ConvexHull(section).vertices]
-    except scipy.spatial.QhullError:  # cannot be: whole voxels have an area
-        return None
-    away = image.beyond_mm[axis] / image.spacing_mm[axis]
-    near = -0.5 if end == 0 else image.hu.shape[axis] - 0.5
-    far = near - away if end == 0 else near + away
-    n = len(rim)
-    index = np.concatenate([np.insert(rim, axis, near, axis=1), np.insert(rim, axis, far, axis=1)])
+def prism(T_ct_index: Floats, outline: Floats, axis: int, between: tuple[float, float]) -> TriangleMesh:
+    """What stands over a convex polygon, shape (n, 2), between two planes across an axis; in voxels or mm."""
+    n = len(outline)
+    index = np.concatenate([np.insert(outline, axis, at, axis=1) for at in between])
     i, j = np.arange(n), np.roll(np.arange(n), -1)
     fan = np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
     sides = np.concatenate([np.stack([i, i + n, j], axis=1), np.stack([j, i + n, j + n], axis=1)])
     faces = np.concatenate([fan, fan[:, ::-1] + n, sides]).astype(np.int32)
-    vertices = apply(image.T_ct_index, index)
+    vertices = apply(T_ct_index, index)
     return TriangleMesh(vertices, _facing_outward(vertices, faces))

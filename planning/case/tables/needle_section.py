@@ -22,6 +22,7 @@ class NeedleSection(Section):
     standoff_mm: Annotated[Number, Field(ge=5, le=1000)] | None = None
     skin_gap_mm: Annotated[Number, Field(ge=6, le=200)] = 10.0  # the least, along the needle; see standoff.py
     holder_diameter_mm: Annotated[Number, Field(ge=1, le=200)] = 30.0
+    lengths_mm: tuple[Annotated[Number, Field(ge=20, le=1000)], ...] = ()
     gauge: Annotated[int, Strict()] | None = None
     solid: Annotated[bool, Strict()] | None = None
     bevel_deg: Annotated[Number, Field(ge=0, le=10)] | None = None
@@ -31,6 +32,9 @@ class NeedleSection(Section):
     def _shaft_fits(self) -> Self:
         if self.shaft_mm > self.length_mm:
             raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
+        least = self.length_mm - self.shaft_mm + 10.0
+        if self.lengths_mm and (self.length_mm not in self.lengths_mm or min(self.lengths_mm) < least):
+            raise ValueError(f"lengths_mm holds length_mm, and none below {least:g}: the holder, and 10 mm of shaft")
         if self.solid is not None and self.gauge is None:
             raise ValueError("solid belongs to gauge; without one the shaft is solid, of diameter_mm")
         return self

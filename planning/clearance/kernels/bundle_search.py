@@ -81,9 +81,10 @@ def _most_promising(needle, groups, low, high, scratch, answer):  # type: ignore
     waiting = 0
     for m in range(high - low):
         u, best, least = direction(scratch.frames32, m), 0, HUGE
+        length = np.float32(needle.length[low + m])
         for group in range(groups):
             row = m * groups + group
-            disc_bounds(scratch.chosen, group, u, SINGLE, needle.short, needle.slack, scratch.bounds, row)
+            disc_bounds(scratch.chosen, group, u, SINGLE, length, needle.slack, scratch.bounds, row)
             bound = least_of(scratch.bounds, row)
             best, least = row if bound < least else best, bound if bound < least else least
         if least <= scratch.upper[m]:
@@ -135,7 +136,7 @@ def _measure_pairs(surface, needle, low, waiting, lanes, scratch, answer, seed):
     """
     answer.counts[5] += waiting
     for p in range(waiting):
-        _test_block(surface[1], needle, p, lanes, scratch)
+        _test_block(surface[1], needle, low, p, lanes, scratch)
     for turn in range(2):
         count = np.int64(0)
         for p in range(waiting):
@@ -154,7 +155,7 @@ def _measure_pairs(surface, needle, low, waiting, lanes, scratch, answer, seed):
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _test_block(local, needle, p, lanes, scratch):  # type: ignore[no-untyped-def]  # numba infers
+def _test_block(local, needle, low, p, lanes, scratch):  # type: ignore[no-untyped-def]  # numba infers
     """The float32 distances of a pair's axis from the triangles of its block, the least of them, and their error."""
     m, slot, slack = scratch.pairs[p, 0], scratch.pairs[p, 1], needle.slack
     group, at, block = slot // LANES, slot % LANES, scratch.found[slot]
@@ -164,9 +165,10 @@ def _test_block(local, needle, p, lanes, scratch):  # type: ignore[no-untyped-de
     around = np.sqrt(x * x + y * y) + radius
     tolerance = -around * (AREA_ROUNDING * around + THREE * slack)
     line_distances(local, block, e, f, x, y, tolerance, scratch.squares, p)
-    if along + radius > needle.short or along < radius:
+    length = np.float32(needle.length[low + m])
+    if along + radius > length or along < radius:
         near = slack + ROUNDING * (abs(along) + radius)
-        heed_ends(local, block, lanes, u, along, needle.short, near, scratch.squares, p)
+        heed_ends(local, block, lanes, u, along, length, near, scratch.squares, p)
     scratch.least[p], scratch.errors[p] = least_of(scratch.squares, p), ROUNDING * around + slack
 
 
@@ -176,16 +178,17 @@ def _try_all(triangles, needle, low, count, scratch, answer, seed):  # type: ign
 
     What is nearer is kept, and of equals what comes first.
     """
-    corners, length = scratch.corners, needle.length
+    corners = scratch.corners
     for k in range(count):
         m, (e, f) = scratch.tried[k, 0], across(scratch.frames, scratch.tried[k, 0])
         bring_into_frame(direction(scratch.frames, m), e, f, triangles, scratch.tried[k, 1], needle.target, corners, k)
-    measure_beside(corners, count, length)
+        corners[11, k] = needle.length[low + m]
+    measure_beside(corners, count)
     answer.counts[6] += count
     for k in range(count):
         m, square, depth = scratch.tried[k, 0], corners[9, k], corners[10, k]
         if square < 0.0:
-            square, depth = measure_other(corners, k, length)
+            square, depth = measure_other(corners, k)
         i = low + m
         if square < answer.square[i] or (square == answer.square[i] and depth < answer.depth[i]):
             answer.square[i], answer.depth[i], seed = square, depth, scratch.tried[k, 1]

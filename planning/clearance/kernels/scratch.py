@@ -37,7 +37,7 @@ class Scratch(NamedTuple):
         least: Shape (64,), float32, the least of them.
         errors: Shape (64,), float32, by how much such a distance may err, mm.
         tried: Shape (1024, 2), members, and rows of triangles.
-        corners: Shape (11, 1032), see `side_by_side.measure_beside`.
+        corners: Shape (12, 1032), see `side_by_side.measure_beside`.
     """
 
     found: NDArray[np.int64]
@@ -65,18 +65,18 @@ class Found(NamedTuple):
 
 
 class NeedleAxes(NamedTuple):
-    """What all axes share: where they start and how long they are; then three float32 numbers.
+    """Where all axes start and how long they are, and two float32 numbers.
 
     Attributes:
         target: Three numbers, mm.
-        length: Mm.
-        short: The length as float32.
+        length: Shape (n,), of each axis, in the tiles' order, mm.
+        longest: Of those of one bundle.
         slack: Rounding of a node's coordinate, mm.
     """
 
     target: Any
     length: Any
-    short: Any
+    longest: Any
     slack: Any
 
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.segment_triangle import CONTACT_MM, LEAST, axis_triangle
 
-ROWS = 11
-"""Of a buffer of pairs: nine coordinates, squared distance, depth."""
+ROWS = 12
+"""Of a buffer of pairs: nine coordinates, squared distance, depth, length of the axis."""
 
 UNDECIDED, BEYOND = -1.0, -2.0
 """In place of a squared distance: `axis_triangle` must be asked; the triangle lies wholly beyond the axis' top."""
@@ -29,18 +29,17 @@ def bring_into_frame(u, e, f, triangles, row, origin, pairs, k):  # type: ignore
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def measure_beside(pairs, count, length):  # type: ignore[no-untyped-def]  # numba infers
+def measure_beside(pairs, count):  # type: ignore[no-untyped-def]  # numba infers
     """Answer the pairs whose triangle lies beside the axis or is pierced by it; mark the others.
 
     Args:
-        pairs: Shape (11, m); rows 0 to 8 as `bring_into_frame` writes them; the squared distance (or `ASK`, `BEYOND`)
-            and the depth of the nearest axis point are written to rows 9 and 10, mm.
+        pairs: Shape (12, m); rows 0 to 8 as `bring_into_frame` writes them, row 11 the axes' lengths; rows 9
+            and 10 are written: squared distance (or `UNDECIDED`, `BEYOND`), and the depth of the axis' nearest point.
         count: Pairs there are.
-        length: Of the axes, mm.
     """
     for k in range(count):
         ax, ay, ta, bx, by, tb = pairs[0, k], pairs[1, k], pairs[2, k], pairs[3, k], pairs[4, k], pairs[5, k]
-        cx, cy, tc = pairs[6, k], pairs[7, k], pairs[8, k]
+        cx, cy, tc, length = pairs[6, k], pairs[7, k], pairs[8, k], pairs[11, k]
         best, depth = _shadow(ax, ay, ta, bx, by, tb)
         two, two_depth = _shadow(bx, by, tb, cx, cy, tc)
         three, three_depth = _shadow(cx, cy, tc, ax, ay, ta)
@@ -60,11 +59,12 @@ def measure_beside(pairs, count, length):  # type: ignore[no-untyped-def]  # num
 
 
 @nb.njit(cache=True, error_model="numpy")
-def measure_other(pairs, k, length):  # type: ignore[no-untyped-def]  # numba infers
+def measure_other(pairs, k):  # type: ignore[no-untyped-def]  # numba infers
     """Squared distance and depth of a pair that `measure_beside` has marked."""
     a, b, c = (pairs[0, k], pairs[1, k], pairs[2, k]), (pairs[3, k], pairs[4, k], pairs[5, k]), (
         pairs[6, k], pairs[7, k], pairs[8, k],
     )  # fmt: skip
+    length = pairs[11, k]
     if pairs[9, k] == BEYOND:
         top = (0.0, 0.0, length)
         return _origin_triangle(_minus(a, top), _minus(b, top), _minus(c, top)), length

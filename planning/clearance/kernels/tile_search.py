@@ -20,7 +20,7 @@ COUNTED = ("bundles", "nodes", "blocks found", "axes", "filters", "block tests",
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
-    surface, all_nodes, slack, origin, length, at_target, nearest, tiles, scratch, found, lanes
+    surface, all_nodes, slack, origin, lengths, at_target, nearest, tiles, scratch, found, lanes
 ):
     """Distance and depth of every axis; a structure's whole search.
 
@@ -29,7 +29,7 @@ def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
         all_nodes: See `bounds.disc_bounds`, made for this target.
         slack: Rounding of a node's coordinate, mm.
         origin: Shape (3,), the target, where the axes start.
-        length: Of the axes, mm.
+        lengths: Shape (n,), of the axes, in the tiles' order, mm.
         at_target: Distance of the target itself from the surface, mm; bounds every answer from above.
         nearest: Row of the triangle that is nearest to the target.
         tiles: `Tiles.outward`, ``starts``, ``middle`` and ``chord``.
@@ -41,13 +41,17 @@ def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
     outward, starts, middle, chords = bare(tiles[0]), bare(tiles[1]), bare(tiles[2]), bare(tiles[3])
     nodes, work, answer = bare(all_nodes), _bare_scratch(scratch), _bare_found(found)
     target, seed = (origin[0], origin[1], origin[2]), nearest
-    needle = NeedleAxes(target, length, np.float32(length), np.float32(slack))
+    length = bare(lengths)
     for tile in range(len(middle)):
         low, high = starts[tile], starts[tile + 1]
+        shortest, longest = length[low], length[low]
+        for i in range(low + 1, high):
+            shortest, longest = min(shortest, length[i]), max(longest, length[i])
+        needle = NeedleAxes(target, length, np.float32(longest), np.float32(slack))
         _begin(outward, low, high, at_target, nearest, lanes, work, answer)
         if seed != nearest:
             corners = _corners(triangles, seed, target)
-            lower_upper_bounds(work.frames32, lanes, corners, needle.short, FOUR * needle.slack, work.upper)
+            lower_upper_bounds(work.frames32, lanes, corners, np.float32(shortest), FOUR * needle.slack, work.upper)
         worst = ZERO
         for k in range(high - low):
             worst = max(worst, work.upper[k])
@@ -125,7 +129,7 @@ def _collect(nodes, base, axis, chord, needle, worst, work, answer):  # type: ig
     while waiting > 0:
         waiting -= 1
         first, level = stack[waiting, 0], stack[waiting, 1]
-        disc_bounds(nodes, first, axis, chord, needle.short, needle.slack, bounds, 0)
+        disc_bounds(nodes, first, axis, chord, needle.longest, needle.slack, bounds, 0)
         answer.counts[1] += 1
         bits, above = at_most(bounds, 0, worst), (first - base[level]) * LANES
         while bits != 0:

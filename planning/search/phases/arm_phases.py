@@ -16,10 +16,11 @@ from puncture_twin.planning.collision.surroundings import GANTRY
 from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.reach.standoff import own_paths
 from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates
 from puncture_twin.planning.search.phases.moving_weights import MovingWeights, moving_weights
-from puncture_twin.planning.search.phases.one_phase import paths_at, rejected_at
+from puncture_twin.planning.search.phases.one_phase import rejected_at
 
 
 def with_breathing_reach(case: Case, anatomy: Anatomy, found: Candidates, reach: ArmReach) -> Candidates:
@@ -54,7 +55,7 @@ def _at_phase(
     displaced = _displaced(anatomy, weights, breathing, s)
     solids = _with_moved_solids(case, anatomy, weights, breathing, s, reach.T_base_ct)
     there = ArmReach(case_checker(solids, displaced, reach.T_base_ct), reach.T_base_ct)
-    paths = paths_at(case, anatomy.skin, found.outward_ct, weights.skin, moved)
+    paths = own_paths(case, anatomy.skin, found.outward_ct, (1 - weights.skin) * moved)
     path = replace(found.path, length=paths.path_length, skin_angle=paths.skin_angle)
     shifted = replace(found, path=path, arm=ArmColumns.unknown(len(found)))
     answered = with_reach(replace(case, target_ct=case.target_ct + moved), shifted, there)

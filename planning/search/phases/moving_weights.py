@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
+from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.breathing.breathing import Breathing
@@ -56,7 +57,7 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
 
 def _by_itself(case: Case, structure: Structure) -> float | None:
     """The weight of what needs no statement; None of all else."""
-    if structure.name == case.target_structure:
+    if structure.name in {case.target_structure, BEYOND_IMAGE}:  # which the breath has widened already
         return 1.0
     return 0.0 if structure.source == OF_CASE_FILE else None
 

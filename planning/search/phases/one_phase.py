@@ -7,22 +7,21 @@ asked for another target. What moves with the target (w = 1) is not measured aga
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.anatomy.skin_entry import SkinPaths, skin_paths, view_depth
+from puncture_twin.planning.anatomy.skin_entry import SkinPaths
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.measure import Clearances, measure
 from puncture_twin.planning.needle.deflection import DeflectionBound
-from puncture_twin.planning.reach.axis_lengths import axis_lengths, farthest_flange
+from puncture_twin.planning.reach.standoff import axis_lengths, own_paths
 from puncture_twin.planning.search.bending.bent_needle import bent_verdict
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 from puncture_twin.planning.search.constraints import first_broken
@@ -82,6 +81,7 @@ class BreathingBody:
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
         weights: Of skin and structures.
         bound: How far the needle may bend; None bends nothing.
+        found: The candidates, checked where the CT shows the body.
     """
 
     case: Case
@@ -90,6 +90,22 @@ class BreathingBody:
     engine: ClearanceEngine
     weights: MovingWeights
     bound: DeflectionBound | None
+    found: Candidates
+
+    @cached_property
+    def lengths(self) -> Floats:
+        """How far the axes of the n candidates are checked against the k structures, shape (n, k), mm.
+
+        Up to the farthest place at which the flange waits at any position.
+        """
+        case, checked, outward = self.case, self.anatomy.checked, self.found.outward_ct
+        at = [axis_lengths(case, checked, self.paths(outward, s)) for s in self.breathing.positions.tolist()]
+        return np.asarray(np.max(at, axis=0))
+
+    def paths(self, outward_ct: Floats, s: float) -> SkinPaths:
+        """The skin along paths (n, 3) at a position; entries in the moved skin's own coordinates."""
+        moved = (1 - self.weights.skin) * self.breathing.moved_ct(s)
+        return own_paths(self.case, self.anatomy.skin, outward_ct, moved)
 
     @property
     def demanding(self) -> Ints:
@@ -106,19 +122,13 @@ class BreathingBody:
         weights = self.weights.structures[self.demanding]
         return np.asarray(abs(high - low) * self.breathing.amplitude_mm * np.abs(1 - weights))
 
-    def at(self, found: Candidates, rows: Ints, s: float) -> Phase:
-        """Some candidates at a position, as if inserted there.
-
-        Args:
-            found: Checked where the CT shows the body.
-            rows: Shape (m,), which.
-            s: The position.
-        """
-        case, checked, outward = self.case, self.anatomy.checked, found.outward_ct[rows]
+    def at(self, rows: Ints, s: float) -> Phase:
+        """Some candidates, ``rows`` (m,), at a position, as if inserted there."""
+        case, checked, outward = self.case, self.anatomy.checked, self.found.outward_ct[rows]
         moved = self.breathing.moved_ct(s)
-        paths = paths_at(case, self.anatomy.skin, outward, self.weights.skin, moved)
+        paths = self.paths(outward, s)
         shifts = moved[None] * (1 - self.weights.structures)[:, None]
-        clearances = _clearances(case, self.anatomy, self.engine, found, rows, shifts)
+        clearances = self._clearances(rows, shifts)
         limit = case.search.max_skin_angle
         verdict = first_broken(paths, clearances, checked, needle=case.needle, max_skin_angle=limit)
         deflection = np.zeros(len(rows)) if self.bound is None else self.bound.at(paths.path_length)
@@ -127,78 +137,36 @@ class BreathingBody:
         clearance = clearances.clearance[:, self.demanding]
         return Phase(s, rows, verdict, clearance, clearance - self.margins, deflection)
 
-    def excess_at(self, found: Candidates, rows: Ints, s: float, columns: Ints) -> Floats:
+    def excess_at(self, rows: Ints, s: float, columns: Ints) -> Floats:
         """What the surfaces of some structures leave over their margins at a position, shape (m, c), mm.
 
         Args:
-            found: Checked where the CT shows the body.
             rows: Shape (m,), which candidates.
             s: The position.
             columns: Shape (c,), which of the structures with a margin.
         """
-        case, which, lengths = self.case, self.demanding[columns], axis_lengths(self.case, self.anatomy.checked)
+        case, which = self.case, self.demanding[columns]
         distance, weights = np.empty((len(rows), len(columns))), self.weights.structures[which]
         for weight in np.unique(weights):
             group = np.flatnonzero(weights == weight)
             origin = case.target_ct + (1 - weight) * self.breathing.moved_ct(s)
-            part, length = self.engine.of(which[group]), lengths[which[group]]
-            distance[:, group] = part.measure(origin, found.outward_ct[rows], length, shown=False).distance
+            part, length = self.engine.of(which[group]), self.lengths[np.ix_(rows, which[group])]
+            distance[:, group] = part.measure(origin, self.found.outward_ct[rows], length, shown=False).distance
         return np.asarray(distance - case.needle.radius_mm - self.margins[columns])
 
-
-def paths_at(case: Case, skin: Skin, outward_ct: Floats, weight: float, moved_ct: Floats) -> SkinPaths:
-    """The skin along paths to a target that the breath has moved; entries in the moved skin's own coordinates.
-
-    What lies beyond the image moves by nobody knows how much: paths end at the nearest of the places that its border
-    has if it stays, follows the skin, or follows the target.
-
-    Args:
-        case: Needle, limits, and the target where the CT shows it.
-        skin: The skin, where the CT shows it.
-        outward_ct: Shape (m, 3), unit.
-        weight: Of the skin.
-        moved_ct: Shape (3,), how far the target has moved, mm.
-    """
-    needle, target = case.needle, case.target_ct
-    farthest = farthest_flange(needle, case.search.max_skin_angle)
-    if not np.any(moved_ct):
-        return skin_paths(skin, target, outward_ct, needle.length_mm, farthest)
-    origins = [target + (1 - w) * moved_ct for w in (weight, 0.0, 1.0)]
-    try:
-        paths = skin_paths(skin, origins[0], outward_ct, needle.length_mm, farthest)
-        views = np.array([view_depth(skin, origin, outward_ct) for origin in origins])
-    except InputError:  # the breath takes the target out of the image: nothing is known around it
-        return _unknown(len(outward_ct))
-    view = np.fmin.reduce(views, axis=0)
-    reached = np.where(view < needle.length_mm, view, np.nan)
-    return replace(paths, view_depth=view, unknown_depth=np.fmin(paths.unknown_depth, reached))
-
-
-def _unknown(count: int) -> SkinPaths:
-    """Paths of which nothing is known from the target on."""
-    blank, zero = np.full(count, np.nan), np.zeros(count)
-    return SkinPaths(np.full((count, 3), np.nan), blank, blank, blank, zero, zero)
-
-
-def _clearances(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, rows: Ints, shifts_ct: Floats
-) -> Clearances:
-    """To all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
-    checked, lengths = anatomy.checked, axis_lengths(case, anatomy.checked)
-    clearance = found.clearance.distance[rows].copy()
-    depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
-    demanding = np.array([one.demands_margin for one in checked], bool)
-    for shift in np.unique(shifts_ct, axis=0):
-        columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & demanding)
-        if not np.any(shift) or not len(columns):
-            continue
-        structures = tuple(checked[column] for column in columns)
-        at = measure(
-            engine.of(columns), structures, case.target_ct + shift, found.outward_ct[rows],
-            length=lengths[columns], radius=case.needle.radius_mm,
-        )  # fmt: skip
-        clearance[:, columns], depth[:, columns], violated[:, columns] = at.clearance, at.depth, at.violated
-    return Clearances(clearance, depth, violated)
+    def _clearances(self, rows: Ints, shifts_ct: Floats) -> Clearances:
+        """To all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
+        checked, found, radius = self.anatomy.checked, self.found, self.case.needle.radius_mm
+        clearance = found.clearance.distance[rows].copy()
+        depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
+        moved = [one.demands_margin and (one.outside or by.any()) for one, by in zip(checked, shifts_ct, strict=True)]
+        for shift in np.unique(shifts_ct[moved], axis=0):
+            columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & moved)
+            structures, length = tuple(checked[column] for column in columns), self.lengths[np.ix_(rows, columns)]
+            target, outward, part = self.case.target_ct + shift, found.outward_ct[rows], self.engine.of(columns)
+            at = measure(part, structures, target, outward, length=length, radius=radius)
+            clearance[:, columns], depth[:, columns], violated[:, columns] = at.clearance, at.depth, at.violated
+        return Clearances(clearance, depth, violated)
 
 
 def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:

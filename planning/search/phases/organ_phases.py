@@ -39,22 +39,21 @@ class _Gap(NamedTuple):
         return _Gap(self.rows[rows], self.columns[columns], self.low, self.high, *ends, self.deflection[rows])
 
 
-def checked_between(body: BreathingBody, found: Candidates, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
+def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
     """The verdict with those rejected that no measurement shows to be clear between two positions.
 
     Args:
         body: The case.
-        found: The candidates.
-        verdict: Of them, with what is rejected at the two positions.
+        verdict: Of the candidates, with what is rejected at the two positions.
         low: The one position.
         high: The other, of the same candidates.
     """
     deflection = np.fmax(low.deflection, high.deflection)
     columns = np.arange(len(body.demanding))
-    return _checked(body, found, verdict, _Gap(low.rows, columns, low.s, high.s, low.excess, high.excess, deflection))
+    return _checked(body, verdict, _Gap(low.rows, columns, low.s, high.s, low.excess, high.excess, deflection))
 
 
-def _checked(body: BreathingBody, found: Candidates, verdict: Verdict, gap: _Gap) -> Verdict:
+def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
     moves = body.moves_mm(gap.low, gap.high)[gap.columns]
     least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]
     short = (least < 0) & (moves > 0) & (verdict.reason[gap.rows] == Reason.NONE.value)[:, None]
@@ -67,15 +66,15 @@ def _checked(body: BreathingBody, found: Candidates, verdict: Verdict, gap: _Gap
         return rejected_at(
             verdict, gap.rows, _too_close(nearest, np.full(len(nearest), np.nan)), body.breathing, middle
         )
-    excess = body.excess_at(found, gap.rows, middle, gap.columns)
+    excess = body.excess_at(gap.rows, middle, gap.columns)
     left = excess - gap.deflection[:, None]
     bad = left.min(axis=1) < 0
     column = left[bad].argmin(axis=1)
     amount = excess[bad][np.arange(len(column)), column] + body.margins[gap.columns[column]]
     close = _too_close(_names(body, gap, left)[bad], amount)
     verdict = rejected_at(verdict, gap.rows[bad], close, body.breathing, middle)
-    verdict = _checked(body, found, verdict, gap._replace(high=middle, at_high=excess))
-    return _checked(body, found, verdict, gap._replace(low=middle, at_low=excess))
+    verdict = _checked(body, verdict, gap._replace(high=middle, at_high=excess))
+    return _checked(body, verdict, gap._replace(low=middle, at_low=excess))
 
 
 def _names(body: BreathingBody, gap: _Gap, left: Floats) -> Texts:
@@ -107,14 +106,14 @@ def with_breathing(
     breathing = case.breathing
     if breathing is None:
         return found
-    body = BreathingBody(case, breathing, anatomy, engine, moving_weights(case, breathing, anatomy), bound)
+    body = BreathingBody(case, breathing, anatomy, engine, moving_weights(case, breathing, anatomy), bound, found)
     rows, within = np.flatnonzero(found.safe), int(breathing.in_window.sum())
-    phases = [body.at(found, rows, s) for s in breathing.positions.tolist()]
+    phases = [body.at(rows, s) for s in breathing.positions.tolist()]
     verdict = through = found.verdict
     for at, phase in enumerate(phases):
         through = rejected_at(through, rows, phase.verdict, breathing, phase.s)
         if at:
-            through = checked_between(body, found, through, phases[at - 1], phase)
+            through = checked_between(body, through, phases[at - 1], phase)
         verdict = through if at < within else verdict  # the gate's window is the first of them
     blank = np.full(len(found), np.nan)
     worst, clearance = blank.copy(), blank.copy()

@@ -182,7 +182,7 @@ class Surroundings:
 
     Attributes:
         blocks: The faces of each of the k structures.
-        length: Shape (k,), of the needle's axis for each.
+        length: Shape (n, k), of each needle's axis for each.
         target_ct: Shape (3,), where every axis starts.
     """
 
@@ -234,7 +234,7 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
         for column in np.flatnonzero(wanted[row] & np.isfinite(first[row])):
             surface_mm = float(needles.surface_mm[row, column])
             doubt = replace(pose, surface_mm=surface_mm) if surface_mm > 0 else pose
-            length, threshold = float(around.length[column]), float(threshold_mm[column])
+            length, threshold = float(around.length[row, column]), float(threshold_mm[column])
             reach = doubt.reach(length, threshold)
             if needles.near.distance[row, column] > max(reach):
                 continue

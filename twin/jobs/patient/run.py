@@ -101,6 +101,7 @@ class Run:
         return {
             **provenance,
             "warnings": [*provenance["warnings"], *needle_warnings(self.context.case, found)],
+            "findings": [*provenance["findings"], *(one.document() for one in found.findings)],
             "inputs": inputs_document(self.inputs),
             "headline": found_windows.headline,
             "largest_window": None if largest is None else window_summary(found, largest),

@@ -69,7 +69,7 @@ def _search(run: Run) -> list[str]:
     lines += [f"{len(found)} direction{'s' if len(found) != 1 else ''}{looked}"]
     counts = ((found.safe_text if reason == "safe" else reason, count) for reason, count in found.counts().items())
     lines += [f"  {count:7d}  {reason}" for reason, count in counts]
-    lines += needle_warnings(run.context.case, found)
+    lines += [*needle_warnings(run.context.case, found), *(one.sentence for one in found.findings)]
     lines += [] if found.arm_checked else [f"arm {found.arm_note}"]
     return lines + (_best(run) if found.safe.any() else _nothing_safe(run))
 

@@ -118,7 +118,7 @@ def write_page(
         ),
         registration=tables.registration_section(registration),
         rehearsal=tables.rehearsal_section(rehearsal, demanding(anatomy), film),
-        warnings=tables.warnings_section(anatomy.warnings),
+        warnings=tables.warnings_section((*(one.sentence for one in candidates.findings), *anatomy.warnings)),
         inputs=tables.inputs_table(case.inputs),
         origin=tables.origin_section(seed),
         data=script_json(_drawn(case, anatomy, candidates, plan, rehearsal, pick, slices, raster)),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.geometry.frames import frame_about
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box as box
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import step_of
@@ -20,15 +20,6 @@ SECTIONS = 24
 
 LIFT_MM = 1.0
 """How far the corridor's mouth is drawn outside the skin, so that the two surfaces do not flicker."""
-
-CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-"""Of the unit cube about the origin, shape (8, 3)."""
-
-QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-"""Its sides: corners in order, seen from outside to the left."""
-
-SIDES = np.array([triangle for a, b, c, d in QUADS for triangle in ((a, b, c), (a, c, d))])
-"""Its sides as triangles, shape (12, 3)."""
 
 KEY = 1e-6
 """rad; corners of cells nearer than this are one corner."""
@@ -48,11 +39,6 @@ def ball(centre_ct: Floats, radius: float) -> TriangleMesh:
     outline = radius * np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
     outline[[0, -1], 0] = 0.0  # the poles
     return revolved(outline, SECTIONS).transformed(pose(np.eye(3), centre_ct))
-
-
-def box(T_ct_box: Floats, size: Any) -> TriangleMesh:
-    """A cuboid about the origin of its frame, with full edge lengths ``size``, mm."""
-    return TriangleMesh(CORNERS * np.asarray(size, dtype=float), SIDES).transformed(T_ct_box)
 
 
 def ring(T_ct_ring: Floats, inner: float, outer: float, thickness: float) -> TriangleMesh:

@@ -1,0 +1,138 @@
+"""Beyond the image the body goes on: one solid of role ``unknown`` for needle, holder, links and base.
+
+At each face of the image that cuts the body its outline there is drawn on outward, also past neighbouring faces that
+cut it, and is widened to the sides by what the case states or by what is usual. What the solid leaves free is air.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.body.cut_ends import SIDES, FieldOfView
+from puncture_twin.planning.anatomy.body.outside_body import prism
+from puncture_twin.planning.anatomy.scan import Scan
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+
+BEYOND_IMAGE = "beyond_image"
+"""Its name among the structures."""
+REACH_MM = 2000.0
+"""So far the body goes on beyond a face, and half spaces to their sides: farther than a needle and its arm reach."""
+USUAL_MM = 150.0
+"""By so much a body without arms is wider than where an image cuts it: hips below a waist, shoulders above a chest."""
+OUTLINE_MM = 10.0
+"""The outline at a face is that of the body's last so many mm: slices of twice as much show it."""
+SAME_MM = 0.01
+"""Corners of an outline that are no farther apart are one."""
+TANGENTS = 32
+"""Sides of the polygon about an outline: about a circle of 200 mm it is 1 mm too wide at most."""
+
+
+class Assumed(NamedTuple):
+    """By how much wider than where it is cut the body may be beyond an image (infinite for a half space), and why."""
+
+    wider_mm: float
+    because: str
+
+
+class Beyond(NamedTuple):
+    """The solid beyond the images of a case, if one cuts the body, and a sentence an image that does."""
+
+    structures: tuple[Structure, ...]
+    findings: tuple[Finding, ...]
+
+
+def beyond_images(case: Case, skin: Skin, scan: Scan | None) -> Beyond:
+    """What lies beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere."""
+    ends = [] if skin.field_of_view is None else [(skin.field_of_view, skin.mesh.vertices)]
+    of_scan = None if scan is None else scan.end()
+    ends = [end for end in [*ends, *([] if of_scan is None else [of_scan])] if end[0].cut.any()]
+    if not ends:
+        return Beyond((), ())
+    found = [assumed(case, view) for view, _ in ends]
+    mesh = joined([beyond_image(*end, one.wider_mm, _breath(case)) for end, one in zip(ends, found, strict=True)])
+    solid = Structure(BEYOND_IMAGE, Role.UNKNOWN, case.ct.margin_mm, mesh, "beyond the image", True, np.zeros((3, 3)))
+    said = [_finding(view, one) for (view, _), one in zip(ends, found, strict=True)]
+    return Beyond((solid,), tuple({one.sentence: one for one in said}.values()))
+
+
+def assumed(case: Case, view: FieldOfView) -> Assumed:
+    """What holds of a case: a person's word, or the usual where no arm can lie beyond.
+
+    An arm that is stretched out lies farther from the trunk than anything usual: unless there is none, or the image
+    shows the arms and the body's whole width, all that lies beyond a cut is unknown.
+    """
+    ct = case.ct
+    if ct.beyond_mm is not None:
+        return Assumed(ct.beyond_mm, "[ct] beyond_mm")
+    if ct.arms == "none" or case.region == "phantom":
+        return Assumed(USUAL_MM, "no arms" if ct.arms == "none" else "a phantom")
+    if ct.arms == "present" and not view.cut[0].any():
+        return Assumed(USUAL_MM, "the image shows the arms, and the body's whole width")
+    return Assumed(np.inf, "nothing says where the arms lie")
+
+
+def beyond_image(view: FieldOfView, points_ct: Floats, wider_mm: float, moved_ct: Floats | None = None) -> TriangleMesh:
+    """The solid beyond a box that cuts the body at one face at least, closed, LPS mm.
+
+    Args:
+        view: The box and its faces that cut the body.
+        points_ct: Shape (n, 3), of the body's surface, those of its outlines at the faces among them.
+        wider_mm: To the sides; infinite for all beyond the faces' planes.
+        moved_ct: Shape (3,), how far what lies there may come toward the image as the body breathes, mm.
+    """
+    by = np.zeros(3) if moved_ct is None else np.abs(view.T_ct_box[:3, :3].T @ moved_ct)
+    points, solids, everything = view.to_box(points_ct), [], bool(np.isinf(wider_mm))
+    for axis, end in np.argwhere(view.cut).tolist():
+        section = _section(view, points, axis, end, everything=everything)
+        outline = _outline(section, float(np.linalg.norm(by)) + (0.0 if everything else wider_mm))
+        near, far = (view.size_mm[axis] - by[axis], REACH_MM) if end else (by[axis], -REACH_MM)
+        solids.append(prism(view.T_ct_box, outline, axis, (near, near + far)))
+    return joined(solids)
+
+
+def _section(view: FieldOfView, points: Floats, axis: int, end: int, *, everything: bool) -> Floats:
+    """Points (n, 2) about which the outline at a face is drawn; where a side of it is cut too, on past that."""
+    others = [other for other in range(3) if other != axis]
+    ends = np.stack([np.full(2, -REACH_MM), view.size_mm[others] + REACH_MM])
+    whole = np.array([[x, y] for x in ends[:, 0] for y in ends[:, 1]])
+    section = points[np.abs(points[:, axis] - end * view.size_mm[axis]) <= OUTLINE_MM][:, others]
+    if everything or not len(section):
+        return whole
+    for k, side in np.argwhere(view.cut[others]).tolist():
+        last = section[np.abs(section[:, k] - side * view.size_mm[others[k]]) <= OUTLINE_MM].copy()
+        last[:, k] = ends[side, k]
+        section = np.concatenate([section, last])
+    return section
+
+
+def _outline(points: Floats, wider_mm: float) -> Floats:
+    """A convex polygon (m, 2) about points (n, 2), its sides so far from them, counter-clockwise."""
+    step = 2 * np.pi / TANGENTS
+    normals = np.stack([np.cos(step * np.arange(TANGENTS)), np.sin(step * np.arange(TANGENTS))], axis=1)
+    away = (points @ normals.T).max(axis=0) + wider_mm
+    along = (np.roll(away, -1) - away * np.cos(step)) / np.sin(step)
+    corners = away[:, None] * normals + along[:, None] * np.stack([-normals[:, 1], normals[:, 0]], axis=1)
+    return np.asarray(corners[np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) > SAME_MM])
+
+
+def _breath(case: Case) -> Floats:
+    """How far the breath moves the target at most from where the CT shows it: nobody knows how it moves the rest."""
+    moved = [] if case.breathing is None else [case.breathing.moved_ct(s) for s in case.breathing.positions.tolist()]
+    return max(moved, key=lambda by: float(np.linalg.norm(by)), default=np.zeros(3))
+
+
+def _finding(view: FieldOfView, what: Assumed) -> Finding:
+    names = ", ".join(name for name, (axis, end) in SIDES.items() if view.cut[axis, end])
+    everything = bool(np.isinf(what.wider_mm))
+    wide = "all beyond it" if everything else f"the body drawn on, {what.wider_mm:g} mm wider to its sides,"
+    said = f"the body is cut at its {names} side: no skin is known there, and {wide} is unknown to needle and arm"
+    way_out = '[ct] arms = "none" where no arm lies there, or beyond_mm' if everything else ""
+    numbers = {"beyond_mm": "all" if everything else what.wider_mm}
+    return Finding(BEYOND_IMAGE, Severity.WARNING, f"{said} ({BEYOND_IMAGE}; {what.because})", numbers, way_out)
