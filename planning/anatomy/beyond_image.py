@@ -23,7 +23,9 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 BEYOND_IMAGE = "beyond_image"
 """Its name among the structures."""
 REACH_MM = 2000.0
-"""So far the body goes on beyond a face, and half spaces to their sides: farther than a needle and its arm reach."""
+"""So far the body goes on along the bed, and half spaces to their sides: farther than a needle and its arm reach."""
+ASIDE_MM = 400.0
+"""So far it goes on beyond a face that cuts its side: no trunk is wider than 800 mm."""
 USUAL_MM = 150.0
 """By so much a body without arms is wider than where an image cuts it: hips below a waist, shoulders above a chest."""
 OUTLINE_MM = 10.0
@@ -92,7 +94,8 @@ def beyond_image(view: FieldOfView, points_ct: Floats, wider_mm: float, moved_ct
     for axis, end in np.argwhere(view.cut).tolist():
         section = _section(view, points, axis, end, everything=everything)
         outline = _outline(section, float(np.linalg.norm(by)) + (0.0 if everything else wider_mm))
-        near, far = (view.size_mm[axis] - by[axis], REACH_MM) if end else (by[axis], -REACH_MM)
+        away = REACH_MM if axis == 2 or everything else ASIDE_MM
+        near, far = (view.size_mm[axis] - by[axis], away) if end else (by[axis], -away)
         solids.append(prism(view.T_ct_box, outline, axis, (near, near + far)))
     return joined(solids)
 
@@ -100,7 +103,8 @@ def beyond_image(view: FieldOfView, points_ct: Floats, wider_mm: float, moved_ct
 def _section(view: FieldOfView, points: Floats, axis: int, end: int, *, everything: bool) -> Floats:
     """Points (n, 2) about which the outline at a face is drawn; where a side of it is cut too, on past that."""
     others = [other for other in range(3) if other != axis]
-    ends = np.stack([np.full(2, -REACH_MM), view.size_mm[others] + REACH_MM])
+    away = np.where(everything | (np.array(others) == 2), REACH_MM, ASIDE_MM)
+    ends = np.stack([-away, view.size_mm[others] + away])
     whole = np.array([[x, y] for x in ends[:, 0] for y in ends[:, 1]])
     section = points[np.abs(points[:, axis] - end * view.size_mm[axis]) <= OUTLINE_MM][:, others]
     if everything or not len(section):

@@ -65,7 +65,7 @@ def test_where_two_neighbouring_faces_cut_the_body_the_corner_is_unknown_too():
     points = cylinder(middle=(260.0, 120.0))
     points = points[points[:, 0] <= SIZE[0]]
     points = np.concatenate([points, [[SIZE[0], y, z] for y in (60.0, 180.0) for z in (0.0, 90.0, SIZE[2])]])
-    corner = np.array([[SIZE[0] + 500, 120.0, SIZE[2] + 300], [SIZE[0] + 20, 120.0, SIZE[2] + 1500]])
+    corner = np.array([[SIZE[0] + 380, 120.0, SIZE[2] + 300], [SIZE[0] + 20, 120.0, SIZE[2] + 1500]])
     assert inside(beyond_image(box_with(HEAD, LEFT), points, 0.0), corner).all()
     alone = inside(beyond_image(box_with(HEAD), points, 0.0), corner)
     assert not alone.any()
