@@ -122,12 +122,14 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     if scan is None:
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
+        progress("what the CT shows outside of the body")
         shown = scan.outside(case.ct.air_hu)
         outside, couch = _outside(case, scan, shown, structures, loader.warnings), shown.couch
         for limb in (structure.mesh for structure in outside if structure.name == ATTACHED_LIMB):
             guesses.append(guessed(ATTACHED_LIMB, LIMB_ATTACHED, limb.volume / 1e3, body_side(limb, skin), NO_ARMS))
         if case.ct.unnamed == "free":
             loader.warnings.append(UNNAMED_FREE)
+        progress("what no structure names")
         structures.extend(_unnamed(case, scan, structures))
     unseen, beyond = beyond_images(case, skin, scan), beyond_labels(case, skin, structures)
     outside = (*outside, *unseen.structures)
@@ -188,8 +190,11 @@ def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterato
     """What the CT shows inside the body that no structure names, unless the case takes that for free."""
     if case.ct.unnamed == "free":
         return
-    named = [Named(structure.name, structure.mesh) for structure in structures]
-    unnamed = scan.unnamed(named, case.ct.dense_hu)
+    written = [Named(one.name, one.mesh) for one in structures if one.source != OWN_TARGET]
+    balls = [Named(one.name, one.mesh) for one in structures if one.source == OWN_TARGET]
+    unnamed = scan.unnamed(written, case.ct.dense_hu)
+    if any(scan.may_hold(unnamed, ball.mesh) for ball in balls):  # else it is the same for every target
+        unnamed = scan.unnamed([*written, *balls], case.ct.dense_hu)
     for name, mesh in ((UNNAMED_DENSE, unnamed.dense), (UNNAMED_GAS, unnamed.gas)):
         if mesh is not None:
             source, voxel_ct = f"{scan.name}: {name}", scan.source.surfaces.voxel_ct

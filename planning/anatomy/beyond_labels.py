@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from puncture_twin.planning.anatomy.label_grids import LabelGrid, label_grids
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, widened
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.labels.label_surface import mask_surface
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
@@ -168,9 +167,8 @@ def _body_between(
     T_index_cell = np.eye(4)
     T_index_cell[:3, :3], T_index_cell[:3, 3] = np.diag(step), first
     T_ct_cell = grid.voxels.T_ct_index @ T_index_cell
-    nx, ny, nz = (int(n) for n in count)
-    inside = scipy.ndimage.maximum_filter(voxels_inside(skin, T_ct_cell, (nx, ny, nz)).view(np.uint8), 3)
+    inside = widened(voxels_inside(skin, T_ct_cell, tuple(count)), (1, 1, 1))
     if not inside.any():
         return None
     oriented = canonical(inside, T_ct_cell)
-    return field_surface(oriented.values.astype(np.float32) - 0.5, oriented.T_ct_index, where=grid.name)
+    return mask_surface(oriented.values, oriented.T_ct_index, where=grid.name)

@@ -24,7 +24,7 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     outside_surface,
 )
 from puncture_twin.planning.anatomy.body.tables import FACES, TableSide, find_support
-from puncture_twin.planning.anatomy.second_witness import BodyImage, Named, Unnamed, unnamed_surfaces
+from puncture_twin.planning.anatomy.second_witness import Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.anatomy.skin import Skin, field_of_view
 from puncture_twin.planning.anatomy.surfaces import Imaged, kept_mesh, mesh_arrays
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -32,6 +32,7 @@ from puncture_twin.planning.base.cache.array_cache import Arrays
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.mesh_guard import fits
 from puncture_twin.planning.formats.volumes.nearest_voxel import nearest
+from puncture_twin.planning.geometry.containment import holds
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.voxelize import voxels_inside
@@ -79,7 +80,7 @@ class Scan:
 
         def make() -> list[TriangleMesh | None]:
             ct = self._ct
-            image = OutsideImage(ct.hu, self._body, ct.T_ct_index, ct.spacing_mm)
+            image = OutsideImage(ct.hu, self._body, ct.T_ct_index, ct.spacing_mm).known(ct.unscanned)
             mask = outside_mask(image, air_hu)
             meshes = self._outside_meshes(image, mask)
             if all(mesh is None or fits(mesh) for mesh in meshes):
@@ -157,11 +158,18 @@ class Scan:
         def make() -> Unnamed:
             ct = self._ct
             slack_mm = 0.0 if self.skin is None else 2.0 * self._tolerance_mm
-            image = BodyImage(ct.hu, self._body, ct.T_ct_index, ct.spacing_mm, slack_mm)
-            return unnamed_surfaces(image, structures, dense_hu=dense_hu, where=self._ct.where)
+            return unnamed_surfaces(ct, self._body, structures, dense_hu=dense_hu, slack_mm=slack_mm)
 
         named = {"structures": [f"{one.name} {one.mesh.digest}" for one in structures]}
         return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
+
+    def may_hold(self, unnamed: Unnamed, mesh: TriangleMesh) -> bool:
+        """Whether something of what no structure names may lie in a surface, or beside it."""
+        step_mm = 2.0 * self.source.surfaces.source.grid.spacing_mm.max()
+        low, high = mesh.bounds + [[-step_mm], [step_mm]]
+        near = (one.vertices for one in unnamed if one is not None)
+        within = any(np.all((low <= some) & (some <= high), axis=1).any() for some in near)
+        return within or any(one is not None and holds(one, (low + high) / 2.0) for one in unnamed)
 
     def contains(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
@@ -181,7 +189,12 @@ class Scan:
     @property
     def voxels(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
         """Hounsfield units as they are stored, shape (nx, ny, nz), and the map (4, 4) of an index to LPS mm."""
-        return self.source.voxels
+        return self._ct.stored, self._ct.T_ct_index
+
+    def release(self) -> None:
+        """Let go of all voxels; what asks for them again decodes them again."""
+        vars(self).pop("_body", None)
+        self.source.release()
 
     @property
     def _ct(self) -> CtImage:

@@ -7,19 +7,17 @@ hold gas: a loop of bowel or a piece of lung that nobody labelled. Both become s
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Bools
-from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.anatomy.body.body_mask import CtImage
+from puncture_twin.planning.base.arrays import Bools, counts_of, grown, widened
+from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.voxelize import voxels_inside
+from puncture_twin.planning.geometry.voxelize import mark_inside
 
 GAS_HU = -300.0
 """Half way between fat (-100) and a voxel that is half gas, half tissue (-500)."""
@@ -51,26 +49,6 @@ class Named(NamedTuple):
         return any(word.startswith(GAS_HOLDERS) or word in GAS_WORDS for word in words)
 
 
-@dataclass(frozen=True, eq=False)
-class BodyImage:
-    """A CT with its body.
-
-    Attributes:
-        hu: Shape (nx, ny, nz), Hounsfield units.
-        body: Same shape.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
-        spacing_mm: Shape (3,).
-        slack_mm: So deep below the body's surface there may still be the ambient air, because the surface is from
-            elsewhere and was widened.
-    """
-
-    hu: NDArray[np.float32]
-    body: Bools
-    T_ct_index: NDArray[np.float64]
-    spacing_mm: NDArray[np.float64]
-    slack_mm: float = 0.0
-
-
 class Unnamed(NamedTuple):
     """What no structure names: closed surfaces in LPS mm, or None where there is nothing."""
 
@@ -78,50 +56,49 @@ class Unnamed(NamedTuple):
     gas: TriangleMesh | None
 
 
-def unnamed_surfaces(image: BodyImage, structures: Sequence[Named], *, dense_hu: float, where: str | Path) -> Unnamed:
+def unnamed_surfaces(
+    ct: CtImage, body: Bools, structures: Sequence[Named], *, dense_hu: float, slack_mm: float = 0.0
+) -> Unnamed:
     """Find dense components and gas inside the body outside of all structures grown by one voxel.
 
     Args:
-        image: The CT and its body.
+        ct: The CT.
+        body: Its body, shape (nx, ny, nz).
         structures: Every structure of the case but the skin.
         dense_hu: From here on a voxel is dense.
-        where: The CT's file, for messages.
+        slack_mm: So deep below the body's surface there may still be the ambient air, because the surface is from
+            elsewhere and was widened.
     """
-    named = _grown_union(structures, image)
-    dense = image.body & (image.hu >= dense_hu) & ~named
-    gas = image.hu < GAS_HU
+    holders = _marked(np.zeros(body.shape, bool), [one for one in structures if one.may_contain_gas], ct)
+    gas = ct.hu < GAS_HU
     if gas.any():
-        gas &= _deep(image) & ~_grown_union([one for one in structures if one.may_contain_gas], image)
-    return Unnamed(_surface(dense, image, where), _surface(gas, image, where))
+        gas &= _deep(body, ct, slack_mm) & ~grown(holders)
+    named = _marked(holders, [one for one in structures if not one.may_contain_gas], ct)
+    return Unnamed(_surface(body & (ct.hu >= dense_hu) & ~grown(named), ct), _surface(gas, ct))
 
 
-def _deep(image: BodyImage) -> Bools:
-    """Voxels so deep in the body that air in them is not the room's."""
-    deep = scipy.ndimage.binary_erosion(image.body, FULL, iterations=SKIN_VOXELS, border_value=1)
-    if image.slack_mm > 0.0 and not image.body.all():
-        deep &= scipy.ndimage.distance_transform_edt(image.body, sampling=image.spacing_mm) > image.slack_mm
-    return np.asarray(deep)
+def _deep(body: Bools, ct: CtImage, slack_mm: float) -> Bools:
+    """Voxels so deep in the body that air in them is not the room's; beyond the border the body goes on."""
+    deep = ~widened(~body, (SKIN_VOXELS,) * 3)
+    if slack_mm > 0.0 and not body.all():
+        deep &= scipy.ndimage.distance_transform_edt(body, sampling=ct.spacing_mm) > slack_mm
+    return deep
 
 
-def _grown_union(structures: Sequence[Named], image: BodyImage) -> Bools:
-    """Voxels of all structures, dilated by one voxel."""
-    union = np.zeros(image.hu.shape, bool)
+def _marked(mask: Bools, structures: Sequence[Named], ct: CtImage) -> Bools:
+    """The mask with the voxels of structures."""
     for structure in structures:
-        union |= voxels_inside(structure.mesh, image.T_ct_index, image.hu.shape)
-    return np.asarray(scipy.ndimage.binary_dilation(union))
+        mark_inside(structure.mesh, ct.T_ct_index, mask)
+    return mask
 
 
-def _surface(mask: Bools, image: BodyImage, where: str | Path) -> TriangleMesh | None:
+def _surface(mask: Bools, ct: CtImage) -> TriangleMesh | None:
     """The surface of the components that are large enough."""
-    kept = np.zeros_like(mask)
-    least = MIN_COMPONENT_MM3 / float(np.prod(image.spacing_mm))
-    for box, component in _components(mask):
-        if np.count_nonzero(component) >= least:
-            kept[box] |= component
-    return field_surface(kept.astype(np.float32) - 0.5, image.T_ct_index, where=where) if kept.any() else None
-
-
-def _components(mask: Bools) -> Iterator[tuple[tuple[slice, ...], Bools]]:
-    labels, _ = scipy.ndimage.label(mask, FULL)
-    for number, box in enumerate(scipy.ndimage.find_objects(labels), start=1):
-        yield box, labels[box] == number
+    if not mask.any():
+        return None
+    box = box_in(mask)
+    labels, count = scipy.ndimage.label(mask[box], FULL)
+    large = counts_of(labels, count) >= MIN_COMPONENT_MM3 / float(np.prod(ct.spacing_mm))
+    large[0] = False
+    mask[box] = large[labels]
+    return mask_surface(mask, ct.T_ct_index, where=ct.where) if large.any() else None

@@ -71,10 +71,13 @@ def skin_of_image(image: CtImage) -> Skin:
     Raises:
         InputError: If no body is found, or no air around it.
     """
-    found, above = image.found, image.hu - BODY_HU
-    inside = np.clip(np.where(above > 0, above, HU_RANGE), HU_LEAST, HU_RANGE)
-    outside = np.clip(np.where(above < 0, above, -HU_RANGE), -HU_RANGE, -HU_LEAST)
-    return _skin(np.where(found.body, inside, outside), found, image.T_ct_index, image.where)
+    body, above = image.found.body, image.hu - BODY_HU
+    unlike = ((above > 0) != body) | (above == 0)  # what counts as body, or as air, whatever its value
+    field = np.abs(above, out=above)
+    field[unlike] = HU_RANGE
+    np.clip(field, HU_LEAST, HU_RANGE, out=field)
+    np.negative(field, out=field, where=~body)
+    return _skin(field, image.found, image.T_ct_index, image.where)
 
 
 def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> Skin:
@@ -180,9 +183,11 @@ def _on_cut_border(
 
 def _at_unscanned(found: BodyMask, T: Floats, centres_ct: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Triangles in whose cell of eight voxels one was not scanned."""
+    near = np.zeros(len(centres_ct), dtype=np.bool_)
+    if not found.unscanned.any():
+        return near
     index = np.linalg.solve(T[:3, :3], (centres_ct - T[:3, 3]).T).T
     low = np.floor(index).astype(int)
-    near = np.zeros(len(centres_ct), dtype=np.bool_)
     for step in itertools.product((0, 1), repeat=3):
         cell = np.clip(low + step, 0, np.array(found.body.shape) - 1)
         near |= found.unscanned[tuple(cell.T)] & ~found.body[tuple(cell.T)]

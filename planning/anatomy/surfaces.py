@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import CtImage, ct_image
 from puncture_twin.planning.anatomy.body.cut_ends import (
@@ -19,7 +18,6 @@ from puncture_twin.planning.anatomy.body.cut_ends import (
     content_of,
     cut_ends,
     end_warnings,
-    shifted,
     stated_ends,
 )
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown
@@ -41,6 +39,12 @@ Value = TypeVar("Value")
 READERS = "puncture_twin.planning.case.case_volumes"
 """The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
 them has changed; nothing here imports them, so that a case without DICOM does not load its library."""
+
+LARGEST = 4
+"""Voxels are held in memory where they take one of so many parts of it at most."""
+
+MASK_BYTES = 3
+"""Of a voxel, for what is found in a CT: the body, and what was not measured."""
 
 
 class Present(NamedTuple):
@@ -92,7 +96,7 @@ class VolumeSurfaces:
     @cached_property
     def labelmap(self) -> LabelMap:
         """The label map itself."""
-        return labelmap_of(self.volume)
+        return self.held("label map", lambda: labelmap_of(self.volume), lambda labels: labels.labels.nbytes)
 
     @property
     def names(self) -> dict[int, str] | None:
@@ -126,7 +130,11 @@ class VolumeSurfaces:
     @cached_property
     def ct_image(self) -> CtImage:
         """All voxels of a CT."""
-        return ct_image(self.volume)
+
+        def make() -> CtImage:
+            return ct_image(vars(self).pop("volume", None) or self.source.volume())  # nobody asks for it again
+
+        return self.held("CT", make, lambda image: image.hu.nbytes)
 
     def imaged(
         self,
@@ -154,6 +162,15 @@ class VolumeSurfaces:
             return _of_content(self.ct_image.content)
         labels = canonical(self.labelmap.labels, self.labelmap.T_ct_index)
         return _of_content(content_of(labels.values == label, labels.T_ct_index))
+
+    def held(self, what: str, make: Callable[[], Value], size: Callable[[Value], int]) -> Value:
+        """What is made from this file, and is held in memory alone, where that does not push out all else."""
+        memory = self.cache.memory
+
+        def held_bytes(value: Value) -> int:
+            return size(value) if size(value) * LARGEST <= memory.most_bytes else memory.most_bytes + 1
+
+        return memory.get((__name__, what, self.path.name, *self.sha256), make, held_bytes)
 
     def kept(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
@@ -183,16 +200,20 @@ class Imaged:
     notes: tuple[str, ...]
     shown: Shown
 
-    @property
-    def voxels(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
-        """The CT as it is stored, shape (nx, ny, nz), and the map (4, 4) of an index to LPS mm."""
-        whole = canonical(self.surfaces.volume.values, self.surfaces.volume.T_ct_index)
-        return whole.values[tuple(slice(*ends) for ends in self.box)], shifted(whole.T_ct_index, self.box)
-
     @cached_property
     def image(self) -> CtImage:
         """The CT."""
-        return self.surfaces.ct_image.within(self.box, self.shown)
+
+        def make() -> CtImage:
+            return self.surfaces.ct_image.within(self.box, self.shown)
+
+        return self.surfaces.held(f"CT {self.box} {self.shown}", make, lambda image: image.hu.size * MASK_BYTES)
+
+    def release(self) -> None:
+        """Let go of the voxels; what asks for them again decodes them again."""
+        for holder, names in ((self, ("image",)), (self.surfaces, ("ct_image", "labelmap", "volume"))):
+            for name in names:
+                vars(holder).pop(name, None)
 
     def skin(self) -> Skin:
         """The body's skin."""

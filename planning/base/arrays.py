@@ -1,5 +1,7 @@
 """The arrays of this project by what they hold; a docstring beside each use gives shape, unit and frame."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -21,3 +23,39 @@ def read_only(array: ArrayLike) -> Floats:
     copy = np.array(array, dtype=np.float64)
     copy.setflags(write=False)
     return copy
+
+
+def widened(mask: Bools, reach: Sequence[int] | NDArray[np.integer]) -> Bools:
+    """A mask with all that lies so many voxels or fewer from it along each axis, in a box; shape of the mask."""
+    for axis, most in enumerate(reach):
+        done = 0
+        while done < most:
+            step = min(2 * done + 1, most - done)  # no farther than what is wide by now has no gap
+            wide = mask.copy()
+            _add_beside(wide, mask, axis, step)
+            mask, done = wide, done + step
+    return mask
+
+
+def grown(mask: Bools) -> Bools:
+    """A mask and the neighbours of its voxels, those that share a face."""
+    wide = mask.copy()
+    for axis in range(mask.ndim):
+        _add_beside(wide, mask, axis, 1)
+    return wide
+
+
+def _add_beside(wide: Bools, mask: Bools, axis: int, step: int) -> None:
+    """Set what lies a step beside a mask, to both ways of an axis."""
+    out, of = np.moveaxis(wide, axis, 0), np.moveaxis(mask, axis, 0)
+    out[step:] |= of[:-step]
+    out[:-step] |= of[step:]
+
+
+def counts_of(numbers: NDArray[np.integer], count: int, where: Bools | None = None) -> Ints:
+    """How many voxels have each number from 0 to ``count``, of those where a mask is True; plane by plane."""
+    counts = np.zeros(count + 1, np.int64)
+    for i, plane in enumerate(numbers):
+        found = np.bincount(plane.ravel() if where is None else plane[where[i]])
+        counts[: len(found)] += found
+    return counts

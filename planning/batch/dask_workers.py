@@ -12,10 +12,10 @@ import threading
 from collections.abc import Generator, Sequence
 from typing import Any
 
-from puncture_twin.planning.base.cache.memory import Memory
+from puncture_twin.planning.base.cache.memory import MEMORY_BYTES, Memory
 from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.batch.run import RunTasks
-from puncture_twin.planning.batch.run_case import MEMORY_BYTES, CaseEnd, CaseTask, commit_failure, ended, run_case
+from puncture_twin.planning.batch.run_case import CaseEnd, CaseTask, commit_failure, ended, run_case
 from puncture_twin.planning.batch.workers import NO_LIMITS, WORKER_DIED, Limits
 
 CONNECT_S = 20.0

@@ -42,9 +42,6 @@ BAD_INPUT = 2
 READY = "ready"
 """A worker's first word: its modules are loaded."""
 
-MEMORY_BYTES = 500_000_000
-"""What a worker keeps of patients: the meshes and trees of some ten whole bodies."""
-
 
 @dataclass(frozen=True)
 class CaseTask:

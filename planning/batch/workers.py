@@ -20,8 +20,9 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import NamedTuple
 
+from puncture_twin.planning.base.cache.memory import MEMORY_BYTES
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.batch.run_case import MEMORY_BYTES, READY, CaseEnd, CaseTask, commit_failure, ended, work
+from puncture_twin.planning.batch.run_case import READY, CaseEnd, CaseTask, commit_failure, ended, work
 
 WORKER_DIED, TIMED_OUT, OUT_OF_MEMORY = "worker_died", "timed_out", "out_of_memory"
 """Reasons of the rows that no worker could write."""

@@ -54,6 +54,8 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
         *odd_units(anatomy),
     )
     _refuse(case, placed)  # what follows looks from the target, which must lie in the body
+    if anatomy.scan is not None:
+        anatomy.scan.release()  # and asks no voxel
     rest = (
         *declared(case),
         *outside_skin(case, anatomy, cache),

@@ -115,8 +115,10 @@ def near_surface(points: Floats, mesh: TriangleMesh, distance_mm: Floats) -> Boo
     centres = mesh.triangles.mean(axis=1)
     reach = np.linalg.norm(mesh.triangles - centres[:, None], axis=2).max(axis=1)
     size = np.ceil(np.log2(np.maximum(reach, distance_mm.min())))
-    for one in np.unique(size):
-        rows, left = np.flatnonzero(size == one), np.flatnonzero(~near)
+    around_mm = (reach + distance_mm.max())[:, None]
+    seen = np.all((centres >= points.min(axis=0) - around_mm) & (centres <= points.max(axis=0) + around_mm), axis=1)
+    for one in np.unique(size[seen]):
+        rows, left = np.flatnonzero(seen & (size == one)), np.flatnonzero(~near)
         found = scipy.spatial.cKDTree(centres[rows]).query_ball_point(points[left], distance_mm[left] + 2.0**one)
         point = np.repeat(left, [len(some) for some in found])
         triangle = rows[[row for some in found for row in some]]

@@ -71,6 +71,8 @@ class TriangleMesh:
     @cached_property
     def closed(self) -> bool:
         """Whether there is an inside: every edge of welded vertices has an even number of triangles."""
+        if self.wound_alike and self.distinct.any():
+            return True  # as many triangles run an edge one way as the other
         a, b, c = self._welded[self.distinct].T
         ends = np.stack([np.concatenate([a, b, c]), np.concatenate([b, c, a])])
         edges = np.sort(ends.min(axis=0) * len(self.vertices) + ends.max(axis=0))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
+from puncture_twin.planning.base.arrays import counts_of
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.dicom.recognise import list_folder
 from puncture_twin.planning.formats.dicom.storage import Kind
@@ -358,7 +359,7 @@ def volume_kind(volume: Volume) -> tuple[str, str]:
         if error.code == "labels_blended":
             raise
         return OTHER, f"{error.what}, and for Hounsfield units nothing is below {AIR_HU}"
-    counts = np.bincount(np.asarray(whole).ravel(order="K"))
+    counts = counts_of(whole.T, round(high))  # as it lies in a file: the first index runs fastest
     different = np.count_nonzero(counts)
     if different > MOST_LABELS or (different > FEW_LABELS and _differs_everywhere(whole)):
         air = int(np.argmax(counts))

@@ -145,13 +145,15 @@ def agreement(mesh: TriangleMesh, skin: Skin) -> Agreement:
     within_mm = min(NEAR_MM, NEAR * float(np.linalg.norm(np.ptp(skin.mesh.bounds, axis=0))))
     open_skin = ~skin.cut_faces if not skin.cut_faces.all() else skin.cut_faces
     seen = TriangleMesh(skin.mesh.vertices, skin.mesh.faces[open_skin])
-    return Agreement(fraction_near(seen, mesh, within_mm), fraction_near(mesh, skin.mesh, within_mm))
+    return Agreement(
+        fraction_near(spread_on(seen, POINTS).points, mesh, within_mm),
+        fraction_near(spread_on(mesh, POINTS).points, skin.mesh, within_mm),
+    )
 
 
-def fraction_near(mesh: TriangleMesh, other: TriangleMesh, within_mm: float) -> float:
-    """The fraction of a surface's area that lies so near to another surface, by points of both."""
-    places = scipy.spatial.cKDTree(spread_on(other, PLACES).points)
-    distance, _ = places.query(spread_on(mesh, POINTS).points, distance_upper_bound=within_mm)
+def fraction_near(points: Floats, other: TriangleMesh, within_mm: float) -> float:
+    """The fraction of points (n, 3) that lie so near to a surface, by points of that."""
+    distance, _ = scipy.spatial.cKDTree(spread_on(other, PLACES).points).query(points, distance_upper_bound=within_mm)
     return float(np.isfinite(distance).mean())
 
 
@@ -171,8 +173,9 @@ def carved_notes(sources: Sequence[tuple[Segmentation, Sequence[Assigned]]]) -> 
     rows = [(segmentation, row) for segmentation, some in sources for row in some]
     targets = [(one.surface(row.label), row.name) for one, row in rows if row.kind == "target"]
     for target, name in targets:
+        points = spread_on(target, POINTS).points
         for segmentation, row in rows:
-            if row.kind == "avoid" and _goes_round(segmentation.surface(row.label), target):
+            if row.kind == "avoid" and _goes_round(segmentation.surface(row.label), points):
                 yield (
                     f"'{row.name}' goes round '{name}' without holding it, as if that was carved out of it, and is "
                     f"avoided by {row.margin_mm:g} mm, so no path through it is safe: if a path may cross it, make it "
@@ -180,9 +183,9 @@ def carved_notes(sources: Sequence[tuple[Segmentation, Sequence[Assigned]]]) -> 
                 )
 
 
-def _goes_round(mesh: TriangleMesh, target: TriangleMesh) -> bool:
+def _goes_round(mesh: TriangleMesh, points: Floats) -> bool:
+    """Whether most of a target's surface, of which these are points (n, 3), borders on another surface."""
     low, high = mesh.bounds
-    below, above = target.bounds
-    if (above < low - BORDER_MM).any() or (below > high + BORDER_MM).any():
+    if np.all((points >= low - BORDER_MM) & (points <= high + BORDER_MM), axis=1).mean() < MOST_OF_BORDER:
         return False
-    return fraction_near(target, mesh, BORDER_MM) >= MOST_OF_BORDER
+    return fraction_near(points, mesh, BORDER_MM) >= MOST_OF_BORDER

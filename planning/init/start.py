@@ -97,7 +97,9 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     if not found.problems:
         overrides.check_names(names, [name for name, _ in found.passed])
     body = _checked(found, point, request)
+    progress("skin")
     skin = body.skin()
+    progress("structures")
     if point is not None and body.ct is not None:
         _refuse_outside(point, body.ct, skin, space)
     stated = dict(overrides.roles) | ({} if body.structure is None else {body.structure.name: "skin"})

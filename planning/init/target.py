@@ -216,7 +216,7 @@ def deepest_point(mesh: TriangleMesh) -> tuple[Floats, int]:
     cell = float((high - low).max()) / CELLS
     shape = np.ceil((high - low) / cell).astype(int) + 2
     T_ct_index = pose(np.eye(3) * cell, low - cell / 2)
-    inside = voxels_inside(mesh, T_ct_index, (int(shape[0]), int(shape[1]), int(shape[2])))
+    inside = voxels_inside(mesh, T_ct_index, tuple(shape))
     parts, count = scipy.ndimage.label(inside)
     largest = parts == np.argmax(np.bincount(parts.ravel())[1:]) + 1 if count > 1 else inside
     depth = scipy.ndimage.distance_transform_edt(largest)

@@ -16,7 +16,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.memory import MEMORY_BYTES, NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.base.progress import Silent, Stages, Watcher
@@ -220,6 +220,7 @@ def prepare(
         cache = replace(user_cache(), memory=memory)
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), cache)
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
+        watcher.step("anatomy", "whether all fits together")
         read = (*case.warnings, *anatomy.warnings)
         found = (
             *(Finding("reading", Severity.WARNING, one) for one in read),
@@ -231,6 +232,7 @@ def prepare(
         shown = tuple(one.sentence for one in found if one.severity is not Severity.NOTE)
         anatomy = replace(anatomy, warnings=shown, findings=found)
         case.files.release()
+        memory.limit(MEMORY_BYTES)
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
         kept = {"cache": cache} if engine == "fast" else {}

@@ -4,9 +4,11 @@ from collections import Counter
 
 import numpy as np
 import pytest
+import scipy
 import SimpleITK as sitk  # noqa: N813
 
-from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
+from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN, ball
+from puncture_twin.planning.anatomy.body.body_mask import body_mask, filled_slices
 from puncture_twin.planning.anatomy.body.unscanned import BLANK_HU, find_unscanned, measured_hu
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.base.errors import InputError
@@ -296,6 +298,34 @@ def test_gas_outside_of_hollow_organs_is_unknown(tmp_path):
     assert rows.sum() > 3
     assert not found.safe[rows].any()
     assert set(found.verdict.structure[rows & (found.verdict.reason == Reason.UNKNOWN_REGION)]) == {"unnamed_gas"}
+
+
+def test_holes_are_filled_slice_by_slice(rng):
+    """As scipy fills each; what reaches the border of a slice is no hole, whatever closes it above and below."""
+    mask = rng.random((20, 17, 6)) < 0.6
+    slices = [scipy.ndimage.binary_fill_holes(mask[:, :, k]) for k in range(6)]
+    assert np.array_equal(filled_slices(mask), np.stack(slices, axis=2))
+
+
+@pytest.mark.parametrize(("values", "lung"), [((-950, -930), False), ((-950, -920), True), ((-950, -930, -930), True)])
+def test_air_at_the_border_is_lung_by_its_median(values, lung):
+    """Of two halves the median lies between them; above -940 HU it is lung, and filled."""
+    air = np.resize(np.array(values, np.float32), (60, 40, 40))
+    hu = np.concatenate([air, np.full((30, 40, 40), 40.0, np.float32)])
+    hu[-5:] = np.random.default_rng(1).normal(-1000.0, 5.0, (5, 40, 40))
+    found = body_mask(hu, np.full(3, 2.0), where="made")
+    assert found.body[:60].all() == lung
+
+
+def test_a_ball_about_the_target_matters_where_something_unnamed_lies_beside_it(scene):
+    """Else what no structure names is one for every target; a bone in the ball is what is hit."""
+    folder, _ = scene("alone")
+    found = prepare(write_case(folder, structures=KIDNEY, name="ball"), arm=False)
+    unnamed = found.anatomy.scan.unnamed([Named("lesion", found.anatomy.structures[0].mesh)], found.case.ct.dense_hu)
+    far = ball(found.case.target_ct + [0.0, 0.0, 500.0], 5.0)
+    near = ball(unnamed.dense.vertices.mean(axis=0), 5.0)
+    assert not found.anatomy.scan.may_hold(unnamed, far)
+    assert found.anatomy.scan.may_hold(unnamed, near)
 
 
 def test_an_obstacle_stops_the_needle_without_an_arm_too(scene):

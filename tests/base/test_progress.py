@@ -95,6 +95,23 @@ def test_a_stage_that_cannot_count_says_what_it_usually_takes(now):
     assert stream.getvalue().splitlines() == ["stage: film, usually 3 s", "stage: search"]
 
 
+def test_what_took_long_is_told_when_it_is_done(now):
+    """Nobody knows before how long it takes; what was short is not worth a line."""
+    stream = io.StringIO()
+    with LineDisplay(stream) as display:
+        display.step("anatomy", "skin")
+        now[0] = 14.0
+        display.step("anatomy", "liver")
+        now[0] = 14.5
+        display.step("anatomy", "spleen")
+    assert stream.getvalue().splitlines() == [
+        "anatomy: skin",
+        "anatomy: skin, took 14 s",
+        "anatomy: liver",
+        "anatomy: spleen",
+    ]
+
+
 @pytest.mark.parametrize(("engine", "most"), [("fast", {"structures"}), ("fcl", {"directions"})])
 def test_an_engine_counts_what_a_person_counts(engine, most, tmp_path):
     """Structures or directions, never one times the other; of the arm no more directions than there are."""

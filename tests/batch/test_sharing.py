@@ -8,8 +8,8 @@ import pytest
 from case_world import ball, registration_section, write_markers
 from cohort_world import plan_of, table_bytes, task_of, tiny_text, write_patient
 
-from puncture_twin.planning.base.cache.memory import Memory
-from puncture_twin.planning.batch.run_case import MEMORY_BYTES, STALE, run_case
+from puncture_twin.planning.base.cache.memory import MEMORY_BYTES, Memory
+from puncture_twin.planning.batch.run_case import STALE, run_case
 
 
 @pytest.fixture
@@ -139,6 +139,10 @@ def test_memory_is_bounded_and_forgets_the_least_recently_used():
     with pytest.raises(ZeroDivisionError):
         memory.get(("bad",), lambda: 1 / 0, lambda _: 1)
     assert memory.get(("bad",), lambda: 5, lambda _: 1) == 5
+    memory.limit(6)
+    assert memory.held_bytes <= 6
+    memory.limit(100)
+    assert memory.most_bytes == 6  # what was let go of was let go of for good
 
 
 def test_other_markers_on_the_same_skin(tmp_path, memory):

@@ -7,13 +7,15 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TextIO
 
-from puncture_twin.twin.report.pace import Pace, step_text
+from puncture_twin.twin.report.pace import Pace, duration_text, step_text
 
 if TYPE_CHECKING:
     from puncture_twin.twin.report.progress_bars import BarDisplay
 
 LINE_EVERY_S = 5.0
 """In a log one line in this time says enough."""
+LONG_S = 3.0
+"""What took so long is told when it is done."""
 
 
 def progress_display(stream: TextIO | None = None) -> BarDisplay | LineDisplay:
@@ -32,7 +34,8 @@ class LineDisplay:
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._pace = Pace()
-        self._last = time.monotonic()
+        self._last = self._since = time.monotonic()
+        self._at = ""
 
     def __enter__(self) -> Self:
         return self
@@ -43,7 +46,11 @@ class LineDisplay:
         return None
 
     def step(self, stage: str, what: str) -> None:
-        """Name what a stage is at."""
+        """Name what a stage is at; and what it was at, and for how long, where that was long."""
+        took_s = time.monotonic() - self._since
+        if self._at and took_s >= LONG_S:
+            self.note(f"{self._at}, took {duration_text(took_s)}")
+        self._at, self._since = f"{stage}: {what}", time.monotonic()
         self._write(f"{stage}: {step_text(what)}")
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:

@@ -6,7 +6,7 @@ from types import TracebackType
 from typing import Self, TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from puncture_twin.twin.report.pace import Pace, step_text
 
@@ -19,6 +19,7 @@ class BarDisplay:
             TextColumn("{task.description}"),
             BarColumn(),
             TextColumn("{task.fields[far]}"),
+            TimeElapsedColumn(),
             console=Console(file=stream),
             transient=True,
         )

@@ -18,8 +18,8 @@ from puncture_twin.planning.anatomy.body.detached_parts import (
     thick_parts,
 )
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown, TableSide, touching_tables
-from puncture_twin.planning.anatomy.body.unscanned import find_unscanned, measured_hu
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned, measured_hu
+from puncture_twin.planning.base.arrays import Bools, Floats, counts_of, grown
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import Volume
@@ -33,6 +33,8 @@ MIN_OUTSIDE_ML = 50.0
 """A smaller air region at the border may be bowel gas that the field of view cuts."""
 MIN_BODY_ML = 100.0
 """Less than a tenth of a newborn's head: something else was found."""
+IN_SLICE = scipy.ndimage.generate_binary_structure(3, 1) & np.array([False, True, False])
+"""Voxels of one slice that share an edge are neighbours."""
 PADDED = (
     "where nothing was scanned the image is filled up with one value, and that cuts the body; no skin is known there, "
     "no body that the arm could meet, and what is filled up is unknown_region (outside_body)"
@@ -66,12 +68,14 @@ class CtImage:
 
     Attributes:
         hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head.
+        stored: Same shape, as the file has them.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         where: The file.
         shown: What a person says that it shows.
     """
 
     hu: NDArray[np.float32]
+    stored: NDArray[np.float32]
     T_ct_index: Floats
     where: Path
     shown: Shown = PATIENT
@@ -88,7 +92,12 @@ class CtImage:
         Raises:
             InputError: See `body_mask`.
         """
-        return body_mask(self.hu, self.spacing_mm, where=self.where, shown=self.shown)
+        return body_mask(self.hu, self.spacing_mm, where=self.where, shown=self.shown, measured=self.unscanned)
+
+    @cached_property
+    def unscanned(self) -> Unscanned:
+        """What was not measured."""
+        return find_unscanned(self.hu)
 
     @property
     def content(self) -> Content:
@@ -97,18 +106,24 @@ class CtImage:
 
     def within(self, box: Box, shown: Shown = PATIENT) -> CtImage:
         """The part of it in a box, and what a person says that it shows."""
-        part = self.hu[tuple(slice(*ends) for ends in box)]
-        return CtImage(part, shifted(self.T_ct_index, box), self.where, shown)
+        part = tuple(slice(*ends) for ends in box)
+        return CtImage(self.hu[part], self.stored[part], shifted(self.T_ct_index, box), self.where, shown)
 
 
 def ct_image(volume: Volume) -> CtImage:
     """A CT in Hounsfield units, whichever way its file runs."""
     oriented = canonical(volume.values, volume.T_ct_index)
-    return CtImage(measured_hu(oriented.values.astype(np.float32)), oriented.T_ct_index, volume.path)
+    stored = oriented.values.astype(np.float32, order="C")  # every mask that is made of it runs so too
+    return CtImage(measured_hu(stored), stored, oriented.T_ct_index, volume.path)
 
 
 def body_mask(
-    hu: NDArray[np.float32], spacing_mm: NDArray[np.float64], *, where: str | Path, shown: Shown = PATIENT
+    hu: NDArray[np.float32],
+    spacing_mm: NDArray[np.float64],
+    *,
+    where: str | Path,
+    shown: Shown = PATIENT,
+    measured: Unscanned | None = None,
 ) -> BodyMask:
     """Finds the patient, or the phantom, in a CT.
 
@@ -121,27 +136,43 @@ def body_mask(
         spacing_mm: Shape (3,).
         where: For messages.
         shown: What a person says of the image.
+        measured: What was not, where that is known.
 
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
     """
+    body, tables, warnings = _found(hu, spacing_mm, where, shown)
+    unscanned, padded = measured or find_unscanned(hu)
+    if unscanned.any():
+        ends = grown(body) & unscanned & ~body
+        if (ends & padded).any():
+            warnings.append(PADDED)
+        if (ends & ~padded).any():
+            warnings.append(CIRCLE)
+    return BodyMask(body, unscanned, tuple(warnings), tables)
+
+
+def _found(
+    hu: NDArray[np.float32], spacing_mm: Floats, where: str | Path, shown: Shown
+) -> tuple[Bools, tuple[TableSide, ...], list[str]]:
+    """The body with all that was filled, the tables that touch it, and what the user should know."""
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
     solids = thick_parts(hu > BODY_HU, spacing_mm)
     trunk = largest_component(solids == 1)
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
-        raise InputError(
-            what, where=where, allowed=f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
-        )
+        allowed = f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
+        raise InputError(what, where=where, allowed=allowed)
     warnings: list[str] = []
     tables: tuple[TableSide, ...] = ()
     if shown.tables:
         touching = touching_tables(hu - BODY_HU, trunk, spacing_mm, shown)
         tables, warnings = touching.sides, list(touching.warnings)
         if touching.cut_off.any():
-            solids = np.where(touching.cut_off, 0, solids)
+            solids[touching.cut_off] = 0
             trunk = largest_component(trunk & ~touching.cut_off)
     limbs = detached_limbs(hu, solids, spacing_mm) if shown.limbs else ()
+    del solids  # four bytes a voxel
     warnings += limb_warnings(limbs, trunk, voxel_ml)
     filled = filled_slices(trunk)
     for limb in limbs:
@@ -149,30 +180,29 @@ def body_mask(
     body = _with_cut_lungs(filled, hu, voxel_ml, warnings)
     if body.all():
         raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
-    unscanned, padded = find_unscanned(hu)
-    ends = scipy.ndimage.binary_dilation(body) & unscanned & ~body
-    if (ends & padded).any():
-        warnings.append(PADDED)
-    if (ends & ~padded).any():
-        warnings.append(CIRCLE)
-    return BodyMask(body, unscanned, tuple(warnings), tables)
+    return body, tables, warnings
 
 
 def filled_slices(mask: Bools) -> Bools:
     """The mask with every hole filled that it encloses in a slice across axis 2."""
-    return np.stack([scipy.ndimage.binary_fill_holes(mask[:, :, k]) for k in range(mask.shape[2])], axis=2)
+    air, count = scipy.ndimage.label(~mask, IN_SLICE)
+    outside = np.zeros(count + 1, bool)
+    for border in (air[0], air[-1], air[:, 0], air[:, -1]):
+        outside[border] = True
+    outside[0] = False
+    return ~outside[air]
 
 
 def _with_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> Bools:
     """Fills air regions that are not the room: small ones, and those with the density of lung."""
     labels, count = scipy.ndimage.label(~body)
-    if count == 0:
+    sizes, denser = counts_of(labels, count), counts_of(labels, count, hu > OUTSIDE_AIR_HU)
+    inside = (sizes * voxel_ml < MIN_OUTSIDE_ML) | (2 * denser > sizes)
+    for number in np.flatnonzero(~inside & (2 * denser == sizes)):  # the median lies between two values
+        inside[number] = np.median(hu[labels == number]) > OUTSIDE_AIR_HU
+    inside[0] = False
+    if not inside.any():
         return body
-    numbers = np.arange(1, count + 1)
-    sizes_ml = np.bincount(labels.ravel())[1:] * voxel_ml
-    medians = np.asarray(scipy.ndimage.median(hu, labels, numbers))
-    inside = (sizes_ml < MIN_OUTSIDE_ML) | (medians > OUTSIDE_AIR_HU)
-    if inside.any():
-        total = sizes_ml[inside].sum()
-        warnings.append(f"{total:.1f} ml of air at the border of the volume were taken as lung or gas inside the body")
-    return np.asarray(body | np.isin(labels, numbers[inside]))
+    total = (sizes * voxel_ml)[inside].sum()
+    warnings.append(f"{total:.1f} ml of air at the border of the volume were taken as lung or gas inside the body")
+    return np.asarray(body | inside[labels])

@@ -130,9 +130,11 @@ def content_of(dense: Bools, T_ct_index: Floats) -> Content:
     spacing_mm = spacing_of(T_ct_index)
     last, area = np.zeros((3, 2), np.int64), np.zeros((3, 2))
     thick, wide = np.zeros((3, 2), bool), np.zeros((3, 2), bool)
+    lines = dense.sum(axis=0, dtype=np.uint32)
+    counts = [np.array([np.count_nonzero(plane) for plane in dense]), lines.sum(axis=1), lines.sum(axis=0)]
     for axis in range(3):
         step_mm, across_mm = float(spacing_mm[axis]), np.delete(spacing_mm, axis)
-        areas = np.count_nonzero(dense, axis=tuple(k for k in range(3) if k != axis)) * float(np.prod(across_mm))
+        areas = counts[axis] * float(np.prod(across_mm))
         held = np.flatnonzero(areas >= SPECK_MM2)
         for end, k in enumerate(held[[0, -1]] if len(held) else (0, len(areas) - 1)):
             next_area = areas[np.clip(k + (1, -1)[end], 0, len(areas) - 1)]

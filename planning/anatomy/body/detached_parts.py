@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, counts_of
 
 OPENING_MM = 6.0
 """Parts thinner than twice this are no trunk, head or limb: table tops, sheets, tubes."""
@@ -57,9 +57,11 @@ def thick_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
     gap, nearest = scipy.ndimage.distance_transform_edt(cores == 0, sampling=coarse_mm, return_indices=True)
     parts = np.where(gap <= CORNER * OPENING_MM + coarse_mm.max(), cores[tuple(nearest)], 0)
     parts = parts[tuple(slice(r, -r) for r in reach)]
-    for axis, times in enumerate(stride):
-        parts = np.repeat(parts, times, axis=axis)
-    return np.where(mask, parts[tuple(slice(0, n) for n in mask.shape)], 0).astype(np.int32)
+    whole = np.zeros(mask.shape, np.int32)
+    for i, plane in enumerate(whole):
+        spread = parts[i // stride[0]].repeat(stride[1], axis=0).repeat(stride[2], axis=1)
+        np.multiply(spread[: mask.shape[1], : mask.shape[2]], mask[i], out=plane)
+    return whole
 
 
 def largest_component(mask: Bools) -> Bools:
@@ -67,7 +69,7 @@ def largest_component(mask: Bools) -> Bools:
     labels, count = scipy.ndimage.label(mask)
     if count == 0:
         return mask
-    return np.asarray(labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:])))
+    return np.asarray(labels == 1 + int(np.argmax(counts_of(labels, count)[1:])))
 
 
 def detached_limbs(hu: NDArray[np.float32], parts: Ints32, spacing_mm: Floats) -> tuple[Bools, ...]:
@@ -82,7 +84,7 @@ def detached_limbs(hu: NDArray[np.float32], parts: Ints32, spacing_mm: Floats) -
         A mask for each.
     """
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
-    sizes = np.bincount(parts.ravel()) * voxel_ml
+    sizes = counts_of(parts, int(parts.max())) * voxel_ml
     limbs = []
     for number in np.flatnonzero(sizes >= MIN_LIMB_ML):
         if number < 2:

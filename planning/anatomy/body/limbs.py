@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
-from puncture_twin.planning.anatomy.body.unscanned import find_unscanned
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.voxelize import voxels_inside
@@ -238,7 +237,7 @@ def limb_search(image: CtImage, body: Bools, target_ct: Floats, structures: Sequ
     x, y, z = np.clip(index, 0, np.array(coarse.shape) - 1)
     labels, _ = scipy.ndimage.label(coarse)
     part = coarse & (labels == labels[x, y, z])
-    solid = coarse | (_share(find_unscanned(image.hu).voxels, stride) >= 0.5)
+    solid = coarse | (_share(image.unscanned.voxels, stride) >= 0.5)
     bone = every_bone & part & ~_explained(every_bone, T, structures)
     return LimbSearch(part, solid, bone, every_bone, image.spacing_mm * stride, T, (int(x), int(y), int(z)))
 

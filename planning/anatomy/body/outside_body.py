@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.tables import TableSide
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
-from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, counts_of, widened
+from puncture_twin.planning.formats.labels.label_surface import mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
 
@@ -71,6 +71,11 @@ class OutsideImage:
         """What was not measured."""
         return find_unscanned(self.hu)
 
+    def known(self, unscanned: Unscanned) -> OutsideImage:
+        """The same image, of which it has been found before what was not measured."""
+        vars(self).update(unscanned=unscanned)
+        return self
+
 
 def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     """Voxels outside of the body that are not air.
@@ -85,9 +90,10 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     hu, body = image.hu, image.body
     unscanned = image.unscanned
     size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(int)
-    mean = scipy.ndimage.uniform_filter(np.maximum(hu, -1024.0), size=tuple(size), mode="nearest")
+    mean = np.maximum(hu, np.float32(-1024.0))
+    scipy.ndimage.uniform_filter(mean, size=tuple(size), output=mean, mode="nearest")
     dense = (mean > air_hu) | (hu > max(DENSE_HU, air_hu))
-    dense &= ~scipy.ndimage.maximum_filter(body, size=tuple(2 * (size // 2 + 1) + 1))
+    dense &= ~widened(body, size // 2 + 1)
     dense = (dense | (hu > BODY_HU)) & ~unscanned.voxels & ~body
     dense = _stiff_pieces(dense, hu > BODY_HU, float(np.prod(image.spacing_mm)))
     return dense | (_unscanned_beside(dense | body, body, unscanned, image.spacing_mm) & ~body)
@@ -107,9 +113,9 @@ def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> T
     if not mask.any():
         return None
     beyond = _layers_mm(image)
-    layered = np.pad(mask.astype(np.float32) - 0.5, [(len(layers), len(layers)) for layers in beyond], mode="edge")
+    layered = np.pad(mask, [(len(layers), len(layers)) for layers in beyond], mode="edge")
     T_ct_layered = image.T_ct_index @ pose(np.eye(3), [-float(len(layers)) for layers in beyond])
-    drawn = _drawn_out(field_surface(layered, T_ct_layered, where=where), image)
+    drawn = _drawn_out(mask_surface(layered, T_ct_layered, where=where), image)
     return joined([drawn, *_hulls_beyond(mask & ~image.unscanned.padded, image)])
 
 
@@ -200,15 +206,15 @@ def _facing_outward(vertices: Floats, faces: Ints32) -> Ints32:
 def _stiff_pieces(mask: Bools, solid: Bools, voxel_mm3: float) -> Bools:
     """The pieces that are bulky, and of others what is solid with its rim: the rest is noise, or cloth on the skin."""
     bulky = _pieces(mask, mask, 1000.0 * BULKY_ML / voxel_mm3)
-    near = scipy.ndimage.binary_dilation(solid & mask, FULL)
+    near = widened(solid & mask, (1, 1, 1))
     stiff = _pieces(near, solid & mask, MIN_PIECE_MM3 / voxel_mm3)
-    return np.asarray(mask & (bulky | scipy.ndimage.binary_dilation(stiff, FULL)))
+    return mask & (bulky | widened(stiff, (1, 1, 1)))
 
 
 def _pieces(mask: Bools, counted: Bools, least_voxels: float) -> Bools:
     """The pieces of a mask that hold enough voxels of another."""
     labels, count = scipy.ndimage.label(mask, FULL)
-    kept = np.bincount(labels[counted], minlength=count + 1) >= least_voxels
+    kept = counts_of(labels, count, counted) >= least_voxels
     kept[0] = False
     return np.asarray(kept[labels])
 
@@ -218,11 +224,13 @@ def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_m
 
     A padding that cuts the body is not free anywhere, as what is beyond a face of the image that cuts it.
     """
-    ends = scipy.ndimage.binary_dilation(dense, FULL) & unscanned.voxels & ~body
+    if not unscanned.voxels.any():
+        return np.zeros_like(dense)
+    ends = widened(dense, (1, 1, 1)) & unscanned.voxels & ~body
     if not ends.any():
         return np.zeros_like(dense)
     beside = (scipy.ndimage.distance_transform_edt(~ends, sampling=spacing_mm) <= RIM_MM) & unscanned.voxels
-    cut = unscanned.padded & scipy.ndimage.binary_dilation(body, FULL)
+    cut = unscanned.padded & widened(body, (1, 1, 1))
     return np.asarray(beside | unscanned.padded if cut.any() else beside)
 
 
@@ -256,13 +264,14 @@ def _hulls_beyond(mask: Bools, image: OutsideImage) -> list[TriangleMesh]:
 
     Not beyond head and feet: there a table goes on as it is cut.
     """
-    labels, _ = scipy.ndimage.label(mask, FULL)
-    sizes = np.bincount(labels.ravel()) * float(np.prod(image.spacing_mm)) / 1000.0
+    if not any(mask.take(end, axis=axis).any() for axis in (0, 1) for end in (0, -1)):
+        return []
+    labels, count = scipy.ndimage.label(mask, FULL)
+    sizes = counts_of(labels, count) * float(np.prod(image.spacing_mm)) / 1000.0
     sizes[0] = 0.0
-    bulky = (sizes >= BULKY_ML)[labels]
     prisms = []
     for axis, end in itertools.product((0, 1), (0, -1)):
-        cut = np.argwhere(bulky.take(end, axis=axis))
+        cut = np.argwhere((sizes >= BULKY_ML)[labels.take(end, axis=axis)])
         corners = (cut[:, None] + np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])).reshape(-1, 2)
         if len(corners):
             rim = corners[scipy.spatial.ConvexHull(corners).vertices]  # whole voxels have an area

@@ -1,4 +1,4 @@
-"""Voxels of a CT that the scanner did not measure: what is there is neither body nor air.
+"""NDArray[np.float32] of a CT that the scanner did not measure: what is there is neither body nor air.
 
 Scanners and programs write one value where they did not look: beyond the circle of reconstruction, beyond the slab of a
 tilted gantry that was resampled to a straight image, in slices that fill a volume up. Some write -3024, some the value
@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Bools
+from puncture_twin.planning.base.arrays import Bools, widened
 
 UNSCANNED_HU = -1500.0
 """Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
@@ -35,6 +35,8 @@ MEASURED_AIR = 0.02
 background that a program has blanked only the seam of the skin is left."""
 ALIKE_PAIRS = 0.5
 """Of the neighbours in measured air that have one value: noise of 2 HU leaves less than a fifth."""
+CUBES = tuple(itertools.product((slice(0, 2), slice(-2, None)), repeat=3))
+"""At an image's corners: of measured air none is filled by one value, and most images end here."""
 
 
 class Unscanned(NamedTuple):
@@ -78,18 +80,28 @@ def find_unscanned(hu: NDArray[np.float32]) -> Unscanned:
 
 
 def _outside_circle(hu: NDArray[np.float32], below: Bools) -> Bools:
-    """Voxels outside a circle of reconstruction; where there is none, nothing."""
+    """NDArray[np.float32] outside a circle of reconstruction; where there is none, nothing."""
     none = np.zeros(hu.shape, bool)
-    measured = hu[~below]
-    if len(measured) == 0:
+    if below.all():
         return none
-    for value in np.unique([measured.min(), *hu[_corners(hu)].ravel()]):
-        padding = np.all((hu == value) | below, axis=2)
+    least = np.min(hu, where=~below, initial=hu.max()) if below.any() else hu.min()
+    for value in np.unique([least, *hu[_corners(hu)].ravel()]):
+        padding = _in_every_slice(hu, below, value)
         if _is_outside_a_circle(padding):
             air = hu[(hu < NEARLY_AIR_HU) & ~padding[:, :, None]]
             if len(air) == 0 or np.mean(air == value) < STILL_AIR:
                 return none | padding[:, :, None]
     return none
+
+
+def _in_every_slice(hu: NDArray[np.float32], below: Bools, value: Any) -> Bools:
+    """Pixels (nx, ny) that have a value, or are below all, in every slice."""
+    padding, first, last = np.ones(hu.shape[:2], bool), 0, 1
+    while first < hu.shape[2] and padding.any():  # a few slices tell nearly always that there are none
+        z = slice(first, last)
+        padding &= ((hu[:, :, z] == value) | below[:, :, z]).all(axis=2)
+        first, last = last, 4 * last
+    return padding
 
 
 def _is_outside_a_circle(padding: Bools) -> bool:
@@ -112,11 +124,13 @@ def _padded(hu: NDArray[np.float32], circle: Bools) -> Bools:
     Nothing of what is known to lie outside a circle, and nothing in an image without noise.
     """
     padded = np.zeros(hu.shape, bool)
-    padded[:, :, (hu == hu[:1, :1]).all(axis=(0, 1))] = True
+    for z in np.flatnonzero(np.ptp(hu[_corners(hu)[:2]], axis=(0, 1)) == 0):
+        padded[:, :, z] = (hu[:, :, z] == hu[0, 0, z]).all()
     for value in np.unique(hu[_corners(hu)]):
-        same = (hu == value) & ~circle
-        if not _fills_a_corner(same):
+        cubes = ((hu[cube] == value) & ~circle[cube] for cube in CUBES)
+        if not any(cube.all() for cube in cubes):
             continue
+        same = (hu == value) & ~circle
         labels, _ = scipy.ndimage.label(_block(same))
         at_corners = np.unique(labels[_corners(hu)])
         padded |= np.isin(labels, at_corners[at_corners > 0])
@@ -131,15 +145,10 @@ def _corners(image: NDArray[Any]) -> tuple[slice, ...]:
     return tuple(slice(None, None, max(1, n - 1)) for n in image.shape)
 
 
-def _fills_a_corner(same: Bools) -> bool:
-    """Whether a mask holds all of a cube at a corner; of measured air none does, and most images end here."""
-    return any(same[cube].all() for cube in itertools.product((slice(0, 2), slice(-2, None)), repeat=3))
-
-
 def _block(same: Bools) -> Bools:
     """Voxels of a mask that lie in a cube of it, or beside one; beyond the image's faces the mask goes on."""
-    eroded = scipy.ndimage.minimum_filter(same.view(np.uint8), BLOCK_VOXELS, mode="nearest")
-    return np.asarray(scipy.ndimage.maximum_filter(eroded, 2 * BLOCK_VOXELS - 1, mode="nearest").view(bool) & same)
+    blocks = ~widened(~same, (BLOCK_VOXELS // 2,) * 3)
+    return widened(blocks, (BLOCK_VOXELS - 1,) * 3) & same
 
 
 def _measured_air_has_noise(hu: NDArray[np.float32], value: np.float32) -> bool:

@@ -8,6 +8,9 @@ from typing import Any, TypeVar
 
 Value = TypeVar("Value")
 
+MEMORY_BYTES = 500_000_000
+"""What is kept of patients, also beside a search: the meshes and trees of some ten whole bodies."""
+
 
 class Memory:
     """Values by key, bounded in size: the least recently used goes first.
@@ -44,11 +47,24 @@ class Memory:
         self._keep(key, value, size(value))
         return value
 
+    @property
+    def most_bytes(self) -> int:
+        """What the values may hold."""
+        return self._most
+
+    def limit(self, most_bytes: int) -> None:
+        """Hold no more than so much from now on."""
+        self._most = min(self._most, most_bytes)
+        self._shrink()
+
     def _keep(self, key: tuple[Hashable, ...], value: Any, size: int) -> None:
         if size > self._most:
             return
         self._kept[key] = value, size
         self._held += size
+        self._shrink()
+
+    def _shrink(self) -> None:
         while self._held > self._most:
             _, (_, gone) = self._kept.popitem(last=False)
             self._held -= gone

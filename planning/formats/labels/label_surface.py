@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from skimage.measure import marching_cubes
 
+from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap
+from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -52,10 +53,34 @@ def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> Triangle
     T_ct_box = labelmap.T_ct_index.copy()
     T_ct_box[:3, 3] += labelmap.T_ct_index[:3, :3] @ [axis.start for axis in box]
     oriented = canonical(mask, T_ct_box)
-    return field_surface(oriented.values.astype(np.float32) - 0.5, oriented.T_ct_index, where=where)
+    return field_surface(oriented.values.astype(np.float32, order="C") - 0.5, oriented.T_ct_index, where=where)
 
 
-def field_surface(field: NDArray[Any], T_ct_index: NDArray[np.float64], *, where: str | Path) -> TriangleMesh:
+def mask_surface(mask: Bools, T_ct_index: NDArray[np.float64], *, where: str | Path) -> TriangleMesh:
+    """The closed surface of a mask's voxels, as `field_surface` of one that is 1/2 inside and -1/2 outside.
+
+    Args:
+        mask: Shape (ni, nj, nk), somewhere True; only the box of what is True is looked at.
+        T_ct_index: Shape (4, 4), determinant positive.
+        where: For messages.
+    """
+    box = box_in(mask)
+    return field_surface(
+        mask[box].astype(np.float32) - 0.5, T_ct_index, where=where, first=[axis.start for axis in box]
+    )
+
+
+def box_in(mask: Bools) -> Box:
+    """The smallest index box about what is True in a mask, somewhere."""
+    i = np.flatnonzero([plane.any() for plane in mask])
+    seen: Bools = np.asarray(mask[i[0] : i[-1] + 1].any(axis=0))
+    j, k = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    return slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), slice(k[0], k[-1] + 1)
+
+
+def field_surface(
+    field: NDArray[Any], T_ct_index: NDArray[np.float64], *, where: str | Path, first: ArrayLike = 0
+) -> TriangleMesh:
     """The closed surface around where a field is positive, in LPS mm, normals outward.
 
     Along the border the field is continued with its sign turned, so the surface closes on the outer faces of
@@ -65,12 +90,13 @@ def field_surface(field: NDArray[Any], T_ct_index: NDArray[np.float64], *, where
         field: Shape (ni, nj, nk), never 0, positive inside, somewhere positive.
         T_ct_index: Shape (4, 4), determinant positive.
         where: For messages.
+        first: Shape (3,), index of the field's first voxel, where it is part of a larger one.
     """
-    padded = np.pad(field.astype(np.float32), 1, mode="edge")
+    padded = np.pad(np.asarray(field, np.float32), 1, mode="edge")
     for axis, side in itertools.product(range(3), (0, -1)):
         border = [slice(None)] * 3
         border[axis] = slice(side, None) if side else slice(0, 1)
         padded[tuple(border)] = -np.abs(padded[tuple(border)])
     found = marching_cubes(padded, level=0.0, method="lorensen", gradient_direction="ascent")
-    index, faces = found[0].astype(np.float64) - 1.0, found[1]
+    index, faces = found[0].astype(np.float64) - 1.0 + first, found[1]
     return guard_mesh(apply(T_ct_index, index), faces, where=where)

@@ -12,6 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB
 from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.cache.memory import Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher
@@ -32,6 +33,9 @@ from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
 from puncture_twin.twin.report.slices.subject import Subject
 
 CASE = "case.toml"
+
+READING_BYTES = 3_000_000_000
+"""What was read to find out is read once: a CT of 1,000 slices of 512 x 512, and its labels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +88,12 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
         raise InputError("there is a case already", where=path, allowed="--force to replace it")
     if (request.target is None) == (request.target_label is None):
         raise InputError("one target", where="init", allowed="either --target X,Y,Z or --target-label NAME")
-    start = start_case(request, user_cache(), partial(watcher.step, "reading"))
+    memory = Memory(READING_BYTES)
+    start = start_case(request, replace(user_cache(), memory=memory), partial(watcher.step, "reading"))
     with atomic(path) as draft:
         draft.write_text(start.text, encoding="utf-8")
         try:
-            context = prepare(draft, arm=False, watcher=watcher)
+            context = prepare(draft, arm=False, watcher=watcher, memory=memory)
         except InputError as error:
             what, where = (text.replace(draft.name, CASE) for text in (error.what, error.where))
             raise type(error)(
