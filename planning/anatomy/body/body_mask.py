@@ -68,17 +68,22 @@ class CtImage:
 
     Attributes:
         hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head.
-        stored: Same shape, as the file has them.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         where: The file.
         shown: What a person says that it shows.
+        as_stored: Shape of ``hu``, as the file has them, where that differs.
     """
 
     hu: NDArray[np.float32]
-    stored: NDArray[np.float32]
     T_ct_index: Floats
     where: Path
     shown: Shown = PATIENT
+    as_stored: NDArray[np.float32] | None = None
+
+    @property
+    def stored(self) -> NDArray[np.float32]:
+        """Hounsfield units as the file has them."""
+        return self.hu if self.as_stored is None else self.as_stored
 
     @property
     def spacing_mm(self) -> Floats:
@@ -107,14 +112,15 @@ class CtImage:
     def within(self, box: Box, shown: Shown = PATIENT) -> CtImage:
         """The part of it in a box, and what a person says that it shows."""
         part = tuple(slice(*ends) for ends in box)
-        return CtImage(self.hu[part], self.stored[part], shifted(self.T_ct_index, box), self.where, shown)
+        T_ct_index = shifted(self.T_ct_index, box)
+        return CtImage(self.hu[part], T_ct_index, self.where, shown, self.stored[part])
 
 
 def ct_image(volume: Volume) -> CtImage:
     """A CT in Hounsfield units, whichever way its file runs."""
     oriented = canonical(volume.values, volume.T_ct_index)
     stored = oriented.values.astype(np.float32, order="C")  # every mask that is made of it runs so too
-    return CtImage(measured_hu(stored), stored, oriented.T_ct_index, volume.path)
+    return CtImage(measured_hu(stored), oriented.T_ct_index, volume.path, as_stored=stored)
 
 
 def body_mask(
