@@ -1,11 +1,12 @@
 """Wrong beside recall, for every image: what is called safe and is not, and what is free beyond doubt and is refused.
 
-    python -m benchmarks.recall [--real FOLDER] [--only NAME,...] [--fine] [--json FILE] [--markdown]
+    python -m benchmarks.recall [--real FOLDER] [--only NAME,...] [--fine] [--undeclared] [--json FILE] [--markdown]
 
 FOLDER holds totalseg_abdomen_3mm and slicer_chest_ct4 (default: ../shared/data beside the repository); where it is not
 there, their images are left out, and it is said. Two processes; a line an image as it ends. The images are in `images`,
 the truth in `oracle`; the search is the product's, without the arm, on a grid of 6 degrees over all directions (a pole
-counts once). Each image has a cache of its own, empty at first.
+counts once). Of each image the case states what a person sees of arms in it (`[ct] arms`, as `init` proposes); with
+--undeclared it states nothing, and all beyond a face that cuts the body is unknown. Each image has a cache of its own.
 """
 
 from __future__ import annotations
@@ -77,6 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--real", type=Path, default=REAL)
     parser.add_argument("--only", default="")
     parser.add_argument("--fine", action="store_true")
+    parser.add_argument("--undeclared", action="store_true")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", action="store_true")
     options = parser.parse_args(arguments)
@@ -93,7 +95,8 @@ def main(arguments: list[str] | None = None) -> int:
         chosen = [one for one in chosen if not one.real]
     found = {}
     with multiprocessing.get_context("spawn").Pool(2, maxtasksperchild=4) as pool:
-        for row in pool.imap_unordered(partial(measured, real=options.real), [one.name for one in chosen]):
+        measure = partial(measured, real=options.real, declared=not options.undeclared)
+        for row in pool.imap_unordered(measure, [one.name for one in chosen]):
             print(line(row), flush=True)
             found[row["name"]] = row
     rows = [found[one.name] for one in chosen]

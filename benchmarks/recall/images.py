@@ -25,6 +25,7 @@ from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.init.finder import Wanted
+from puncture_twin.planning.init.overrides import with_keys
 from puncture_twin.planning.init.start import Request
 from puncture_twin.twin.jobs.patient.init_job import init_case
 from puncture_twin.twin.plant.beside.beside import Beside
@@ -46,6 +47,7 @@ class Image(NamedTuple):
         ambiguous: Whether a person could not tell either.
         fine: Finer than 2 mm: asked for by `--fine`.
         real: Whether it needs the real data.
+        arms: What a person who looks at it states of ``[ct] arms``; None where the region says it.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Image(NamedTuple):
     ambiguous: bool = False
     fine: bool = False
     real: bool = False
+    arms: str | None = "none"
 
 
 def asked_alike(folder: Path) -> None:
@@ -62,6 +65,12 @@ def asked_alike(folder: Path) -> None:
     rest = text[text.index("[search]") :]
     rest = rest[rest.index("\n[") :]
     path.write_text(text[: text.index("[needle]")] + NEEDLE + "\n" + SEARCH + rest, encoding="utf-8")
+
+
+def declare(folder: Path, arms: str) -> None:
+    """State what a person sees of arms in the image, as `init --set` does."""
+    path = folder / "case.toml"
+    path.write_text(with_keys(path.read_text(encoding="utf-8"), {"ct.arms": f'"{arms}"'}), encoding="utf-8")
 
 
 def start(folder: Path, target, region=None) -> None:
@@ -370,16 +379,30 @@ IMAGES = (
     Image("abdomen_feet_third", abdomen((-26, -200, 145), high=206), real=True),
     Image("chest_front", chest((25.5, -60.9, -250.2), "tissue"), real=True),
     Image("chest_lung", chest((-56.7, -24.3, -220.2), "right lung"), real=True),
-    *(Image(f"{name}_{where}", phantom(name, where == "table")) for name in BLOCKS for where in ("air", "table")),
+    *(
+        Image(f"{name}_{where}", phantom(name, where == "table"), arms=None)
+        for name in BLOCKS
+        for where in ("air", "table")
+    ),
     Image("torso_cradle", cradled),
     Image("trunk1_up_flat", drawn(1, "none", "flat", 0, _scan(seed=1))),
-    Image("trunk1_beside_none", drawn(1, "beside", "none", 3, _scan(3.0, 2.5, 20.0, 2))),
-    Image("trunk1_pressed_curved", drawn(1, "pressed", "curved", 0, _scan(3.0, 2.5, 20.0, 3)), ambiguous=True),
+    Image("trunk1_beside_none", drawn(1, "beside", "none", 3, _scan(3.0, 2.5, 20.0, 2)), arms="present"),
+    Image(
+        "trunk1_pressed_curved",
+        drawn(1, "pressed", "curved", 0, _scan(3.0, 2.5, 20.0, 3)),
+        ambiguous=True,
+        arms="present",
+    ),
     Image("trunk2_up_none", drawn(2, "none", "none", 2, _scan(3.0, 2.5, 20.0, 4))),
-    Image("trunk2_across_pad", drawn(2, "across", "pad", 0, _scan(4.0, 3.0, 20.0, 5)), ambiguous=True),
+    Image(
+        "trunk2_across_pad",
+        drawn(2, "across", "pad", 0, _scan(4.0, 3.0, 20.0, 5)),
+        ambiguous=True,
+        arms="present",
+    ),
     Image("trunk3_up_narrow", drawn(3, "none", "curved", 0, _scan(3.0, 2.0, 20.0, 6, fov=300.0)), ambiguous=True),
-    Image("trunk3_beside_flat", drawn(3, "beside", "flat", 2, _scan(seed=7))),
+    Image("trunk3_beside_flat", drawn(3, "beside", "flat", 2, _scan(seed=7)), arms="present"),
     Image("abdomen_fine_liver", abdomen(LIVER_SIDE, step=(0.78, 0.78, 1.0)), fine=True, real=True),
     Image("abdomen_fine_psoas", abdomen(PSOAS, step=(0.78, 0.78, 1.0)), fine=True, real=True),
-    Image("trunk2_fine_beside", drawn(2, "beside", "flat", 2, _scan(1.5, 0.9, 25.0, 8)), fine=True),
+    Image("trunk2_fine_beside", drawn(2, "beside", "flat", 2, _scan(1.5, 0.9, 25.0, 8)), fine=True, arms="present"),
 )

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.recall.images import IMAGES, Image
+from benchmarks.recall.images import IMAGES, Image, declare
 from benchmarks.recall.oracle import Needle, Oracle, Scene
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.reach.standoff import standoffs
@@ -21,20 +21,22 @@ DEFAULT_MARGIN_MM = 5.0
 """Of every structure, where the product refuses a case and so states none."""
 
 
-def measured(name: str, real: Path | None) -> dict:
-    """The row of one image."""
+def measured(name: str, real: Path | None, declared: bool = True) -> dict:
+    """The row of one image, with what a person states of it or without."""
     image = next(one for one in IMAGES if one.name == name)
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryDirectory() as cache:
         os.environ["PUNCTURE_TWIN_CACHE"] = cache
-        row = judged(Path(folder), image, real)
+        row = judged(Path(folder), image, real, declared)
     return {"name": name, "ambiguous": image.ambiguous, **row, "seconds": round(time.perf_counter() - began, 1)}
 
 
-def judged(folder: Path, image: Image, real: Path | None = None) -> dict:
+def judged(folder: Path, image: Image, real: Path | None = None, declared: bool = True) -> dict:
     """Make, search, and hold every direction against the truth."""
     try:
         scene = image.make(folder, real)
+        if declared and image.arms is not None:
+            declare(folder, image.arms)
     except InputError as error:
         return _refused(str(error))
     try:
