@@ -276,7 +276,8 @@ def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> 
     yield from role_notes(parts.rows, target.holding)
     yield from carved_notes(parts.sources)
     if request.region is None:
-        yield f'region = "{parts.region}" is told by the structures; --region says otherwise'
+        if_phantom = ", phantom for a phantom" if parts.region == "other" else ""
+        yield f'region = "{parts.region}" is told by the structures; --region says otherwise{if_phantom}'
     if parts.region == "phantom":
         yield PHANTOM
     if parts.markers:
