@@ -212,7 +212,9 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
     lines = np.unique(np.clip(np.rint(side.across).astype(int), 0, view.shape[1] - 1))
     at = np.full(view.shape[1], np.nan)
     middle = np.array([_middle(row) for row in thick_mm[lines]])
-    same = np.abs(thick_mm[lines] - middle[:, None]) <= max(ALIKE_MM / 2.0, 1.5 * float(spacing_mm[side.axis]))
+    same = np.abs(thick_mm[lines] - np.nan_to_num(middle, posinf=0.0)[:, None]) <= max(
+        ALIKE_MM / 2.0, 1.5 * float(spacing_mm[side.axis])
+    )
     open_to_body = (same.mean(axis=1) >= DRAWN_FRACTION) & (middle <= THICKEST_MM)
     at[lines[open_to_body]] = middle[open_to_body]
     run = max(2, int(RUN_MM / spacing_mm[1 - side.axis]))
