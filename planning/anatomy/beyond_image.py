@@ -60,7 +60,8 @@ def beyond_images(case: Case, skin: Skin, scan: Scan | None) -> Beyond:
     found = [assumed(case, view) for view, _ in ends]
     mesh = joined([beyond_image(*end, one.wider_mm, _breath(case)) for end, one in zip(ends, found, strict=True)])
     solid = Structure(BEYOND_IMAGE, Role.UNKNOWN, case.ct.margin_mm, mesh, "beyond the image", True, np.zeros((3, 3)))
-    said = [_finding(view, one) for (view, _), one in zip(ends, found, strict=True)]
+    own = "; cut of the skin's table, [] if all of it is skin" if case.skin_section.mesh else ""
+    said = [_finding(view, one, own) for (view, _), one in zip(ends, found, strict=True)]
     return Beyond((solid,), tuple({one.sentence: one for one in said}.values()))
 
 
@@ -132,11 +133,11 @@ def _breath(case: Case) -> Floats:
     return max(moved, key=lambda by: float(np.linalg.norm(by)), default=np.zeros(3))
 
 
-def _finding(view: FieldOfView, what: Assumed) -> Finding:
+def _finding(view: FieldOfView, what: Assumed, own: str) -> Finding:
     names = ", ".join(name for name, (axis, end) in SIDES.items() if view.cut[axis, end])
     everything = bool(np.isinf(what.wider_mm))
     wide = "all beyond it" if everything else f"the body drawn on, {what.wider_mm:g} mm wider to its sides,"
     said = f"the body is cut at its {names} side: no skin is known there, and {wide} is unknown to needle and arm"
-    way_out = '[ct] arms = "none" where no arm lies there, or beyond_mm' if everything else ""
+    way_out = '; [ct] arms = "none" where no arm lies there, or beyond_mm' if everything else ""
     numbers = {"beyond_mm": "all" if everything else what.wider_mm}
-    return Finding(BEYOND_IMAGE, Severity.WARNING, f"{said} ({BEYOND_IMAGE}; {what.because})", numbers, way_out)
+    return Finding(BEYOND_IMAGE, Severity.WARNING, f"{said} ({BEYOND_IMAGE}; {what.because}{way_out}{own})", numbers)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, filled_slices
-from puncture_twin.planning.anatomy.body.cut_ends import SIDES, Box, FieldOfView, shifted, spacing_of
+from puncture_twin.planning.anatomy.body.cut_ends import SIDES, WIDE, Box, FieldOfView, shifted, spacing_of
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import field_surface
@@ -30,6 +30,8 @@ CUT_PLANE_MM = 0.5
 """A triangle this close to the plane of a cut belongs to it: half a voxel of a fine scan."""
 FLAT_END_MM2 = 3000.0
 """No skin is flat and square to the scanner over such an area; even a belly pressed on a table is rounder."""
+FLAT_STEP = 1.0 - 1e-9
+"""Cosine to its side's axis of a triangle that is a face of voxels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,16 +138,23 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
 def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
     """The sides at which a surface ends in a plane of its bounding box, as a body does that a scan has cut.
 
+    A round body of straight voxel steps ends so too, but half as wide again one step before; across the bed, where
+    bodies end seldom and are cut mostly, that is not asked.
+
     Args:
         mesh: In LPS mm.
     """
-    low, high = mesh.bounds
     corners = mesh.triangles
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    areas = np.linalg.norm(normals, axis=1)
     ends = []
     for name, (axis, end) in SIDES.items():
-        in_plane = np.all(np.abs(corners[:, :, axis] - (low, high)[end][axis]) < CUT_PLANE_MM, axis=1)
-        if areas[in_plane].sum() > FLAT_END_MM2:
+        depth_mm = np.abs(corners[:, :, axis] - mesh.bounds[end][axis]).max(axis=1)
+        in_plane, outward = depth_mm < CUT_PLANE_MM, normals[:, axis] * (2 * end - 1) > FLAT_STEP * areas
+        before = outward & ~in_plane
+        step = before & (depth_mm < depth_mm[before].min(initial=np.inf) + CUT_PLANE_MM)
+        alone = axis == 2 or areas[in_plane].sum() > WIDE * areas[in_plane | step].sum()
+        if areas[in_plane].sum() > FLAT_END_MM2 and alone:
             ends.append(name)
     return tuple(ends)
 

@@ -82,7 +82,9 @@ class MeshFolder:
     def _single(self, row: Assigned) -> str:
         ends = flat_ends(self.meshes[row.label]) if row.kind == "skin" else ()
         cut = (
-            f"cut = [{', '.join(map(quoted, ends))}]  # flat there: the scan ended, the body did not\n" if ends else ""
+            f"cut = [{', '.join(map(quoted, ends))}]  # flat there: the scan ended; [] if all of it is skin\n"
+            if ends
+            else ""
         )
         up = "" if self.up is None else f'up = "{self.up}"\n'
         return (

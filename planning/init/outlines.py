@@ -6,7 +6,7 @@ A path crosses the skin anyway, so an outline is left out; a ball in the body th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -160,32 +160,42 @@ def fraction_near(points: Floats, other: TriangleMesh, within_mm: float) -> floa
 BORDER_MM = 2.0
 """The surfaces of two labels that border on each other are this near: both lie between the same voxels."""
 
-MOST_OF_BORDER = 0.5
-"""Of the target's surface, which an organ about it borders on; one below the organ's surface has more."""
+MOST_OF_BORDER, ALL_ROUND = 0.5, 0.9
+"""Of the target's surface, which an organ about it borders on; one below the organ's surface has more. What goes all
+round holds it: the target was carved out of it, and no path comes to it otherwise."""
 
 
-def carved_notes(sources: Sequence[tuple[Segmentation, Sequence[Assigned]]]) -> Iterator[str]:
+def bordering(target: str | None, segmentations: Sequence[Segmentation]) -> dict[str, float]:
+    """Of the target's surface the fraction that each structure borders on whose box may go round it.
+
+    Args:
+        target: The structure that the case names, or None.
+        segmentations: Of a folder.
+    """
+    every = [SkinOf(one, label) for one in segmentations for label in one.names]
+    found = {}
+    for own in (one for one in every if one.name == target):
+        points = spread_on(own.segmentation.surface(own.label), POINTS).points
+        for one in (one for one in every if one.name != target):
+            mesh = one.segmentation.surface(one.label)
+            low, high = mesh.bounds
+            if np.all((points >= low - BORDER_MM) & (points <= high + BORDER_MM), axis=1).mean() >= MOST_OF_BORDER:
+                found[one.name] = fraction_near(points, mesh, BORDER_MM)
+    return found
+
+
+def carved_notes(rows: Sequence[Assigned], target: str | None, border: Mapping[str, float]) -> Iterator[str]:
     """That an avoided structure goes round the target's, one sentence each.
 
     Args:
-        sources: Each segmentation with what the case says of its structures.
+        rows: What the case says of structures.
+        target: The structure that the case names, or None.
+        border: Of `bordering`.
     """
-    rows = [(segmentation, row) for segmentation, some in sources for row in some]
-    targets = [(one.surface(row.label), row.name) for one, row in rows if row.kind == "target"]
-    for target, name in targets:
-        points = spread_on(target, POINTS).points
-        for segmentation, row in rows:
-            if row.kind == "avoid" and _goes_round(segmentation.surface(row.label), points):
-                yield (
-                    f"'{row.name}' goes round '{name}' without holding it, as if that was carved out of it, and is "
-                    f"avoided by {row.margin_mm:g} mm, so no path through it is safe: if a path may cross it, make it "
-                    "traverse in the case"
-                )
-
-
-def _goes_round(mesh: TriangleMesh, points: Floats) -> bool:
-    """Whether most of a target's surface, of which these are points (n, 3), borders on another surface."""
-    low, high = mesh.bounds
-    if np.all((points >= low - BORDER_MM) & (points <= high + BORDER_MM), axis=1).mean() < MOST_OF_BORDER:
-        return False
-    return fraction_near(points, mesh, BORDER_MM) >= MOST_OF_BORDER
+    for row in rows:
+        if row.kind == "avoid" and border.get(row.name, 0.0) >= MOST_OF_BORDER:
+            yield (
+                f"'{row.name}' goes round '{target}' without holding it, as if that was carved out of it, and is "
+                f"avoided by {row.margin_mm:g} mm, so no path through it is safe: if a path may cross it, make it "
+                "traverse in the case"
+            )

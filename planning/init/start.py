@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +23,15 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
-from puncture_twin.planning.init.outlines import Outlines, SkinOf, carved_notes, skin_of, skin_problems
+from puncture_twin.planning.init.outlines import (
+    ALL_ROUND,
+    Outlines,
+    SkinOf,
+    bordering,
+    carved_notes,
+    skin_of,
+    skin_problems,
+)
 from puncture_twin.planning.init.roles import assign, likely_region, role_notes
 from puncture_twin.planning.init.segmentation import Place, Segmentation
 from puncture_twin.planning.init.target import Target, label_target, parse_point, typed_target
@@ -108,6 +116,9 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     target = _target(request, point, outlines)
     region = request.region or likely_region(names, target.holding.target)
     left_out = outlines.at(target.point_ct)
+    border = bordering(target.holding.target, found.segmentations)
+    carved = {name for name, fraction in border.items() if fraction >= ALL_ROUND}
+    target = replace(target, holding=target.holding._replace(others=target.holding.others | carved))
     parts = CaseParts(
         name=request.folder.resolve().name,
         space=space,
@@ -124,7 +135,8 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),
         keys=overrides.keys,
     )
-    notes = (*_notes(request, found, target, parts), *outlines.notes(target.point_ct))
+    told = carved_notes(parts.rows, target.holding.target, border)
+    notes = (*_notes(request, found, target, parts), *told, *outlines.notes(target.point_ct))
     return Start(case_text(parts), parts, notes)
 
 
@@ -274,9 +286,9 @@ def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> 
         yield from one.notes
     yield from target.notes
     yield from role_notes(parts.rows, target.holding)
-    yield from carved_notes(parts.sources)
     if request.region is None:
-        yield f'region = "{parts.region}" is told by the structures; --region says otherwise'
+        if_phantom = ", phantom for a phantom" if parts.region == "other" else ""
+        yield f'region = "{parts.region}" is told by the structures; --region says otherwise{if_phantom}'
     if parts.region == "phantom":
         yield PHANTOM
     if parts.markers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from case_world import skin_from_ct
 from places import REAL_CT
 
-from puncture_twin.planning.anatomy.skin import Skin, skin_from_label, skin_from_mesh
+from puncture_twin.planning.anatomy.skin import Skin, flat_ends, skin_from_label, skin_from_mesh
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
@@ -181,3 +182,24 @@ def test_skin_of_the_real_patient_is_closed_and_knows_its_four_cut_faces() -> No
     assert 0.1 < skin.cut_faces.mean() < 0.4
     a, b, c = skin.mesh.triangles.swapaxes(0, 1)
     assert 20e6 < np.einsum("ij,ij->", a, np.cross(b, c)) / 6 < 28e6
+
+
+def stepped(field):
+    """The faces of the voxels of 4 mm where a field is positive, as one closed mesh."""
+    inside, quads = np.pad(field > 0.0, 1), []
+    for axis, way in itertools.product(range(3), (1, -1)):
+        at = np.argwhere(inside & ~np.roll(inside, -way, axis)).astype(float)
+        out, right, up = np.eye(3)[[axis, (axis + 1) % 3, (axis + 2) % 3]] / 2
+        corners = [at + way * out + a * right + b * up for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        quads.append(np.stack(corners[::way], axis=1))
+    vertices, faces = np.unique(4.0 * np.concatenate(quads).reshape(-1, 3), axis=0, return_inverse=True)
+    corner = faces.reshape(-1, 4)
+    return TriangleMesh(vertices, np.concatenate([corner[:, [0, 1, 2]], corner[:, [0, 2, 3]]]).astype(np.int32))
+
+
+@pytest.mark.parametrize("cut_mm", [0.0, 40.0])
+def test_straight_steps_of_voxels_at_the_sides_are_no_cuts(cut_mm):
+    """An elliptic column ends flat at head and feet alone; one that a scan has cut at its left there too."""
+    x, y, _ = np.meshgrid(*(4.0 * (np.arange(n) - (n - 1) / 2) for n in (70, 50, 46)), indexing="ij")
+    column = np.where(x > 130.0 - cut_mm, -1.0, 1.0 - np.hypot(x / 130.0, y / 95.0))
+    assert flat_ends(stepped(column)) == (("left", "feet", "head") if cut_mm else ("feet", "head"))

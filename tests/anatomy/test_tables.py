@@ -88,7 +88,17 @@ def test_faces_near_a_body_that_nothing_supports_are_open(rows, faces):
     support = find_support(nothing, inside, SPACING)
     assert not support.seen
     assert set(support.open_faces) - {(0, 0), (0, -1)} == set(faces)
-    assert len(list(support_warnings(support.seen, support.open_faces))) == 1
+    said = list(support_warnings(support.seen, support.open_faces))
+    assert [('table = "none"' in one, 'arms = "none"' in one) for one in said] == [(True, False), (False, True)]
+
+
+def test_the_arms_of_a_body_that_ends_in_the_image_lie_there_too():
+    """A ball in air, nothing below it: front and back are unknown, for it lies on something; its sides are air."""
+    inside = (X - 198.0) ** 2 + (Y - 140.0) ** 2 + (Z - 78.0) ** 2 < 60.0**2
+    assert not inside[:, :, [0, -1]].any()
+    near = inside[25:75, 8:60]
+    for body, faces in ((near, {(1, 0), (1, -1)}), (near[:, :, 15:], {(0, 0), (0, -1), (1, 0), (1, -1)})):
+        assert set(find_support(np.zeros_like(body), body, SPACING).open_faces) == faces
 
 
 def test_a_support_that_ends_in_the_image_leaves_the_faces_free():

@@ -49,7 +49,7 @@ Box = tuple[tuple[int, int], ...]
 
 FILLED = (
     "behind the body's {names} side the image goes on with nothing but air, up to {voxels} voxels: it was cut there "
-    "and filled up (cut in the skin's table says otherwise)"
+    'and filled up (cut in the skin\'s table says otherwise: cut = [] if it ends there; so does region = "phantom")'
 )
 ENDS_FLAT = (
     "the phantom ends flat at its {names} side, where no structure is cut that does not run through it: it counts as "

@@ -65,7 +65,7 @@ CUT_OFF = (
 )
 PRISM = (
     "the body has one section along the bed at all four sides, as a phantom has: none of them counts as a table "
-    '([ct] table = "present" says that one is)'
+    '([ct] table = "present" says that one is; region = "phantom", if it is one, that it is whole)'
 )
 NEAR_MM = 60.0
 """A face is near the body up to this distance. Mattresses are at most some 50 mm thick; of their foam a CT shows
@@ -212,7 +212,9 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
     lines = np.unique(np.clip(np.rint(side.across).astype(int), 0, view.shape[1] - 1))
     at = np.full(view.shape[1], np.nan)
     middle = np.array([_middle(row) for row in thick_mm[lines]])
-    same = np.abs(thick_mm[lines] - middle[:, None]) <= max(ALIKE_MM / 2.0, 1.5 * float(spacing_mm[side.axis]))
+    same = np.abs(thick_mm[lines] - np.nan_to_num(middle, posinf=0.0)[:, None]) <= max(
+        ALIKE_MM / 2.0, 1.5 * float(spacing_mm[side.axis])
+    )
     open_to_body = (same.mean(axis=1) >= DRAWN_FRACTION) & (middle <= THICKEST_MM)
     at[lines[open_to_body]] = middle[open_to_body]
     run = max(2, int(RUN_MM / spacing_mm[1 - side.axis]))
@@ -560,26 +562,31 @@ def find_support(
     supports = {side.face for side in (*drawn, *touching) if side.whole}
     cut = [face for face in FACES if _cuts(outside, face) and any(face[0] != axis for axis, _ in supports)]
     faces = cut if supports else FACES
-    faces = [face for face in faces if face[0] == 1 or shown.limbs]  # at its sides only an arm may lie unseen
+    arms = shown.limbs and bool(body[:, :, [0, -1]].any())  # of a body that ends in the image its arms are there too
+    faces = [face for face in faces if face[0] == 1 or arms]  # at its sides only an arm may lie unseen
     gaps = {face: _gap_mm(body, face, spacing_mm) for face in faces}
     near = tuple(face for face, gap in gaps.items() if gap <= NEAR_MM and not (supports and gap == 0.0))
     return Support(drawn, bool(supports), () if shown.phantom and not supports else near)
 
 
 def support_warnings(seen: bool, open_faces: Sequence[Side]) -> Iterator[str]:
-    """One sentence, where the image does not show all of what the body lies on.
+    """What the image does not show of what lies beside the body, and what says so where nothing lies there.
 
     Args:
-        seen: Whether it shows anything of it.
+        seen: Whether it shows what the body lies on.
         open_faces: The faces beyond which nothing is known.
     """
-    names = " and ".join(SIDES[face] for face in open_faces)
-    beyond = f"what is beyond its {names} face, within {NEAR_MM:g} mm of the body, is unknown_region (outside_body)"
-    if not seen:
-        far = f"beyond its faces, more than {NEAR_MM:g} mm from the body, counts as air"
-        yield f"the CT shows nothing that the body lies on; {beyond if open_faces else far}"
-    elif open_faces:
-        yield f"the CT cuts what the body lies on; {beyond}"
+    bed = f"the CT does not show {'all of ' if seen else ''}what the body lies on"
+    sides = ((1, bed, "[ct] table"), (0, "the CT need not show all of the arms", "[ct] arms"))
+    for axis, said, key in sides:
+        names = " and ".join(SIDES[face] for face in open_faces if face[0] == axis)
+        if names:
+            yield (
+                f"{said}: what is beyond its {names} face, within {NEAR_MM:g} mm of the body, is unknown_region "
+                f'(outside_body; {key} = "none" where there is nothing)'
+            )
+    if not seen and not open_faces:
+        yield "the CT shows nothing that the body lies on; what is beyond its faces counts as air"
 
 
 def _cuts(outside: Bools, face: Side) -> bool:

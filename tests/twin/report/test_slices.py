@@ -164,6 +164,26 @@ def test_with_a_ct_and_errors(tmp_path):
     assert Image.open(tmp_path / "one.png").width > 2 * PIXELS
 
 
+def test_an_image_alone_proposes_no_needle(tmp_path):
+    """Three planes through the target that hold the body, what lies beside it in the legend, and nothing cyan."""
+    one = subject(scan=SimpleNamespace(hu_at=ball_ct))
+    drawn_with = draw_slices(one)
+    one.anatomy.structures[1].name, one.anatomy.structures[1].role = "outside_body", "unknown"
+    alone = draw_slices(Subject(one.case, one.anatomy, None))
+    write_sheet(alone, tmp_path / "slices.png")
+
+    def cyan(panels):
+        return sum(np.count_nonzero((panel.overlay[..., :3] == CYAN).all(axis=2)) for panel in panels)
+
+    assert cyan(drawn_with.panels) > 0 == cyan(alone.panels) and alone.units is None
+    names = [name for name, _ in alone.legend]
+    assert "needle" not in names and any("beside the body" in name for name in names) and "needle" not in alone.notes[1]
+    planes = [panel.plane for panel in alone.panels]
+    assert np.allclose([abs(plane.normal) for plane in planes], [[0, 0, 1], [0, 1, 0], [1, 0, 0]])
+    for plane in planes:
+        assert np.abs(plane.place(one.anatomy.skin.mesh.vertices) - plane.centre).max() < plane.half_mm
+
+
 def test_unknown_structures_are_beads_and_a_refused_direction_is_drawn_too():
     """Beads leave gaps where a line has none; a direction without an entry is drawn without units."""
     one = subject(scan=SimpleNamespace(hu_at=ball_ct))

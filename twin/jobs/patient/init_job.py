@@ -8,9 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.memory import Memory
 from puncture_twin.planning.base.errors import InputError
@@ -19,14 +16,12 @@ from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case_file import CaseFile
-from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.case.read_case import ALLOWED_CASE
 from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.init.case_text import with_image_seen
 from puncture_twin.planning.init.overrides import WAYS, with_keys
 from puncture_twin.planning.init.start import ALLOWED, Request, Start, start_case
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.planning.search.sides import grid_of, sides_text
 from puncture_twin.twin.jobs.patient.run import SLICES
 from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
@@ -103,7 +98,9 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
         parse_toml(text.encode(), path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
         draft.write_text(text, encoding="utf-8")
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
-    picture = None if context.anatomy.scan is None else _picture(context, folder / SLICES)
+    picture = None if context.anatomy.scan is None else folder / SLICES
+    if picture is not None:
+        write_sheet(draw_slices(Subject(context.case, context.anatomy, None)), picture)
     return InitRun(path, replace(start, text=text), context, (*start.notes, *found), picture)
 
 
@@ -115,19 +112,6 @@ def _with_seen(start: Start, request: Request, context: CaseContext) -> str:
     if not request.wanted.overrides.keys.keys().isdisjoint(keys):
         return text
     return with_keys(text, keys, {"search.theta_deg": looked, "search.frame": "theta 0 is its z"})
-
-
-def _picture(context: CaseContext, path: Path) -> Path:
-    """The CT through the target, toward a limb that was found, else toward what the body lies on, else the front."""
-    anatomy, case = context.anatomy, context.case
-    beside = next((one.mesh for one in anatomy.surroundings if one.name == ATTACHED_LIMB), anatomy.couch)
-    theta, beta = 0.0, 0.0
-    if beside is not None:
-        toward = (beside.bounds.mean(axis=0) - case.target_ct) * (1.0, 1.0, 0.0)
-        theta, beta = map(float, angles((toward / np.linalg.norm(toward)) @ case.T_ct_entry[:3, :3]))
-    explained = context.explain(theta, beta)
-    write_sheet(draw_slices(Subject(context.case, context.anatomy, Pick(explained.candidates, 0))), path)
-    return path
 
 
 def _source(place: str) -> str:

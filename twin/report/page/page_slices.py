@@ -42,7 +42,7 @@ def slices_data(shown: Sequence[Slices]) -> dict[str, Any]:
 def _direction(one: Slices) -> dict[str, Any]:
     pick = one.subject.pick
     return {
-        **pick.candidates.at(pick.row),
+        **({} if pick is None else pick.candidates.at(pick.row)),
         "panels": [_panel(panel) for panel in one.panels],
         "units": "" if one.units is None else _png(one.units.quantize(COLOURS)),
         "legend": [[name.replace("_", " "), css(colour)] for name, colour in one.legend],

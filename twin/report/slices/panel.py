@@ -72,12 +72,13 @@ class Panel(NamedTuple):
 
 
 def draw_panel(subject: Subject, plane: Plane) -> Panel:
-    """Draw one plane of a direction."""
+    """Draw one plane, with the needle of the direction if there is one."""
     scan = subject.anatomy.scan
     hu = None if scan is None else scan.hu_at(plane.points_ct(PIXELS)).reshape(PIXELS, PIXELS)
     sheet = _Sheet(plane)
     _outlines(sheet, subject, plane)
-    _needle(sheet, subject, plane)
+    if subject.pick is not None:
+        _needle(sheet, subject, plane)
     _target(sheet, plane)
     _directions(sheet, subject, plane)
     _scale(sheet, plane)
@@ -187,7 +188,7 @@ def _directions(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
         (middle, EDGE, plane.up, "ma"),
         (middle, far, -plane.up, "mb"),
     )
-    shaft = subject.case.needle.shaft_mm * subject.outward_ct
+    shaft = np.zeros(3) if subject.pick is None else subject.case.needle.shaft_mm * subject.outward_ct
     needle = sheet.pixels(np.linspace(0, 1, PIXELS)[:, None] * plane.place(plane.at_ct + shaft))
     for x, y, direction, anchor in edges:
         beside = anchor in {"rm", "lm"}

@@ -1,4 +1,4 @@
-"""The four planes in which a needle's path is looked at: where each lies, and what is right and up in its picture."""
+"""The planes in which a needle's path or an image is looked at: where each lies, what is right and up in it."""
 
 from __future__ import annotations
 
@@ -88,6 +88,19 @@ def needle_planes(target_ct: Floats, outward_ct: Floats, path_mm: float) -> tupl
         plane(f"along the needle, {_tilt_deg(side, up):.0f}° from axial", side, up),
         plane(f"along the needle, {_tilt_deg(along, across):.0f}° from axial", along, across),
         plane("across the needle at the target", *_seen_along(-outward_ct), PROBE_HALF_MM),
+    )
+
+
+def body_planes(target_ct: Floats, bounds_ct: Floats) -> tuple[Plane, ...]:
+    """The axial, coronal and sagittal plane through the target, as wide as the body, shape (2, 3), and some more.
+
+    The patient's right is on the left; the sagittal one shows the back to the right.
+    """
+    half, middle = float(np.ptp(bounds_ct, axis=0).max()) / 2 + BESIDE_MM, bounds_ct.mean(axis=0) - target_ct
+    axes = (("axial", LEFT, -BACK), ("coronal", LEFT, HEAD), ("sagittal", BACK, HEAD))
+    return tuple(
+        Plane(f"{name}, through the target", target_ct, right, up, np.array([right @ middle, up @ middle]), half)
+        for name, right, up in axes
     )
 
 

@@ -1,4 +1,4 @@
-"""``slices.png``: the four slices of a direction, the units along its needle, and a legend, on one sheet."""
+"""``slices.png``: the slices of a direction and the units along its needle, or of an image alone, on one sheet."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from puncture_twin.twin.report.numbers import number, target_text
 from puncture_twin.twin.report.palette import PNG_LEVEL, TARGET_POINT
 from puncture_twin.twin.report.slices.hu_plot import draw_hu_plot
 from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, Panel, draw_panel
-from puncture_twin.twin.report.slices.planes import needle_planes
+from puncture_twin.twin.report.slices.planes import body_planes, needle_planes
 from puncture_twin.twin.report.slices.subject import Subject
 from puncture_twin.twin.report.slices.tones import TONES, Tone
 
@@ -22,7 +22,7 @@ WITHOUT_CT: Rgb = (44, 47, 54)
 """Behind the outlines of a case without CT."""
 
 NO_CT = "The case has no CT: outlines of the structures alone."
-RADIOLOGICAL = "The patient's right is on the left. A cut shows only what lies in it: look at all four."
+RADIOLOGICAL = "The patient's right is on the left. A cut shows only what lies in it: look at all."
 GAP, TOP, CAPTION = 16, 92, 30
 
 
@@ -32,7 +32,7 @@ class Slices:
 
     Attributes:
         subject: The direction.
-        panels: Its four slices.
+        panels: Its four slices; three of an image alone.
         units: Hounsfield units along the needle; None without a CT or an entry.
     """
 
@@ -44,12 +44,14 @@ class Slices:
     def notes(self) -> tuple[str, ...]:
         """What the lines mean, and what is missing."""
         subject = self.subject
+        ct = NO_CT if subject.anatomy.scan is None else "The CT's nearest voxels, not smoothed."
+        beads = " Beads: the edge of what is unknown." if subject.has_unknown else ""
+        if subject.pick is None:
+            return ct, f"Lines: the skin and the structures.{beads}"
         dashed = f"; dashed: with the greatest margin near it, {number(subject.margin_mm, 1, 'mm')}"
         needle = subject.case.needle
         shown = f"Needle ⌀ {needle.diameter_mm:g} mm as thick as it is{dashed if subject.margin_mm > 0 else ''}"
         region = "" if subject.region_ct is None else "; pink: cut of the 95 % region of the tip"
-        ct = NO_CT if subject.anatomy.scan is None else "The CT's nearest voxels, not smoothed."
-        beads = " Beads: the edge of what is unknown." if subject.has_unknown else ""
         dotted = f"Thin and dotted: the needle's shadow, where it is not in the plane.{beads}"
         bends = "" if subject.bent_mm is None else "Lime: where its bevel may take it, to either side."
         return tuple(filter(None, (ct, f"{shown}{region}.", bends, dotted)))
@@ -59,15 +61,22 @@ class Slices:
         """Names with colours."""
         subject = self.subject
         target = subject.case.target_structure
-        first = [("needle", NEEDLE_COLOUR), ("target", TARGET_POINT)]
+        needle = [] if subject.pick is None else [("needle", NEEDLE_COLOUR)]
+        first = [*needle, ("target", TARGET_POINT)]
         region = [] if subject.region_ct is None else [("95 % region", REGION_COLOUR)]
-        return [*first, *region, (target, subject.colours[target]), *((one.text, one.colour) for one in subject.named)]
+        named = [*((one.text, one.colour) for one in subject.named), *subject.beside]
+        return [*first, *region, (target, subject.colours[target]), *named]
 
 
 def draw_slices(subject: Subject) -> Slices:
-    """Draw all of one direction."""
-    planes = needle_planes(subject.case.target_ct, subject.outward_ct, subject.path_mm)
-    return Slices(subject, tuple(draw_panel(subject, plane) for plane in planes), draw_hu_plot(subject))
+    """Draw all of one direction, or of the image alone."""
+    target = subject.case.target_ct
+    if subject.pick is None:
+        planes = body_planes(target, subject.anatomy.skin.mesh.bounds)
+    else:
+        planes = needle_planes(target, subject.outward_ct, subject.path_mm)
+    units = None if subject.pick is None else draw_hu_plot(subject)
+    return Slices(subject, tuple(draw_panel(subject, plane) for plane in planes), units)
 
 
 def flat(panel: Panel, tone: Tone) -> Image.Image:

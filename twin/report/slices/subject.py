@@ -1,4 +1,4 @@
-"""What the slices show of one direction: its needle, the structures near it, and where its tip is expected."""
+"""What the slices show of one direction, its needle and the structures near it, or of an image alone."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, OUTSIDE_BODY
+from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.search.bending.insertion import insertion_along
@@ -19,6 +21,13 @@ NEAR_MM = 30.0
 """A structure with a margin that lies nearer to the needle is drawn strongly and named."""
 MOST_NEAR = 8
 """So many of them at most, the nearest."""
+
+BESIDE: dict[str, tuple[str, Rgb]] = {
+    OUTSIDE_BODY: ("beside the body: table, cloths, lines, and what no image shows of them", (255, 170, 40)),
+    ATTACHED_LIMB: ("what seems to be a limb", (255, 77, 240)),
+    BEYOND_IMAGE: ("the body beyond the image", (120, 170, 255)),
+}
+"""Of an image alone: what no structure of the case names, by its name, for a person, and its colour."""
 
 
 class Near(NamedTuple):
@@ -43,31 +52,33 @@ class Subject:
     Attributes:
         case: The case.
         anatomy: Structures, skin, and the CT where there is one.
-        pick: The candidate.
+        pick: The candidate; None for the image alone, in which nobody has proposed a needle yet.
         region_ct: Shape (3, 3), mm^2: the tip is expected within x' inv(region) x <= 1 in 95 of 100; None without
             declared errors.
     """
 
     case: Any
     anatomy: Any
-    pick: Pick
+    pick: Pick | None
     region_ct: Floats | None = None
 
     @property
     def outward_ct(self) -> Floats:
         """From the target along the needle, unit, shape (3,)."""
+        assert self.pick is not None
         return np.asarray(self.pick.candidates.outward_ct[self.pick.row])
 
     @property
     def path_mm(self) -> float:
         """Target to skin, NaN without an entry."""
-        return float(self.pick.candidates.path.length[self.pick.row])
+        return float("nan") if self.pick is None else float(self.pick.candidates.path.length[self.pick.row])
 
     @cached_property
     def colours(self) -> dict[str, Rgb]:
         """Of every structure, as in the other pictures; what is outside of the body is grey."""
         inside = organ_colours(tuple(s.name for s in self.anatomy.structures))
-        return {**{s.name: OUTSIDE for s in self.anatomy.surroundings}, **inside}
+        own = {} if self.pick is not None else {name: colour for name, (_, colour) in BESIDE.items()}
+        return {**{s.name: OUTSIDE for s in self.anatomy.surroundings}, **inside, **own}
 
     @property
     def near(self) -> tuple[Near, ...]:
@@ -80,6 +91,12 @@ class Subject:
         return self.near or self._demanding[:1]
 
     @property
+    def beside(self) -> list[tuple[str, Rgb]]:
+        """Of an image alone, what was found that no structure names: for a legend."""
+        names = {one.name for one in self.anatomy.checked}
+        return [] if self.pick is not None else [line for name, line in BESIDE.items() if name in names]
+
+    @property
     def has_unknown(self) -> bool:
         """Whether there is anything of which nobody knows what it is."""
         return any(str(one.role) == "unknown" for one in self.anatomy.checked)
@@ -87,6 +104,8 @@ class Subject:
     @cached_property
     def _demanding(self) -> tuple[Near, ...]:
         """All with a margin, nearest first."""
+        if self.pick is None:
+            return ()
         found, row = self.pick.candidates.clearance, self.pick.row
         rows = zip(found.structures, found.distance[row], found.margins, strict=True)
         demanding = [
@@ -121,6 +140,8 @@ class Subject:
 
     @property
     def title(self) -> str:
-        """The direction."""
+        """The direction, or that there is none."""
+        if self.pick is None:
+            return "what the image shows; no needle is proposed here"
         angles = self.pick.candidates.at(self.pick.row)
         return f"θ {angles['theta_deg']:.4g}°, β {angles['beta_deg']:.4g}°"
