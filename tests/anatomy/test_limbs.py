@@ -87,6 +87,22 @@ def test_a_bone_that_a_structure_names_is_no_evidence(line):
     assert not search(hu, body, structures=[NamedBones("rib_left_7", bone)]).limbs().any()
     assert search(hu, body, structures=[NamedBones("humerus_left", bone)]).limbs().any()
     assert search(hu, body, structures=[NamedBones("tissue", whole)]).limbs().any()
+    for name in ("bone", "Skeleton", "Segment_1", "LeftArmBones", "Elle"):  # may be, or hold, an arm's
+        assert search(hu, body, structures=[NamedBones(name, bone)]).limbs().any(), name
+
+
+@pytest.mark.parametrize("name", ["femur_right", "rib_right_7"])
+def test_a_thigh_pressed_against_the_one_that_holds_the_target_is_found_though_its_bone_is_named(name):
+    """Two thighs of 75 mm side by side; beyond a neck a leg's bone is a limb's, a rib is not."""
+    x = POINTS[..., 0] - 160.0, POINTS[..., 1] - 140.0
+    left, right = (np.hypot(x[0] - side * 73.0, x[1]) < 75.0 for side in (1, -1))
+    line = (160.0 - 73.0, 140.0, 0.0), (160.0 - 73.0, 140.0, 180.0)
+    hu, body = image(trunk=left | right)
+    hu[body & (hu > 200.0)], hu[about(*line) < 14.0] = 30.0, 600.0
+    vertices = ball(np.zeros(3), 1.0).vertices * [14.0, 14.0, 120.0] + line[0] + [0.0, 0.0, 90.0]
+    femur = NamedBones(name, type(ball(np.zeros(3), 1.0))(vertices, ball(np.zeros(3), 1.0).faces))
+    found = search(hu, body, np.array([200.0, 140.0, 90.0]), [femur]).limbs()
+    assert found[right & ~left].mean() == pytest.approx(1.0 if name == "femur_right" else 0.0, abs=0.02)
 
 
 def test_an_arm_that_holds_the_target_is_not_forbidden():

@@ -185,3 +185,16 @@ def test_of_a_body_on_a_cradle_that_is_wider_the_cradle_is_cut_off(slope):
     assert found.cut_off[beyond].mean() > 0.85
     assert found.cut_off[(body > 0.0) & (Y < 200.0)].sum() == 0
     assert found.warnings
+
+
+def test_a_shell_in_front_counts_beside_a_table_that_was_cut_off():
+    """A board that is wider than the trunk is cut off; the shell that lies upon the belly is still no skin."""
+    x, y = np.abs(X - 198.0), Y - 150.0
+    board = np.minimum.reduce([190.0 - x, Y - 232.0, 256.0 - Y])
+    outer, inner = np.hypot(x / 165.0, y / 112.0), np.hypot(x / 140.0, y / 86.0)
+    shell = np.minimum.reduce([(1.0 - outer) * 112.0, (inner - 1.0) * 86.0, -y - 40.0])
+    scene = np.maximum.reduce([trunk(), *(125.0 * np.clip(one, -4.0, 4.0) for one in (board, shell))])
+    found = touching_tables(noisy(scene), scene > 0.0, SPACING)
+    assert found.cut_off[(board > 4.0) & (x > 150.0)].mean() > 0.85
+    assert (1, 0) in {side.face for side in found.sides if side.whole}
+    assert (1, -1) not in {side.face for side in found.sides}

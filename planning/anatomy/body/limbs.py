@@ -5,8 +5,9 @@ neck (a ball that fits into either does not fit through where they touch); a str
 lateral to all others; and a bone with air on many sides. A rib lies below skin that is nearly flat: of a sphere about
 it, 1.6 times as wide as it is deep, .19 is air, however it runs. About a forearm's bones it is a third and more.
 
-Labels explain bones: what a structure names is no evidence, unless its name is an arm's. No part that is larger than a
-limb can be is one, nor the part that holds the target, nor its organ. All of it is decided on a grid of 4 mm.
+Labels explain bones: what has a known name is no evidence, unless that is an arm's, or of bones altogether; beyond a
+neck a leg's bone is evidence too. No part that is larger than a limb can be is one, nor the part that holds the target,
+nor its organ. All of it is decided on a grid of 4 mm.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
+from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.voxelize import voxels_inside
@@ -37,7 +39,9 @@ is pressed against the trunk, some 50 mm wide."""
 NAMED_DENSE = 0.4
 """Of a structure's voxels so many are dense, or it is no bone: of a label "tissue" or "body" that holds bones too few
 are."""
-ARM_NAMES = re.compile(r"humer|radius|ulna|forearm|(?<![a-z])(arm|hand|carp|metacarp|phalan)")
+LIMBS = "limbs and girdles"
+"""Their line in the table of names; the names of arms, and of bones altogether, are among its others."""
+GIRDLE, LEG = re.compile(r"scapula|clavic"), re.compile(r"femur|tibia|fibula|patella|tarsal")
 DEEPEST_MM, DEEPEST_FRACTION = 60.0, 0.45
 """From a limb's bone to the air, and as a fraction of what the trunk's middle has: a spine lies deeper."""
 GAP_MM = 16.0
@@ -78,6 +82,7 @@ class LimbSearch:
         body: Shape (nx, ny, nz), the part that holds the target; a block counts where any of its voxels does.
         solid: Same shape, body, and what was not scanned: neither is air.
         bone: Same shape, bone that is evidence of a limb; a block counts where an eighth of it is, which noise is not.
+        limb_bone: Same shape, a leg's named bone too: such is a limb's beyond a neck, and the trunk's in a hip.
         every_bone: Same shape, named bone too.
         spacing_mm: Shape (3,).
         T_ct_index: Shape (4, 4), LPS mm.
@@ -87,6 +92,7 @@ class LimbSearch:
     body: Bools
     solid: Bools
     bone: Bools
+    limb_bone: Bools
     every_bone: Bools
     spacing_mm: Floats
     T_ct_index: Floats
@@ -110,7 +116,7 @@ class LimbSearch:
     def limbs(self) -> Bools:
         """Blocks of the body that belong to a limb without the target."""
         found = np.zeros(self.body.shape, bool)
-        if not self.body[self.at] or self.volume_ml(self.bone) < MIN_BONE_ML:
+        if not self.body[self.at] or self.volume_ml(self.limb_bone) < MIN_BONE_ML:
             return found
         for part in self._beyond_necks():
             found |= part
@@ -125,7 +131,7 @@ class LimbSearch:
         for number in range(1, int(owner.max(initial=0)) + 1):
             part = owner == number
             small = min(own_ml, self.volume_ml(part)) <= MOST_ML
-            if number != owner[self.at] and small and self.volume_ml(part & self.bone) >= MIN_BONE_ML:
+            if number != owner[self.at] and small and self.volume_ml(part & self.limb_bone) >= MIN_BONE_ML:
                 yield part
 
     def _near_skin(self) -> Bools:
@@ -238,19 +244,23 @@ def limb_search(image: CtImage, body: Bools, target_ct: Floats, structures: Sequ
     labels, _ = scipy.ndimage.label(coarse)
     part = coarse & (labels == labels[x, y, z])
     solid = coarse | (_share(image.unscanned.voxels, stride) >= 0.5)
-    bone = every_bone & part & ~_explained(every_bone, T, structures)
-    return LimbSearch(part, solid, bone, every_bone, image.spacing_mm * stride, T, (int(x), int(y), int(z)))
+    legs, others = _explained(every_bone, T, structures)
+    bone, limb_bone = (every_bone & part & ~named for named in (legs | others, others))
+    return LimbSearch(part, solid, bone, limb_bone, every_bone, image.spacing_mm * stride, T, (int(x), int(y), int(z)))
 
 
-def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[NamedBones]) -> Bools:
-    """Blocks within, or beside, a structure that is a bone and not an arm's."""
-    explained = np.zeros(bone.shape, bool)
+def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[NamedBones]) -> tuple[Bools, Bools]:
+    """Blocks within, or beside, a structure that is a leg's bone, and one that is another of a known name, no arm's."""
+    legs, others = np.zeros(bone.shape, bool), np.zeros(bone.shape, bool)
     for name, mesh in structures:
-        if not ARM_NAMES.search(name.lower()):
+        line, plain = default_role(name, "other"), plain_name(name)
+        leg = line is not None and LEG.search(plain) is not None
+        if line is not None and (line.group != LIMBS or leg or GIRDLE.search(plain)):
             inside = voxels_inside(mesh, T_ct_index, bone.shape)
             if np.count_nonzero(inside & bone) >= NAMED_DENSE * np.count_nonzero(inside):
+                explained = legs if leg else others
                 explained |= inside
-    return np.asarray(scipy.ndimage.binary_dilation(explained, FULL))
+    return scipy.ndimage.binary_dilation(legs, FULL), scipy.ndimage.binary_dilation(others, FULL)
 
 
 def _axis(points: Floats) -> tuple[Floats, Floats]:

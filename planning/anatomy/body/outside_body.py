@@ -28,8 +28,9 @@ SMOOTH_MM = 3.0
 DENSE_HU = -700.0
 """A single voxel above this is no noise (ten times that of a low-dose image)."""
 MIN_PIECE_MM3 = 100.0
-"""Pieces that hold less above ``BODY_HU`` are noise, or cloth: a line of 4 mm diameter has this in 8 mm of its
-length. A gown on the skin of a real chest has -850, and -600 in its folds; it stops no needle."""
+"""Pieces that hold less above ``BODY_HU`` are noise, or cloth: a full line of 4 mm diameter has this in 8 mm of its
+length. A gown on the skin of a real chest has -850, and -600 in its folds; it stops no needle. So has a line with a
+bore (4 and 2.6 mm) in voxels of 2 mm and more, and one of 2 mm in any: it is not seen."""
 BULKY_ML = 50.0
 """Pieces of this volume that the border of the image cuts (a table, a mattress) go on beyond it, also between the
 places where they are cut: of a table that sags below the image both ends are seen."""

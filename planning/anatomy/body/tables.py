@@ -174,19 +174,23 @@ def touching_tables(above: NDArray[np.floating], trunk: Bools, spacing_mm: Float
             there is said to be one.
     """
     drawn = drawn_sides(above, trunk, spacing_mm)
-    cut_off, said = np.zeros(trunk.shape, bool), []
+    cut_off, said, cut = np.zeros(trunk.shape, bool), list[str](), set[Side]()
     for side in (side for side in drawn if side.whole):
         table = table_beside(above > 0.0, side, spacing_mm)
         if table.any():
             thick_mm = float(np.median(table.sum(axis=side.axis)[table.any(axis=side.axis)])) * spacing_mm[side.axis]
             said.append(CUT_OFF.format(thick=thick_mm, name=SIDES[side.face]))
             cut_off |= table
+            cut.add(side.face)
+    if cut:
+        drawn = drawn_sides(np.where(cut_off, -np.abs(above), above), trunk & ~cut_off, spacing_mm)
     flat = flat_sides(above, trunk & ~cut_off, spacing_mm)
-    prism = {side.face for side in (*flat, *drawn)} == set(FACES) and not cut_off.any()
+    prism = {side.face for side in (*flat, *drawn) if side.whole} == set(FACES)
     if (shown.phantom or prism) and shown.table != "present":
-        return Touching(cut_off, (), tuple(said) if shown.phantom else (PRISM,))
+        return Touching(cut_off, (), tuple(said) if shown.phantom else (*said, PRISM))
     named = {side.face for side in flat}
-    left = () if cut_off.any() else drawn
+    left = [side for side in drawn if side.face not in cut]  # at a table's face the body is pressed into its section
+    left = left if not cut or any(side.whole for side in left) else []
     said += [side.warning for side in (*flat, *(one for one in left if one.whole and one.face not in named))]
     length_mm = trunk.shape[2] * float(spacing_mm[2])
     if length_mm < LEAST_LENGTH_MM:
