@@ -101,7 +101,6 @@ def certificate(folder):
         max_skin_angle=1.0,
         structures=("rib",),
         margins=np.zeros(1),
-        lengths=np.array([210.0]),
     )
     empty = np.array([""])
     one = Certificate(
