@@ -9,7 +9,7 @@ from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError, InputListError
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.evidence.coverage import absent_usual_organs, short_grid, thick_slices
+from puncture_twin.planning.evidence.coverage import absent_usual_organs, ignored_organs, short_grid, thick_slices
 from puncture_twin.planning.evidence.inside_skin import outside_skin
 from puncture_twin.planning.evidence.label_placement import label_placement
 from puncture_twin.planning.evidence.named_places import densities, order_of_organs
@@ -64,6 +64,7 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
         *needle_too_short(case, anatomy),
         *thick_slices(case, anatomy),
         *short_grid(case),
+        *ignored_organs(case, anatomy),
         *absent_usual_organs(case, anatomy),
     )
     _refuse(case, rest)

@@ -7,9 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.default_roles import default_role
 from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.anatomy.regions import absent_organs
 from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.base.text_names import first_few
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
 
@@ -52,6 +54,15 @@ def short_grid(case: Case) -> Iterator[Finding]:
                 f"checked is {last:g}"
             )
             yield Finding("short_grid", Severity.WARNING, said, {"last_deg": float(last)})
+
+
+def ignored_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
+    """What the case leaves out on purpose, though its name is that of something to be avoided: it counts as free."""
+    roles = {name: default_role(name, case.region or "other") for name in anatomy.ignored}
+    avoided = [name for name, role in roles.items() if role is not None and role.kind == "avoid"]
+    if avoided:
+        said = f"ignored by the case, and so free to cross: {first_few(avoided)}"
+        yield Finding("organs_ignored", Severity.WARNING, said, {"count": float(len(avoided))})
 
 
 def absent_usual_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:

@@ -1,5 +1,7 @@
 """Schema 2 of the case: a file or a list that was cut is refused wherever it was cut; schema 1 is read as before."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from case_world import CASE, MARKERS, write_case, write_labels
@@ -10,6 +12,7 @@ from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.whole_case import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
+from puncture_twin.planning.evidence.coverage import ignored_organs
 from puncture_twin.planning.formats.labels.totalsegmentator import V2
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
@@ -196,3 +199,12 @@ def test_totalsegmentator_names_every_usual_organ_of_the_trunk():
     for region in ("abdomen", "chest"):
         assert absent_organs(region, V2.values()) == []
     assert set(USUAL) >= {"abdomen", "chest", "pelvis", "brain", "head", "neck", "spine", "limb", "phantom"}
+
+
+def test_what_is_ignored_and_should_be_avoided_is_said():
+    """An aorta that a case leaves out on purpose counts as free: every result names it, but no outline of the body."""
+    anatomy = SimpleNamespace(ignored=("aorta", "body", "made_up_name"))
+    (said,) = ignored_organs(SimpleNamespace(region="abdomen"), anatomy)
+    assert (said.code, said.numbers) == ("organs_ignored", {"count": 1.0})
+    assert "aorta" in said.sentence
+    assert not list(ignored_organs(SimpleNamespace(region=None), SimpleNamespace(ignored=("body",))))

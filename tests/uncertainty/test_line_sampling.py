@@ -40,7 +40,7 @@ def chances(mesh, cov, surface=0.0, freedom=None, threshold=RADIUS):
     normal = normals_of(engine.triangles, np.zeros(3), UP[None], axes)
     near = proximity(axes.distance, axes.depth, normal, UP[None], cov[None], surface)
     first = touch_chance(near, threshold, freedom)
-    around = Surroundings(engine.blocks, np.array([LENGTH]), np.zeros(3))
+    around = Surroundings(engine.blocks, np.full((1, 1), LENGTH), np.zeros(3))
     needles = Needles(UP[None], cov[None], near, np.full((1, 1), surface), freedom)
     found = refined(around, needles, np.array([threshold]), first, np.ones((1, 1), bool))
     return first[0, 0], found[0, 0]
