@@ -33,7 +33,7 @@ MIN_OUTSIDE_ML = 50.0
 """A smaller air region at the border may be bowel gas that the field of view cuts."""
 MIN_BODY_ML = 100.0
 """Less than a tenth of a newborn's head: something else was found."""
-IN_SLICE = scipy.ndimage.generate_binary_structure(3, 1) & np.array([False, True, False])
+IN_SLICE = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], bool)[..., None] & np.array([False, True, False])
 """Voxels of one slice that share an edge are neighbours."""
 PADDED = (
     "where nothing was scanned the image is filled up with one value, and that cuts the body; no skin is known there, "
