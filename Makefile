@@ -14,7 +14,7 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test quick durations slips fuzz kill kill-batch lint mutants install reinstall kernels wheel docs pictures meshes clean
+.PHONY: demo test quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -56,7 +56,13 @@ fuzz: install
 mutants: install
 	$(BIN)/python benchmarks/mutants.py --out out/mutants.json
 
-install: $(VENV)/installed
+install: links $(VENV)/installed
+
+# Beside the package's own files: mypy, the site's pages and editors look there for its parts. Python needs none of them.
+LINKS := $(addprefix puncture_twin/,planning twin meshes run_twin.py)
+links: $(LINKS)
+$(LINKS):
+	@ln -sfn ../$(@F) $@
 
 # The stamp holds what was installed: files that are only newer, as after a checkout, install nothing again.
 $(VENV)/installed: pyproject.toml constraints.txt
@@ -106,4 +112,4 @@ meshes: install
 	$(BIN)/python -m tools.phantoms --out meshes
 
 clean:
-	rm -rf $(VENV) build out
+	rm -rf $(VENV) build out $(LINKS)

@@ -21,9 +21,6 @@ from puncture_twin.planning.base.cache.brought_kernels import MADE_FOR, classes_
 from puncture_twin.planning.base.cache.kernel_cache import host_features
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = ("LICENSE", "README.md", "pyproject.toml", "run_twin.py", "meshes", "planning", "puncture_twin", "twin")
-"""What is installed, and what says how."""
-
 TAGS = f"--python-tag=cp{sys.version_info.major}{sys.version_info.minor}", "--platform-tag=linux_x86_64"
 FIXED = {"NUMBA_CPU_FEATURES": "", "NUMBA_DISABLE_INTEL_SVML": "1"}
 """For numba: nothing beyond what the class can do, and no library that another machine may lack."""
@@ -60,16 +57,8 @@ def build(out: Path, commands: Sequence[Words], classes: Sequence[str]) -> list[
 
 
 def pure_wheel(work: Path) -> Path:
-    """What pip builds of this checkout: of a copy, beside which other work may go on."""
-    sources = work / "sources"
-    sources.mkdir()
-    for name in SOURCES:
-        if (ROOT / name).is_dir():
-            unkept = shutil.ignore_patterns("__pycache__")
-            shutil.copytree(ROOT / name, sources / name, symlinks=True, ignore=unkept)
-        else:
-            shutil.copy(ROOT / name, sources)
-    run("-m", "pip", "wheel", str(sources), "--quiet", "--no-deps", "--wheel-dir", str(work / "plain"))
+    """What pip builds of this checkout."""
+    run("-m", "pip", "wheel", str(ROOT), "--quiet", "--no-deps", "--wheel-dir", str(work / "plain"))
     (wheel,) = (work / "plain").glob("*.whl")
     return wheel
 

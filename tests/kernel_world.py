@@ -1,9 +1,8 @@
 """A small project that keeps its kernels as ours does: what is needed for that, and a kernel that takes in another."""
 
 import shutil
-from pathlib import Path
 
-import puncture_twin
+from puncture_twin.planning.base.cache.source_stamp import PACKAGE
 
 BASE = "planning/base"
 COPIED = (
@@ -28,9 +27,10 @@ def copy_package(project):
     for name in COPIED:
         copy = project / "puncture_twin" / name
         copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(Path(puncture_twin.__file__).parent / name, copy)
         if name.endswith("__init__.py"):
             copy.write_text("")  # what a room hands on is not there
+        else:
+            shutil.copy(PACKAGE / name, copy)
 
 
 def write_kernels(project):

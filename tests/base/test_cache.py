@@ -276,10 +276,15 @@ def test_what_older_versions_left_is_cleared(cache, monkeypatch):
     assert not {"0" * 64 + ".npz", ".x.arrays"} & left
 
 
+def place_of(module):
+    """Of a module in the project, without ending."""
+    return module.partition(".")[2].replace(".", "/")
+
+
 @pytest.mark.parametrize("maker", MAKERS)
 def test_the_libraries_of_every_maker_are_in_the_key(maker):
     """Whatever its code imports is this project, Python's own or a library whose version counts."""
-    files = closure([f"{PROJECT}/{maker.replace('.', '/')}.py"])
+    files = closure([f"{PROJECT}/{place_of(maker)}.py"])
     imports = [found for file in files for found in IMPORTED.findall(Path(file).read_bytes())]
     modules = {name for module, _, listed in imports for name in ([module] if module else NAME.findall(listed))}
     tops = {module.decode().split(".")[0] for module in modules}
@@ -291,19 +296,17 @@ def test_the_libraries_of_every_maker_are_in_the_key(maker):
 
 def test_the_code_that_makes_a_surface_is_in_its_stamp():
     """From reading a file to the surface: each of these modules decides what is kept."""
-    names = closure([f"{PROJECT}/puncture_twin/planning/anatomy/surfaces.py"])
+    names = closure([f"{PROJECT}/planning/anatomy/surfaces.py"])
     volumes = (f"formats/volumes/{name}" for name in ("nifti_header", "voxels"))
     wanted = ("anatomy/skin", "anatomy/body/body_mask", "formats/labels/label_surface", *volumes)
-    assert {f"{PROJECT}/puncture_twin/planning/{name}.py" for name in wanted} <= names
+    assert {f"{PROJECT}/planning/{name}.py" for name in wanted} <= names
 
 
 def test_the_code_that_reads_a_volume_decides_what_is_kept_of_it(tmp_path, monkeypatch):
     """Readers of DICOM are handed in: the organ of the old one stayed when one was mended."""
-    files = closure([f"{PROJECT}/{surfaces.READERS.replace('.', '/')}.py"])
+    files = closure([f"{PROJECT}/{place_of(surfaces.READERS)}.py"])
     dicom = [f"dicom/{name}" for name in ("ct_series", "stack", "segmentation", "structure_set")]
-    assert {
-        f"{PROJECT}/puncture_twin/planning/formats/{name}.py" for name in (*dicom, "labels/slicer_segments")
-    } <= files
+    assert {f"{PROJECT}/planning/formats/{name}.py" for name in (*dicom, "labels/slicer_segments")} <= files
     assert {"pydicom", "python-gdcm"} <= set(LIBRARIES)
     made = []
     for stamp in ("old", "old", "mended"):
@@ -406,7 +409,7 @@ def test_no_import_of_the_project_is_written_so_that_a_stamp_misses_it():
     """They are found by a pattern, which knows the usual ways alone."""
     for file in sources_with(b"import"):
         for name in imported_by_python(file):
-            places = (f"{PROJECT}/{name.replace('.', '/')}", f"{PROJECT}/{name.rpartition('.')[0].replace('.', '/')}")
+            places = (f"{PROJECT}/{place_of(one)}" for one in (name, name.rpartition(".")[0]))
             found = [place + end for place in places for end in (".py", "/__init__.py")]
             files = [one for one in found if Path(one).is_file()]
             assert not files or files[0] in closure([file]), f"{file}: {name}"

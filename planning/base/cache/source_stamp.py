@@ -14,10 +14,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[3]
-"""The folder of ``puncture_twin``; not resolved, for in a checkout its parts are links."""
+"""The folder of the parts: that of ``puncture_twin`` where it is installed, in a checkout the one around it."""
 
-PROJECT = str(PACKAGE.parent)
-"""The folder around it. Files are named by text here: a thousand names are asked for, and few are files."""
+PROJECT = str(PACKAGE)
+"""Files are named by text here: a thousand names are asked for, and few are files."""
 
 PARTS = ("planning", "twin")
 
@@ -160,7 +160,7 @@ def _absolute(module: str, file: str) -> str:
     if not dots:
         return module
     place = file.removeprefix(f"{PROJECT}/").split("/")[:-dots]
-    return ".".join((*place, name) if name else place)
+    return ".".join(part for part in ("puncture_twin", *place, name) if part)
 
 
 def _imports(source: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
@@ -180,8 +180,9 @@ def _files_of_name(module: str, name: str) -> tuple[str, ...]:
 
 @cache
 def _files_of(module: str) -> tuple[str, ...]:
-    if module.partition(".")[0] != PACKAGE.name:
+    package, _, rest = module.partition(".")
+    if package != "puncture_twin":
         return ()
-    place = f"{PROJECT}/{module.replace('.', '/')}"
+    place = f"{PROJECT}/{rest.replace('.', '/')}"
     files = f"{place}.py", f"{place}/__init__.py"
     return tuple(file for file in files if os.path.isfile(file))  # noqa: PTH113  # a path of each costs 0.01 s
