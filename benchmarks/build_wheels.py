@@ -58,8 +58,8 @@ def build(out: Path, commands: Sequence[Words], classes: Sequence[str]) -> list[
 
 def pure_wheel(work: Path) -> Path:
     """What pip builds of this checkout."""
-    run("-m", "pip", "wheel", str(ROOT), "--quiet", "--no-deps", "--wheel-dir", str(work / "plain"))
-    (wheel,) = (work / "plain").glob("*.whl")
+    run("-m", "hatchling", "build", "--target", "wheel", "--directory", str(work / "plain"))
+    (wheel,) = (work / "plain").iterdir()
     return wheel
 
 

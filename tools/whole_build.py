@@ -1,4 +1,4 @@
-"""For hatchling (pyproject.toml): a build that lacks a file of the tree is an error, not a package."""
+"""For hatchling (pyproject.toml): the folders at the top go into the package, and a build that lacks a file fails."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ FOLDERS = ("planning", "twin", "meshes", "puncture_twin")
 
 
 class WholeBuild(BuildHookInterface[Any]):
-    """Compares what was built with the tree; an editable install, which is the tree, has nothing to compare."""
+    """Says what is built, and compares it with the tree; an editable install is the tree, and holds nothing."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Put the parts where a wheel has them."""
+        if self.target_name == "wheel" and version == "standard":
+            build_data["force_include"] |= self.config["wheel"]
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
         """Raise a RuntimeError that names what is missing."""

@@ -13,7 +13,7 @@ PARTS = ("planning", "twin", "meshes")
 @cache
 def modules():
     """Full name to file, of every module and package of the product."""
-    files = [ROOT / NAME / "__init__.py", ROOT / NAME / "api.py", ROOT / "run_twin.py"]
+    files = [*sorted((ROOT / NAME).glob("_*.py")), ROOT / NAME / "api.py", ROOT / "run_twin.py"]
     files += [path for part in PARTS for path in sorted((ROOT / part).rglob("*.py"))]
     return {name_of(path): path for path in files}
 
