@@ -17,6 +17,7 @@ import typer
 
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.extras import require_extra
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.geometry.spaces import Space, Up
 from puncture_twin.planning.geometry.units import Unit
@@ -24,7 +25,6 @@ from puncture_twin.twin.jobs.batch.commands import batch_app
 from puncture_twin.twin.jobs.call_room import with_room
 from puncture_twin.twin.jobs.collector import late_collection
 from puncture_twin.twin.jobs.exit_codes import exit_code_of, finish
-from puncture_twin.twin.jobs.extras import require_extra
 from puncture_twin.twin.jobs.first_use import compiling_beside
 from puncture_twin.twin.jobs.leave import leave
 from puncture_twin.twin.jobs.options import (

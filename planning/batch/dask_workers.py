@@ -14,6 +14,7 @@ from typing import Any
 
 from puncture_twin.planning.base.cache.memory import MEMORY_BYTES, Memory
 from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.extras import require_extra
 from puncture_twin.planning.batch.run import RunTasks
 from puncture_twin.planning.batch.run_case import CaseEnd, CaseTask, commit_failure, ended, run_case
 from puncture_twin.planning.batch.workers import NO_LIMITS, WORKER_DIED, Limits
@@ -42,12 +43,8 @@ def on_scheduler(address: str) -> RunTasks:
     Raises:
         InputError: The extra ``dask`` is not installed.
     """
-    try:
-        import distributed
-    except ImportError as error:
-        raise InputError(
-            "dask.distributed is not installed", where="--scheduler", allowed="pip install 'puncture-twin[dask]'"
-        ) from error
+    require_extra("dask", "--scheduler")
+    import distributed
 
     def run(tasks: Sequence[CaseTask], limits: Limits) -> Generator[CaseEnd, None, None]:
         if limits != NO_LIMITS:

@@ -17,6 +17,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.extras import require_extra
 from puncture_twin.planning.formats.itk_linear import ALLOWED, MAX_PARTS, StatedTransform
 from puncture_twin.planning.formats.raw_mesh import refuse
 
@@ -31,9 +32,9 @@ _PARAMETERS = ("TransformParameters", "TranformParameters")
 _FIXED = ("TransformFixedParameters", "TranformFixedParameters")
 _DAMAGED = (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, MemoryError, OverflowError)
 """What h5py raises for bytes that are no whole HDF5."""
-_WITHOUT_H5PY = (
-    "pip install 'puncture-twin[hdf5]', or the same transform as text: in Slicer, Save with the file format .tfm; in "
-    "SimpleITK, WriteTransform(T, 'x.tfm')"
+_AS_TEXT = (
+    ", or the same transform as text: in Slicer, Save with the file format .tfm; "
+    "in SimpleITK, WriteTransform(T, 'x.tfm')"
 )
 
 
@@ -47,10 +48,9 @@ def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
     Raises:
         InputError: Without h5py; or no whole HDF5 file of ITK's transforms.
     """
-    try:
-        import h5py
-    except ImportError:
-        refuse("to read HDF5 needs h5py, which is not installed", where, _WITHOUT_H5PY)
+    require_extra("hdf5", where, else_allowed=_AS_TEXT)
+    import h5py
+
     try:
         with h5py.File(BytesIO(data), "r") as file:
             return [_transform(_Members(h5py, group, data, where), where) for group in _groups(h5py, file, where)]

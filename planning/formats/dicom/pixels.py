@@ -129,7 +129,7 @@ def _decompressed(data: Dataset, syntax: UID, where: str) -> NDArray[Any]:
         except NotImplementedError:
             raise InputError(named, where=where, allowed=how_to_convert()) from None
         if not decoder.is_available:
-            allowed = f"{how_to_convert()}; or install the extra 'compressed' (python-gdcm)"
+            allowed = f"{how_to_convert()}; or pip install python-gdcm"
             what = f"{named} needs a decoder that is not installed"
             raise InputError(what, where=where, allowed=allowed, code="no_decoder")
         try:

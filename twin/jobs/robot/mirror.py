@@ -17,12 +17,12 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.extras import require_extra
 from puncture_twin.planning.base.input_file import read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.joint_readings import joint_readings, parse_joint_recording
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
-from puncture_twin.twin.jobs.extras import require_extra
 
 MAX_RECORDING_BYTES = 200_000_000
 """An hour at 125 states a second is 60 MB."""

@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 from walls.house import modules
 
+from puncture_twin.planning.base import extras
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.extras import MODULES, require_extra
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.extras import MODULES
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,9 +41,33 @@ def test_planner_map_and_page_need_no_extra():
 )
 def test_a_missing_extra_is_one_line(arguments, monkeypatch, capsys):
     """A command that needs it names it, says how to get it, and ends with exit code 2 before it does anything."""
-    monkeypatch.setattr("puncture_twin.twin.jobs.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("puncture_twin.planning.base.extras.find_spec", lambda name: None)
     assert main(arguments) == 2
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1
     assert told[0].startswith(f"{arguments[0]}: it needs the extra 'twin', which is not installed (no pybullet")
-    assert told[0].endswith("allowed: pip install 'puncture-twin[twin]'")
+    assert told[0].endswith(f"allowed: pip install --editable '{ROOT}[twin]'")
+
+
+@pytest.mark.parametrize("extra", MODULES)
+def test_no_message_names_an_index(extra, monkeypatch, tmp_path):
+    """Installed from a folder or a file, it is that one; and pip knows the words after it as an extra's."""
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras, "__file__", str(tmp_path / "puncture_twin" / "planning" / "base" / "extras.py"))
+    folder = tmp_path / "puncture_twin-0.1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Name: puncture-twin\nVersion: 0.1.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for told, named in (("{}", "FOLDER"), ('{"url": "file:///home/me/twin"}', "/home/me/twin")):
+        (folder / "direct_url.json").write_text(told)
+        with pytest.raises(InputError) as refused:
+            require_extra(extra, "here")
+        assert f"pip install '{named}[{extra}]'" in str(refused.value)
+
+
+def test_what_has_no_wheel_is_named_by_itself(monkeypatch):
+    """The extra leaves it out there: to install that again would change nothing."""
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "pybullet" else name)
+    monkeypatch.setattr(extras.sys, "version_info", (3, 13, 0))
+    with pytest.raises(InputError, match="pip install pybullet .no wheel for Python 3.13"):
+        require_extra("twin", "demo")
