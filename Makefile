@@ -1,7 +1,10 @@
 # make demo: the main job on the embedded abdomen.  make test: everything that must hold.  make quick: most of it, in under a minute on two idle cores.
 # make mutants: which faults in the plain modules and kernels the tests notice (a quarter of an hour).
 
-PYTHON ?= python3.11
+# The newest that is tried, is here and can make an environment, or the one that is named: make test PYTHON=python3.11
+ifndef PYTHON
+PYTHON := $(shell for p in python3.13 python3.12 python3.11; do $$p -c 'import ensurepip, venv' 2>/dev/null && echo $$p && break; done)
+endif
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
@@ -14,7 +17,7 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel docs pictures meshes clean
+.PHONY: FORCE demo test quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -65,17 +68,23 @@ $(LINKS):
 	@ln -sfn ../$(@F) $@
 
 # The stamp holds what was installed: files that are only newer, as after a checkout, install nothing again.
-$(VENV)/installed: pyproject.toml constraints.txt
-	@cat $^ | cmp -s - $@ || $(MAKE) --no-print-directory reinstall
-	@touch $@
+VERSION := -c 'import sys; print("Python %d.%d" % sys.version_info[:2])'
+STAMP := { cat pyproject.toml constraints.txt; $(PYTHON) $(VERSION); }
+$(VENV)/installed: FORCE
+	@[ -n "$(PYTHON)" ] || { echo "no Python 3.11, 3.12 or 3.13 with venv is here; Debian 12 and later, Ubuntu 24.04: apt install python3-venv"; exit 2; }
+	@$(STAMP) | cmp -s - $@ || $(MAKE) --no-print-directory reinstall PYTHON=$(PYTHON)
 
 reinstall:
+	@[ "$$($(BIN)/python $(VERSION) 2>&1)" = "$$($(PYTHON) $(VERSION))" ] || rm -rf $(VENV)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
+	@$(BIN)/python -c "import pybullet" 2>/dev/null || { echo "building the simulator: PyBullet has no wheel for this Python (8 minutes; needs g++ and python3-dev)"; \
+	  $(BIN)/pip install --quiet --constraint constraints.txt pybullet; } || \
+	  echo "no simulator: demo, rehearse, servo, selfcal, reproduce and their tests need it; all else works (so does PYTHON=python3.11)"
 	@command -v chromium chromium-browser google-chrome >/dev/null || $(BIN)/playwright install chromium || \
 	  echo "no browser: the page's tests in one will skip"
 	$(MAKE) --no-print-directory kernels
-	cat pyproject.toml constraints.txt > $(VENV)/installed
+	$(STAMP) > $(VENV)/installed
 
 # Compiled here, not while a person waits for a first answer. What is not compiled here is where it is first used.
 kernels:
