@@ -93,6 +93,17 @@ def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> 
 
 
 @app.command()
+def schema() -> None:
+    """Print the JSON Schema of case.toml, by which editors complete its keys."""
+    import json
+
+    from puncture_twin.planning.case.case_file import case_schema
+
+    found = case_schema()
+    finish("schema", found, found, json.dumps(found, indent=1), as_json=False)
+
+
+@app.command()
 def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="With a CT and a segmentation.")],
     target: Annotated[str | None, typer.Option("--target", help="X,Y,Z in mm.")] = None,

@@ -178,3 +178,11 @@ class CaseFile(Section):
         if isinstance(self.place.up, str) or isinstance(self.place.along, str):
             raise ValueError('place: space "local" has no head and no front; give up and along as vectors')
         return self
+
+
+def case_schema() -> dict[str, Any]:
+    """The JSON Schema of a case file, by which an editor completes keys and marks wrong ones."""
+    schema = CaseFile.model_json_schema()
+    keys = schema["properties"]
+    keys["structures"] = {"anyOf": [keys["structures"], keys.pop(COUNT_KEY)]}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

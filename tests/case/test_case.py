@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from case_world import ORGAN, SKIN, case_text, changed
 
+from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case_file import case_schema
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.spaces import Space
 
@@ -203,3 +205,29 @@ def test_a_missing_case_is_refused(tmp_path):
 def test_the_good_case_is_good():
     """The text that the broken ones are made from is valid TOML with the sections of the schema."""
     assert {"target", "needle", "search", "structure"} <= set(tomllib.loads(GOOD))
+
+
+def unknown_keys(value, schema, definitions):
+    """Keys of a case that its JSON Schema does not have, anywhere below."""
+    if "$ref" in schema:
+        schema = definitions[schema["$ref"].rpartition("/")[2]]
+    if "anyOf" in schema:
+        return min((unknown_keys(value, one, definitions) for one in schema["anyOf"]), key=len)
+    if isinstance(value, list):
+        return [key for one in value for key in unknown_keys(one, schema.get("items", {}), definitions)]
+    if not isinstance(value, dict):
+        return []
+    rest = schema.get("additionalProperties") or None
+    kinds = {key: schema.get("properties", {}).get(key, rest) for key in value}
+    below = [found for key, kind in kinds.items() if kind for found in unknown_keys(value[key], kind, definitions)]
+    return [key for key, kind in kinds.items() if kind is None] + below
+
+
+@pytest.mark.parametrize("name", ["abdomen/case.toml", "carton/case_h.toml"])
+def test_the_json_schema_has_the_keys_of_every_case_and_no_others(name):
+    """`run-twin schema`: what an editor completes, and what it marks."""
+    schema = case_schema()
+    data = tomllib.loads((folder() / name).read_text(encoding="utf-8"))
+    assert unknown_keys(data, schema, schema["$defs"]) == []
+    data["needle"]["lenght_mm"] = 1.0
+    assert unknown_keys(data | {"serch": {}}, schema, schema["$defs"]) == ["serch", "lenght_mm"]

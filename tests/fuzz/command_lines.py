@@ -9,7 +9,7 @@ COMMANDS = [
     *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "export", "register"],
     *["touch", "pivot"],
     *["batch", "batch run", "batch status", "batch merge", "batch compare"],
-    *["init", "selfcal", "servo", "reproduce", "scan", "", "serch", "x" * 3000, "--help", "-h", "--version"],
+    *["schema", "init", "selfcal", "servo", "reproduce", "scan", "", "serch", "x" * 3000, "--help", "-h", "--version"],
 ]
 """Not ``demo``, which needs nothing and takes a minute, nor ``batch plan``, which takes any folder."""
 

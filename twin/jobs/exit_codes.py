@@ -58,6 +58,7 @@ REHEARSED = (
 RULES: Mapping[str, Rule] = MappingProxyType(
     {
         "demo": Rule("as `rehearse`", _unless(lambda run: not run.failures)),
+        "schema": Rule(NEVER),
         "init": Rule("never: a case is written, or refused"),
         "search": Rule("no direction is safe", _unless(lambda run: run.candidates.safe.any())),
         "verify": Rule("never: a cell that does not hold is refused, as a certificate that is none"),
