@@ -53,6 +53,7 @@ def test_a_missing_extra_is_one_line(arguments, monkeypatch, capsys):
 def test_no_message_names_an_index(extra, monkeypatch, tmp_path):
     """Installed from a folder or a file, it is that one; and pip knows the words after it as an extra's."""
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras.sys, "version_info", (3, 11, 0))
     monkeypatch.setattr(extras, "__file__", str(tmp_path / "puncture_twin" / "planning" / "base" / "extras.py"))
     folder = tmp_path / "puncture_twin-0.1.0.dist-info"
     folder.mkdir()
