@@ -32,7 +32,7 @@ sys.exit(code if sent.is_set() else %d)
 ENDED_BEFORE = 77
 """The program's exit code where the command ended before it was interrupted: the machine is too fast."""
 
-QUICK = {"register", "verify", "init", "pivot", "batch"}
+QUICK = {"register", "verify", "init", "pivot", "batch", "schema"}
 """Commands that take less than the second after which the others are interrupted."""
 
 WRITING = {
@@ -90,6 +90,7 @@ def typed(tmp_path_factory):
         "selfcal": [str(here / "selfcal")],
         "servo": [str(folder() / "head")],
         "reproduce": ["chen2019"],
+        "schema": [],
     }
 
 
