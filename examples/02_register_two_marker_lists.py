@@ -11,10 +11,11 @@ import numpy as np
 
 import puncture_twin as pt
 from puncture_twin.meshes import folder
-from puncture_twin.planning.geometry.rigid import apply, exp_twist, inverse, log_twist
+from puncture_twin.planning.geometry.rigid import apply, inverse, pose
+from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
 
-SLIP = np.array([0.0, 0.0, 3.0, 0.0, 0.0, np.radians(1.0)])
-"""How the patient might slip: a twist in the CT frame, 3 mm to the head and a turn of 1 degree about that axis."""
+SLIP = pose(exp_rotation(np.array([0.0, 0.0, np.radians(1.0)])), [0.0, 0.0, 3.0])
+"""How the patient might slip, in the CT frame: 3 mm to the head and a turn of 1 degree about that axis."""
 
 
 def main() -> None:
@@ -31,14 +32,14 @@ def main() -> None:
     print(f"FRE {found.fre_mm:.2f} mm, which is not the error at the target: {expected:.2f} mm (rms) is expected there")
     for flag in found.flags:
         print(f"weak: {flag}")
-    T_base_slipped = found.T_base_ct @ exp_twist(SLIP)
+    T_base_slipped = found.T_base_ct @ SLIP
     missed = np.linalg.norm(apply(T_base_slipped, np.array(target_ct)) - apply(found.T_base_ct, np.array(target_ct)))
     print(f"a slip of 3 mm and 1 degree after the touch would move the target by {missed:.2f} mm")
     both = found.markers.points_ct, found.markers.points_base
     three = [dict(zip(found.markers.names[:3], points, strict=False)) for points in both]
     triad = pt.register(*three, target_ct=target_ct, method="triad")
-    twist = log_twist(inverse(found.T_base_ct) @ triad.T_base_ct)
-    print(f"the first three alone would turn the patient by {np.degrees(np.linalg.norm(twist[3:])):.2f} degrees")
+    turn = log_rotation((inverse(found.T_base_ct) @ triad.T_base_ct)[:3, :3])
+    print(f"the first three alone would turn the patient by {np.degrees(np.linalg.norm(turn)):.2f} degrees")
 
 
 if __name__ == "__main__":
