@@ -72,7 +72,7 @@ VERSION := -c 'import sys; print("Python %d.%d" % sys.version_info[:2])'
 STAMP := { cat pyproject.toml constraints.txt; $(PYTHON) $(VERSION); }
 $(VENV)/installed: FORCE
 	@[ -n "$(PYTHON)" ] || { echo "no Python 3.11, 3.12 or 3.13 with venv is here; Debian 12 and later, Ubuntu 24.04: apt install python3-venv"; exit 2; }
-	@$(STAMP) | cmp -s - $@ || $(MAKE) --no-print-directory reinstall PYTHON=$(PYTHON)
+	@$(STAMP) 2>/dev/null | cmp -s - $@ || $(MAKE) --no-print-directory reinstall PYTHON=$(PYTHON)
 
 reinstall:
 	@[ "$$($(BIN)/python $(VERSION) 2>&1)" = "$$($(PYTHON) $(VERSION))" ] || rm -rf $(VENV)

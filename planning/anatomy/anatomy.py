@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.beyond_image import beyond_images
 from puncture_twin.planning.anatomy.beyond_labels import beyond_labels
-from puncture_twin.planning.anatomy.body.limbs import NamedBones
 from puncture_twin.planning.anatomy.body.tables import support_warnings
 from puncture_twin.planning.anatomy.scan import Outside, Scan
 from puncture_twin.planning.anatomy.second_witness import Named
@@ -42,8 +41,8 @@ OUTSIDE_NOT_KNOWN = (
 )
 
 LIMB_ATTACHED = "a limb seems to be pressed against the part of the body that holds the target"
-NO_ARMS, NO_TABLE = '[ct] arms = "none"', '[ct] table = "none"'
-"""The lines that overrule the rules."""
+NO_ARMS = '[ct] arms = "none"'
+"""The line that overrules the rule."""
 
 UNNAMED_FREE = '[ct] unnamed = "free": what the CT shows inside the body beside the structures is not checked'
 
@@ -177,7 +176,7 @@ def _outside(
     if case.ct.table != "none":
         warnings.extend(support_warnings(outside.supported, outside.open_faces))
     voxel_ct = scan.source.surfaces.voxel_ct
-    bones = [NamedBones(one.name, one.mesh) for one in structures if one.source != OWN_TARGET]
+    bones = [Named(one.name, one.mesh) for one in structures if one.source != OWN_TARGET]
     found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct, bones)))
     return tuple(
         Structure(name, Role.UNKNOWN, case.ct.margin_mm, mesh, f"{scan.name}: {name}", True, voxel_ct)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
-from puncture_twin.planning.anatomy.body.limbs import NamedBones, limb_search
+from puncture_twin.planning.anatomy.body.limbs import limb_search
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_LONG_MM,
     OutsideImage,
@@ -80,7 +80,7 @@ class Scan:
 
         def make() -> list[TriangleMesh | None]:
             ct = self._ct
-            image = OutsideImage(ct.hu, self._body, ct.T_ct_index, ct.spacing_mm).known(ct.unscanned)
+            image = OutsideImage(ct.hu, self._body, ct.T_ct_index, ct.spacing_mm, measured=ct.unscanned)
             mask = outside_mask(image, air_hu)
             meshes = self._outside_meshes(image, mask)
             if all(mesh is None or fits(mesh) for mesh in meshes):
@@ -124,9 +124,7 @@ class Scan:
         """Sides at which a table holds together with the body that this CT shows."""
         return () if self.skin is not None else self._ct.found.tables
 
-    def attached_limbs(
-        self, target_ct: NDArray[np.float64], structures: Sequence[NamedBones] = ()
-    ) -> TriangleMesh | None:
+    def attached_limbs(self, target_ct: NDArray[np.float64], structures: Sequence[Named] = ()) -> TriangleMesh | None:
         """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None.
 
         Args:

@@ -9,7 +9,8 @@ from places import DATA, REAL_CT
 
 from puncture_twin.planning.anatomy.anatomy import ball
 from puncture_twin.planning.anatomy.body.body_mask import CtImage, ct_image
-from puncture_twin.planning.anatomy.body.limbs import NamedBones, limb_search
+from puncture_twin.planning.anatomy.body.limbs import limb_search
+from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
 CT = REAL_CT / "ct.nii.gz"
@@ -84,11 +85,11 @@ def test_a_bone_that_a_structure_names_is_no_evidence(line):
     vertices = long_bone.vertices @ stretch + middle
     bone = type(long_bone)(vertices, long_bone.faces)
     whole = ball(TARGET, 400.0)
-    assert not search(hu, body, structures=[NamedBones("rib_left_7", bone)]).limbs().any()
-    assert search(hu, body, structures=[NamedBones("humerus_left", bone)]).limbs().any()
-    assert search(hu, body, structures=[NamedBones("tissue", whole)]).limbs().any()
+    assert not search(hu, body, structures=[Named("rib_left_7", bone)]).limbs().any()
+    assert search(hu, body, structures=[Named("humerus_left", bone)]).limbs().any()
+    assert search(hu, body, structures=[Named("tissue", whole)]).limbs().any()
     for name in ("bone", "Skeleton", "Segment_1", "LeftArmBones", "Elle"):  # may be, or hold, an arm's
-        assert search(hu, body, structures=[NamedBones(name, bone)]).limbs().any(), name
+        assert search(hu, body, structures=[Named(name, bone)]).limbs().any(), name
 
 
 @pytest.mark.parametrize("name", ["femur_right", "rib_right_7"])
@@ -100,7 +101,7 @@ def test_a_thigh_pressed_against_the_one_that_holds_the_target_is_found_though_i
     hu, body = image(trunk=left | right)
     hu[body & (hu > 200.0)], hu[about(*line) < 14.0] = 30.0, 600.0
     vertices = ball(np.zeros(3), 1.0).vertices * [14.0, 14.0, 120.0] + line[0] + [0.0, 0.0, 90.0]
-    femur = NamedBones(name, type(ball(np.zeros(3), 1.0))(vertices, ball(np.zeros(3), 1.0).faces))
+    femur = Named(name, type(ball(np.zeros(3), 1.0))(vertices, ball(np.zeros(3), 1.0).faces))
     found = search(hu, body, np.array([200.0, 140.0, 90.0]), [femur]).limbs()
     assert found[right & ~left].mean() == pytest.approx(1.0 if name == "femur_right" else 0.0, abs=0.02)
 

@@ -16,7 +16,6 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -25,8 +24,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
+from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 
 SAMPLING_MM = 4.0
@@ -65,13 +64,6 @@ BEYOND_ENDS_MM = 30.0
 """So far beyond the end of its bone a limb goes on, to a joint and the next bone."""
 
 FULL = np.ones((3, 3, 3), bool)
-
-
-class NamedBones(NamedTuple):
-    """A structure of the case, which explains the bone that it holds."""
-
-    name: str
-    mesh: TriangleMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +216,7 @@ class LimbSearch:
         return np.asarray(gap < radius) if beyond[self.at] else beyond
 
 
-def limb_search(image: CtImage, body: Bools, target_ct: Floats, structures: Sequence[NamedBones]) -> LimbSearch:
+def limb_search(image: CtImage, body: Bools, target_ct: Floats, structures: Sequence[Named]) -> LimbSearch:
     """Sample a CT and its body.
 
     Args:
@@ -249,7 +241,7 @@ def limb_search(image: CtImage, body: Bools, target_ct: Floats, structures: Sequ
     return LimbSearch(part, solid, bone, limb_bone, every_bone, image.spacing_mm * stride, T, (int(x), int(y), int(z)))
 
 
-def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[NamedBones]) -> tuple[Bools, Bools]:
+def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[Named]) -> tuple[Bools, Bools]:
     """Blocks within, or beside, a structure that is a leg's bone, and one that is another of a known name, no arm's."""
     legs, others = np.zeros(bone.shape, bool), np.zeros(bone.shape, bool)
     for name, mesh in structures:

@@ -59,6 +59,7 @@ class OutsideImage:
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         spacing_mm: Shape (3,).
         beyond_mm: How far what the border cuts is taken to go on.
+        measured: What was not measured, where it was found before.
     """
 
     hu: NDArray[np.float32]
@@ -66,16 +67,12 @@ class OutsideImage:
     T_ct_index: Floats
     spacing_mm: Floats
     beyond_mm: tuple[float, float, float] = BEYOND_MM
+    measured: Unscanned | None = None
 
     @cached_property
     def unscanned(self) -> Unscanned:
         """What was not measured."""
-        return find_unscanned(self.hu)
-
-    def known(self, unscanned: Unscanned) -> OutsideImage:
-        """The same image, of which it has been found before what was not measured."""
-        vars(self).update(unscanned=unscanned)
-        return self
+        return self.measured or find_unscanned(self.hu)
 
 
 def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
