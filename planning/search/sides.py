@@ -148,7 +148,7 @@ def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
         searched: Whether the case's grid counts: what it does not hold is named.
     """
     spoken = [side for side in sides if side.name in ROUND_ABOUT]
-    here = [side.name for side in spoken if (side.searched >= LEAST_SEARCHED if searched else side.is_open)]
+    here = [side.name for side in spoken if side.is_open and (not searched or side.searched >= LEAST_SEARCHED)]
     parts = [_listed(here) or "no side"]
     for why in dict.fromkeys(side.why for side in spoken if not side.is_open):
         names = [side.name for side in spoken if side.why == why]
