@@ -21,11 +21,11 @@ import numpy as np
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, TipLimit, slowed
-from puncture_twin.planning.arm.tool import gantry_boxes
+from puncture_twin.planning.arm.tool import Box, Tool, gantry_boxes
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.surroundings import case_boxes
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool, home_configuration

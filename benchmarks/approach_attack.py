@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.arm.tool import gantry_boxes
+from puncture_twin.planning.arm.tool import Box, Tool, gantry_boxes
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
 from puncture_twin.planning.geometry.rotations import exp_rotation

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script,
 
 from benchmarks.hostile_scenes import KINDS, HostileScene, make_scene
 from benchmarks.plain_distance import Inside, distances, exact_distance, least_distances
-from puncture_twin.planning.anatomy.anatomy import Role, Structure
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.measure import measure
 

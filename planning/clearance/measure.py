@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.anatomy import Structure
+from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.geometry.containment import holds

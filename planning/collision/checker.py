@@ -27,7 +27,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.base_place import refuse_base_in
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.body import BODY_NAMES, NEVER_TESTED, NEVER_TOUCHING, Body
+from puncture_twin.planning.collision.bodies.body import NEVER_TESTED, NEVER_TOUCHING, Body
 from puncture_twin.planning.collision.bodies.shapes import convex, surface
 from puncture_twin.planning.collision.bodies.solid import Solid
 from puncture_twin.planning.collision.check import Check
@@ -41,7 +41,6 @@ from puncture_twin.planning.collision.state_checker import (
     Distances,
     FirstContact,
     Nearest,
-    StateChecker,
     require_finite,
 )
 from puncture_twin.planning.collision.sweep import SweptBodies
@@ -132,21 +131,6 @@ def _place(solids: Sequence[fcl.CollisionObject], T: Floats) -> None:
 def _gaps_mm(first: Sequence[fcl.CollisionObject], second: Sequence[fcl.CollisionObject]) -> Floats:
     """Distances between pieces, shape (n, m), mm; at most 0 where they touch."""
     return np.array([[fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult()) for b in second] for a in first])
-
-
-__all__ = [
-    "BODY_NAMES",
-    "DISTANCE_PAIRS",
-    "NEEDLE_IN_PATIENT",
-    "Box",
-    "CellChecker",
-    "Contact",
-    "Distances",
-    "FirstContact",
-    "Nearest",
-    "StateChecker",
-    "Tool",
-]
 
 
 class CellChecker:

@@ -13,14 +13,20 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.collision.checker import NEEDLE_IN_PATIENT, CellChecker, Contact, FirstContact
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.kernels.segment_parts import Room, segment_room
 from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES_OUTSIDE
 from puncture_twin.planning.collision.never_touching import without_neighbours
 from puncture_twin.planning.collision.packed.hulls import ROUND
 from puncture_twin.planning.collision.proofs import Motion, Proofs
 from puncture_twin.planning.collision.segments import SegmentChecker
-from puncture_twin.planning.collision.state_checker import PATIENT, require_finite
+from puncture_twin.planning.collision.state_checker import (
+    NEEDLE_IN_PATIENT,
+    PATIENT,
+    Contact,
+    FirstContact,
+    require_finite,
+)
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

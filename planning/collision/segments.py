@@ -12,18 +12,10 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.check import Check
-from puncture_twin.planning.collision.checker import Contact
 from puncture_twin.planning.collision.kernels import segments as segment_kernels
-from puncture_twin.planning.collision.kernels.segment_parts import (
-    CONTACT,
-    HALVINGS,
-    NOT_FINITE,
-    QUERY,
-    Answer,
-    Room,
-)
+from puncture_twin.planning.collision.kernels.segment_parts import CONTACT, HALVINGS, NOT_FINITE, QUERY, Answer, Room
 from puncture_twin.planning.collision.proofs import Proofs
-from puncture_twin.planning.collision.state_checker import require_finite
+from puncture_twin.planning.collision.state_checker import Contact, require_finite
 
 LOOK_FIRST_RAD = 0.125
 """Down to parts of this length a segment is halved for all checks together: what it touches is found soonest so."""

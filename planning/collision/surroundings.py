@@ -9,7 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.arm.tool import Box, gantry_boxes
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, Role
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache

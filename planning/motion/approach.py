@@ -18,36 +18,18 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.collision.checker import CellChecker, Contact, StateChecker
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.segments import halving_order
+from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.motion.cut import UPPER_ARM, Cut
 from puncture_twin.planning.motion.follow import follow, rounded
 from puncture_twin.planning.motion.joint_space import SegmentContact
-from puncture_twin.planning.motion.path_check import (
-    MAX_SWEEP_MM,
-    dense_states,
-    first_contact,
-    least_clearance,
-    path_length,
-)
+from puncture_twin.planning.motion.path_check import dense_states, first_contact
 from puncture_twin.planning.motion.rrt_connect import Connected
 from puncture_twin.planning.motion.shortcuts import CLEARANCE_MM
 from puncture_twin.planning.motion.shortest import MAX_SAMPLES, RUNS, Path, Task, direct_path, shortest_path
 from puncture_twin.planning.motion.trajectory import Trajectory
-
-__all__ = [
-    "FINER",
-    "MAX_SWEEP_MM",
-    "RESOLUTION_RAD",
-    "Approach",
-    "dense_states",
-    "first_contact",
-    "least_clearance",
-    "path_length",
-    "plan_approach",
-]
-
 
 RESOLUTION_RAD = 0.05
 """Joint distance of the states at which FCL alone checks a segment: up to 50 mm at a metre, never the last word."""

@@ -14,7 +14,7 @@ import numpy as np
 from ompl import base as ob, util as ou
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.checker import Contact
+from puncture_twin.planning.collision.state_checker import Contact
 
 SegmentContact = Callable[[Floats, Floats], Contact | None]
 """What the straight joint segment between two states (6,) meets; None when it is free, its end included. Of a segment

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.checker import DISTANCE_PAIRS, Contact, Distances, Nearest, StateChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.state_checker import DISTANCE_PAIRS, Contact, Distances, Nearest, StateChecker
 
 MAX_SWEEP_MM = 2.0
 """So fine that no body point moves farther between two checked states."""

@@ -18,7 +18,7 @@ from ompl import base as ob, geometric as og
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.collision.checker import Contact
+from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.motion.joint_space import Angles, JointSpace, SegmentContact, angles_of, seeded
 from puncture_twin.planning.motion.shortcuts import shortened
 

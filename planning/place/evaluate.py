@@ -17,7 +17,8 @@ from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.place.directions import WantedDirections
-from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
+from puncture_twin.planning.reach.answer import ReachRequest
+from puncture_twin.planning.reach.reach import assess_reach_all
 
 
 @dataclass(frozen=True, eq=False)

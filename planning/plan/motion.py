@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.checker import CellChecker, StateChecker
-from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, dense_states, least_clearance
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD
+from puncture_twin.planning.motion.path_check import dense_states, least_clearance
 from puncture_twin.planning.plan.plan import Plan
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.collision.checker import Contact
+from puncture_twin.planning.collision.state_checker import Contact
 
 SAME_UNIT = 1e-9
 """How far a direction's length may be from 1."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.collision.bodies.body import BODY_NAMES
-from puncture_twin.planning.collision.checker import Contact, StateChecker
+from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.reach.answer import ReachAnswer
 from puncture_twin.planning.reach.survey import MARGIN_DIGITS, Insertion, Surveyed
 from puncture_twin.planning.reach.trial import Blocked, blocked_at_standoff, tried

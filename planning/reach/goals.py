@@ -9,8 +9,9 @@ import numpy as np
 from puncture_twin.planning.arm.insertion import reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import wrapped_solutions
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.checker import StateChecker
-from puncture_twin.planning.reach.reach import ReachAnswer, ReachRequest, every_reach
+from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.reach.answer import ReachAnswer, ReachRequest
+from puncture_twin.planning.reach.reach import every_reach
 
 MARGIN_FRACTION = 0.5
 """A pose with less than this fraction of the best margin is no goal: a shorter path is not worth a cramped arm."""

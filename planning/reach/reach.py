@@ -16,12 +16,12 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.collision.checker import StateChecker
+from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.reach.answer import ReachAnswer, ReachRequest
 from puncture_twin.planning.reach.branch_paths import every_branch
 from puncture_twin.planning.reach.first_clear import FirstClear
-from puncture_twin.planning.reach.survey import MAX_SWEEP_MM, Surveyed, surveyed
+from puncture_twin.planning.reach.survey import Surveyed, surveyed
 from puncture_twin.planning.reach.trial import Blocked, tried_all
 from puncture_twin.planning.reach.unreachable import why_unreachable
 
@@ -54,15 +54,6 @@ def _refusal_of_kinematics(model: UrModel, found: Surveyed) -> ReachAnswer:
     stops = [first_stop(model, path, found.depths) for path in paths[reached]]
     deepest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
     return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
-
-
-__all__ = [
-    "MAX_SWEEP_MM",
-    "ReachAnswer",
-    "ReachRequest",
-    "assess_reach_all",
-    "every_reach",
-]
 
 
 SAME_LENGTH_MM = 1e-6

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.checker import Box, Tool
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose

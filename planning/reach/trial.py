@@ -9,7 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.insertion import first_stop, reach_margin
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.collision.checker import Contact, StateChecker
+from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.reach.answer import ReachAnswer
 from puncture_twin.planning.reach.sampling import sampled
 from puncture_twin.planning.reach.survey import MAX_SWEEP_MM, Insertion, Surveyed

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.containment import holds
 from puncture_twin.planning.geometry.crossings import crossings

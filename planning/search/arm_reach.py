@@ -11,7 +11,8 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
+from puncture_twin.planning.reach.answer import ReachRequest
+from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import ARM_CHECKED, ArmColumns, Candidates, Verdict
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.anatomy import Role, Structure
 from puncture_twin.planning.anatomy.skin_entry import SkinPaths
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure, surface_distance
+from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
+from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.reasons import Reason

@@ -25,8 +25,8 @@ from puncture_twin.planning.geometry.rotations import exp_rotation
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, plan_approach
 from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.motion.path_check import dense_states
+from puncture_twin.planning.reach.answer import ReachRequest
 from puncture_twin.planning.reach.goals import approach_goals
-from puncture_twin.planning.reach.reach import ReachRequest
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text

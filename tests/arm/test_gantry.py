@@ -10,13 +10,13 @@ import trimesh
 from kept_checkers import built
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.arm.tool import SIDES, gantry_boxes
+from puncture_twin.planning.arm.tool import SIDES, Tool, gantry_boxes
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.collision.checker import CellChecker, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.surroundings import case_boxes
 from puncture_twin.planning.collision.workcell import case_tool, home_configuration

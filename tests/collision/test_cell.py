@@ -11,13 +11,14 @@ import trimesh
 
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual_links
-from puncture_twin.planning.arm.tool import HOLDER_ROOT_MM
+from puncture_twin.planning.arm.tool import HOLDER_ROOT_MM, Box, Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, UrModel, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.body import NEVER_TESTED
 from puncture_twin.planning.collision.bodies.shapes import convex, surface, touch
-from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.winding import winding_number, winding_numbers

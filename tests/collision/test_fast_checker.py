@@ -16,6 +16,7 @@ from numba import typeof
 from places import ROOT
 
 from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
@@ -23,7 +24,7 @@ from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
 from puncture_twin.planning.collision.bodies.prisms import prism
 from puncture_twin.planning.collision.bodies.shapes import convex, surface
 from puncture_twin.planning.collision.bodies.sphere_tree import halves, sphere_tree
-from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
 from puncture_twin.planning.collision.kernels.proofs import SKIN
@@ -34,7 +35,8 @@ from puncture_twin.planning.collision.surroundings import case_boxes
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import to_triangle
-from puncture_twin.planning.reach.reach import ReachAnswer, assess_reach_all
+from puncture_twin.planning.reach.answer import ReachAnswer
+from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.organs import organ_candidates

@@ -12,12 +12,14 @@ from kept_checkers import built
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
+from puncture_twin.planning.collision.bodies.body import BODY_NAMES
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
 from puncture_twin.planning.collision.bodies.solid import Solid
-from puncture_twin.planning.collision.checker import BODY_NAMES, CellChecker, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.loose_parts import LooseParts
 from puncture_twin.planning.collision.patient import PART_TRIANGLES, FclSkin

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.anatomy.anatomy import Role, Structure
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.evidence.checks import findings
 from puncture_twin.planning.evidence.inside_skin import SAMPLES, inside_skin, near_surface

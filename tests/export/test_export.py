@@ -17,10 +17,11 @@ from puncture_twin.planning.arm.insertion import needle_lines
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
 from puncture_twin.planning.arm.speed_limits import SpeedLimits
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import JOINT_NAMES, UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.export.corners import corner_rows, rests_at
 from puncture_twin.planning.export.exporter import FORMATS, blend_radii_mm, csv_text, export_plan, read_csv
 from puncture_twin.planning.export.limits import check_trajectory

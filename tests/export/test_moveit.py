@@ -14,7 +14,7 @@ from export.ros_messages import type_store
 from rosbags.typesys import Stores
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.anatomy.anatomy import Role
+from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.model_urdf import T_BASE_URDFBASE
 from puncture_twin.planning.arm.tool import Tool

@@ -12,10 +12,12 @@ from kept_checkers import built
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed, tip_rates, tip_speeds
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.collision.checker import Box, CellChecker, Contact, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, Approach, plan_approach
 from puncture_twin.planning.motion.follow import MAX_JERK, follow, follow_smoothly, rounded

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from kept_checkers import built
 
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.motion.approach import plan_approach
 from puncture_twin.planning.motion.cut import UPPER_ARM, UPPER_ARM_FRAME, Cut

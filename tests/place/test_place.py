@@ -16,6 +16,7 @@ from benchmarks.chen2019_reach import SHARES, WINDOWS, our_share, our_windows
 from puncture_twin import run_twin
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import link_poses
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.processes import map_all
@@ -24,7 +25,7 @@ from puncture_twin.planning.case.bed import bed_frame
 from puncture_twin.planning.case.mount import mount_pose
 from puncture_twin.planning.case.options import CaseOptions
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.collision.checker import Box, CellChecker, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.arm_spheres import (

@@ -22,7 +22,8 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.arm_spheres import ArmSpheres
-from puncture_twin.planning.reach.reach import ReachRequest, assess_reach_all
+from puncture_twin.planning.reach.answer import ReachRequest
+from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.twin.world.arm import load_arm
 from puncture_twin.twin.world.client import physics_client
 

@@ -12,9 +12,10 @@ import trimesh
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.settings import Needle
-from puncture_twin.planning.collision.checker import CellChecker, Tool
+from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.directions import wanted_directions

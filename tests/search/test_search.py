@@ -114,7 +114,7 @@ def _directions(found):
 
 def test_tissue_is_the_length_inside(carton, found, ball):
     """Through a ball of radius 20 about a point 60 mm away: two radii where the path goes through its centre."""
-    from puncture_twin.planning.anatomy.anatomy import Role, Structure
+    from puncture_twin.planning.anatomy.structure import Role, Structure
 
     organ = Structure("organ", Role.TRAVERSE, 0, ball(20, (0, 0, 60), 5), "")
     up = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 1.0], [1.0, 0, 0]])

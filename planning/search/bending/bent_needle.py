@@ -10,7 +10,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.needle.deflection import DeflectionBound

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, Structure
+from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
+from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.breathing.breathing import Breathing

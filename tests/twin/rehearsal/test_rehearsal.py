@@ -11,8 +11,9 @@ import pytest
 import trimesh
 from uncertainty_world import declared
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy, Role, Structure
+from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
 from puncture_twin.planning.arm.ur import ur_model

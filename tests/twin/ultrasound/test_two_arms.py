@@ -10,6 +10,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.geometry.mesh import box
 from puncture_twin.planning.geometry.winding import winding_number
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.pose_choice import (
@@ -33,7 +34,7 @@ from puncture_twin.twin.guidance.ultrasound.two_arms import (
     probe_tool,
 )
 from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
-from puncture_twin.twin.report.scene.shapes import bar, box
+from puncture_twin.twin.report.scene.shapes import bar
 
 
 def make_case(**sections):

@@ -14,7 +14,7 @@ import pybullet
 import pytest
 from places import TESTS
 
-from puncture_twin.planning.anatomy.anatomy import Structure
+from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.collision_cases.checks_file import read_checks

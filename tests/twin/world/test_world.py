@@ -16,7 +16,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.checker import BODY_NAMES
+from puncture_twin.planning.collision.bodies.body import BODY_NAMES
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.arm import load_arm
 from puncture_twin.twin.world.bodies import load_box, load_surface, thinned

@@ -15,7 +15,7 @@ from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeShot
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection
@@ -29,7 +29,7 @@ from puncture_twin.twin.report.annotate import width_of, write
 from puncture_twin.twin.report.raster.camera import camera_around
 from puncture_twin.twin.report.raster.compositing import compose
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, shells_of
-from puncture_twin.twin.report.scene.shapes import bar, box
+from puncture_twin.twin.report.scene.shapes import bar
 
 PX_PER_MM = 8
 """Of the sheet."""

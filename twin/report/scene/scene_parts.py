@@ -14,7 +14,7 @@ from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import SAFE, Rgb
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.winding import hit_fraction
 from puncture_twin.planning.search.candidates import Candidates
@@ -22,7 +22,7 @@ from puncture_twin.planning.search.selection.choice import Pick
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.raster.outwards import faces_outwards
 from puncture_twin.twin.report.raster.render import Layer, Surface
-from puncture_twin.twin.report.scene.shapes import ball, bar, box, corridor_mouth, corridor_walls, ring
+from puncture_twin.twin.report.scene.shapes import ball, bar, corridor_mouth, corridor_walls, ring
 
 ORGAN_OPACITY = 0.38
 """Opacity of the organ that holds the target, so that the lesion and its vessels show."""
