@@ -19,8 +19,7 @@ from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.extras import require_extra
 from puncture_twin.planning.base.files import check_writable
-from puncture_twin.planning.geometry.spaces import Space, Up
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 from puncture_twin.twin.jobs.batch.commands import batch_app
 from puncture_twin.twin.jobs.call_room import with_room
 from puncture_twin.twin.jobs.collector import late_collection
@@ -44,7 +43,7 @@ from puncture_twin.twin.jobs.terminal import default_out
 from puncture_twin.twin.report.progress import progress_display
 
 if TYPE_CHECKING:
-    from puncture_twin.planning.search.selection.choice import Choice
+    from puncture_twin.planning.search.choice import Choice
 
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
@@ -427,7 +426,7 @@ def pivot(
     else:
         require_extra("twin", "pivot")
         from puncture_twin.planning.search.context import prepare
-        from puncture_twin.twin.jobs.experiment.pivot_tour import parse_place, pivot_tour, pivot_tour_text
+        from puncture_twin.twin.jobs.experiment.pivot_job import parse_place, pivot_tour, pivot_tour_text
 
         place, folder = parse_place(at), _out(out_dir, case, "pivot")
         with progress_display() as progress:
@@ -445,8 +444,7 @@ def place(
 ) -> None:
     """Find where the arm should stand to hold most of the organ-safe directions; write the placements and their map."""
     from puncture_twin.planning.search.context import prepare
-    from puncture_twin.twin.jobs.patient.place_job import place_case
-    from puncture_twin.twin.jobs.patient.place_text import place_text
+    from puncture_twin.twin.jobs.patient.place_job import place_case, place_text
 
     folder = _out(out_dir, case, "place")
     with progress_display() as progress:
@@ -471,8 +469,8 @@ def mirror(
     """Show a running arm's needle in the CT: tip, distance to the target. Writes nothing to the robot."""
     from puncture_twin.planning.base.provenance import inputs_document
     from puncture_twin.planning.case.read_case import load_case
-    from puncture_twin.twin.jobs.interrupt import ended_by_ctrl_c
     from puncture_twin.twin.jobs.robot.mirror import Mirror, RecordedJoints, connect, live_states, mirror_text
+    from puncture_twin.twin.jobs.terminal import ended_by_ctrl_c
 
     if (host is None) == (recorded is None):
         raise InputError("one arm at a time", where="mirror", allowed="either HOST or --from joints.csv")
@@ -510,8 +508,8 @@ def export(
 ) -> None:
     """Write a plan for a robot, read back and within the arm's limits. Research software, not a medical device."""
     from puncture_twin.planning.export.exporter import FORMATS
-    from puncture_twin.planning.export.moveit.moveit_files import MOVEIT
-    from puncture_twin.planning.export.slicer.slicer_files import SLICER
+    from puncture_twin.planning.export.moveit import MOVEIT
+    from puncture_twin.planning.export.slicer import SLICER
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.choosing.candidates_export import CANDIDATE_FORMATS
     from puncture_twin.twin.jobs.patient import main_job, text
@@ -534,7 +532,7 @@ def export(
     with progress_display() as progress:
         context = None if planned_case is None else prepare(planned_case, watcher=progress)
         if format_name == MOVEIT and context is not None:
-            from puncture_twin.twin.jobs.patient.moveit_job import export_to_moveit
+            from puncture_twin.twin.jobs.patient.export_jobs import export_to_moveit
 
             done = export_to_moveit(context, source if is_plan(source) else None, folder, choice)
         elif context is None or is_plan(source):
@@ -562,7 +560,7 @@ def _export_candidates(source: Path, format_name: str, out_dir: Path, choice: Ch
 def _export_to_slicer(source: Path, out_dir: Path, choice: Choice, as_json: bool) -> None:
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
-    from puncture_twin.twin.jobs.patient.slicer_job import export_to_slicer
+    from puncture_twin.twin.jobs.patient.export_jobs import export_to_slicer
 
     if is_plan(source):
         allowed = "a case, with --rank, --window, --theta or --entry"
@@ -676,8 +674,7 @@ def scan(
 
     from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.experiment.scan_beside import parse_beside
-    from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, parse_marker, scan_case
-    from puncture_twin.twin.jobs.experiment.scan_text import scan_text
+    from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, parse_marker, scan_case, scan_text
     from puncture_twin.twin.plant.scanner.image import ScanSettings
 
     settings = ScanSettings(spacing, pixel, noise, seed=seed, fov_mm=fov, length_mm=length, turn=radians(turn))

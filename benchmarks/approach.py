@@ -19,23 +19,21 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, TipLimit, slowed
+from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, TipLimit, flange_pose, slowed
 from puncture_twin.planning.arm.tool import Box, Tool, gantry_boxes
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.surroundings import case_boxes
-from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool, home_configuration
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool, home_configuration
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.motion import approach
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, Approach, plan_approach
 from puncture_twin.planning.motion.follow import MAX_JERK, follow
 from puncture_twin.planning.motion.path_check import dense_states, least_clearance, path_length
-from puncture_twin.planning.reach.answer import ReachRequest
-from puncture_twin.planning.reach.goals import approach_goals
+from puncture_twin.planning.reach.reach import approach_goals
+from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.search.context import CaseContext, prepare
 
 STANDOFF_MM = 100.0

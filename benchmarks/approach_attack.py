@@ -28,7 +28,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, plan_approach
 from puncture_twin.planning.motion.path_check import MAX_SWEEP_MM, dense_states, path_length
 

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script,
 
 from benchmarks.approach import Scene, scenes
 from puncture_twin.planning.arm.inverse_kinematics import wrapped_solutions
-from puncture_twin.planning.collision.bodies.body import NEVER_TESTED
+from puncture_twin.planning.collision.bodies import NEVER_TESTED
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.motion.path_check import dense_states, first_contact, path_length

@@ -19,10 +19,9 @@ import numpy as np
 from ompl import geometric as og
 
 from benchmarks.approach import Scene, scenes
-from puncture_twin.planning.motion import joint_space, rrt_connect, shortest
+from puncture_twin.planning.motion import rrt_connect, rrt_connect as joint_space, shortest
 from puncture_twin.planning.motion.path_check import path_length
-from puncture_twin.planning.motion.rrt_connect import Limits, connect
-from puncture_twin.planning.motion.shortcuts import CLEARANCE_MM
+from puncture_twin.planning.motion.rrt_connect import CLEARANCE_MM, Limits, connect
 from puncture_twin.planning.motion.shortest import NEAR_RAD, Task
 
 SAMPLES = 4000

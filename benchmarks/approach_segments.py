@@ -17,8 +17,7 @@ import numpy as np
 from ompl import base as ob
 
 from benchmarks.approach import Scene, scenes
-from puncture_twin.planning.motion.joint_space import JointSpace, SegmentContact
-from puncture_twin.planning.motion.rrt_connect import Limits, _Validator
+from puncture_twin.planning.motion.rrt_connect import JointSpace, Limits, SegmentContact, _Validator
 
 CALLS = 2000
 

@@ -25,12 +25,11 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.surroundings import case_boxes
-from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
 from puncture_twin.planning.reach.reach import assess_reach_all
-from puncture_twin.planning.search.arm_reach import reach_request
+from puncture_twin.planning.search.constraints import reach_request
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 
 ROOT = Path(__file__).parents[1]
 CHUNK = 200

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import N_PARAMETERS
 from puncture_twin.twin.guidance.ultrasound.pose_choice import choose_poses, expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.simulate import (
     SPEC_NOISE,

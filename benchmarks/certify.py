@@ -27,7 +27,7 @@ from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"

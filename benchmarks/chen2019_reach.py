@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.insertion import flange_poses
-from puncture_twin.planning.arm.singularity import MIN_SINGULARITY
+from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.place.estimate import insertion_branches

@@ -32,7 +32,7 @@ from skimage.measure import marching_cubes
 
 from benchmarks import wait_probe
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
-from puncture_twin.planning.formats.labels.totalsegmentator import V2
+from puncture_twin.planning.formats.labels.naming import V2
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -4,7 +4,7 @@
 log's SHA-256: the same seed and count give the same digest. A log that is there is continued, and only reported where
 it is long enough. Exit 1 where a "safe" is wrong.
 
-A verdict is the product's: `planning.clearance.measure.measure` over the `FastEngine`, safe or too close at a margin.
+A verdict is the product's: `planning.clearance.engine.measure` over the `FastEngine`, safe or too close at a margin.
 What is true: too close if the axis' distance is below needle radius plus margin, 0 inside a closed surface. The brute
 force computes in float64, and once more in long double where it differs from the verdict or is within `CLOSE_MM` of the
 threshold. A verdict is wrong if the distance lies on the other side of the threshold by more than `ROUNDING_MM`.
@@ -30,8 +30,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script,
 from benchmarks.hostile_scenes import KINDS, HostileScene, make_scene
 from benchmarks.plain_distance import Inside, distances, exact_distance, least_distances
 from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.clearance.engine import measure
 from puncture_twin.planning.clearance.fast_engine import FastEngine
-from puncture_twin.planning.clearance.measure import measure
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
 from puncture_twin.twin.guidance.stereo.detection import picture_detector
-from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed, Unknowns
-from puncture_twin.twin.guidance.stereo.joint.optimum import Adjusted, bound
+from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, Unknowns, bound
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.session import DetectorOf, run_session
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell

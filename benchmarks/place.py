@@ -15,23 +15,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
 
-from benchmarks.chen2019_reach import (
-    AGAINST_Z,
-    SHARES,
-    TOWARD_AXIS,
-    WINDOWS,
-    cap,
-    held_share,
-    our_share,
-    our_windows,
-)
+from benchmarks.chen2019_reach import AGAINST_Z, SHARES, TOWARD_AXIS, WINDOWS, cap, held_share, our_share, our_windows
 from puncture_twin.meshes import folder
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.place.mounts import Region, Site
 from puncture_twin.planning.place.search import search_placements
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 
 AXIS_WORDS = {AGAINST_Z: "base -z", TOWARD_AXIS: "to base axis"}
 LESION_M_CT = np.array([50.0, 130.0, 63.0])

@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.peers import pose, trees
 from benchmarks.scenes import Scene
+from puncture_twin.planning.clearance.engine import NEAR_THRESHOLD_MM, too_near
 from puncture_twin.planning.clearance.fast_engine import FastEngine
-from puncture_twin.planning.clearance.measure import NEAR_THRESHOLD_MM, too_near
 
 RADII_MM = (0.5, 3.0, 5.5)
 PAIRS = 2000

@@ -32,14 +32,16 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.twin.guidance.stereo.detection import Detector
 from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, needle_statistics, trial
-from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed
-from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_error, servoed_error
-from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome, needle_outcome
-from puncture_twin.twin.guidance.stereo.joint.optimum import Adjusted, adjust
-from puncture_twin.twin.guidance.stereo.poses import flange_poses
+from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, adjust
+from puncture_twin.twin.guidance.stereo.joint.needle_error import (
+    NeedleOutcome,
+    needle_outcome,
+    open_loop_error,
+    servoed_error,
+)
 from puncture_twin.twin.guidance.stereo.robot_calibration import calibrating_rod, carried_rod, grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
-from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, ball_jacobian
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, ball_jacobian, flange_poses
 from puncture_twin.twin.guidance.stereo.session import run_session
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, planned_cameras
 

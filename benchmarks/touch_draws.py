@@ -23,15 +23,12 @@ from scipy.special import ndtr
 
 from benchmarks.timing import least_seconds
 from benchmarks.trust import Scene, punctures, scenes
-from puncture_twin.planning.clearance.near_faces import NearFaces, near_faces
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.clearance.fast_engine import NearFaces, near_faces
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.reach.standoff import own_lengths
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
-from puncture_twin.planning.uncertainty.chances import demanding
-from puncture_twin.planning.uncertainty.lines.line_sampling import line_chance
-from puncture_twin.planning.uncertainty.lines.needle_doubt import NeedleDoubt, needle_doubt
-from puncture_twin.planning.uncertainty.lines.walks import walked
-from puncture_twin.planning.uncertainty.touch import touch_chance
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding
+from puncture_twin.planning.uncertainty.hit import touch_chance
+from puncture_twin.planning.uncertainty.lines import NeedleDoubt, line_chance, needle_doubt, walked
 
 SEED, MARKERS = 20191104, 4
 SURE = 1e-3

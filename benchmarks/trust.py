@@ -29,9 +29,9 @@ from benchmarks.scenes import DATA
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.singularity import farthest_from_singular
+from puncture_twin.planning.arm.kinematics import farthest_from_singular
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.clearance.near_faces import near_faces
+from puncture_twin.planning.clearance.fast_engine import near_faces
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.reach.standoff import own_lengths
@@ -46,9 +46,8 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residual_test import NoiseTest
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances
-from puncture_twin.planning.uncertainty.chances import demanding
+from puncture_twin.planning.search.search import organ_candidates
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding, refined_chances
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, hit_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms

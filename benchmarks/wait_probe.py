@@ -31,10 +31,9 @@ FUNCTIONS = {
     "planning.evidence.checks": {"findings": "inputs compared"},
     "planning.clearance.fast_engine": {"FastEngine.__init__": "engine's blocks"},
     "planning.collision.workcell": {"case_checker": "workcell"},
-    "planning.search.search": {"organ_distances": "search"},
-    "planning.search.organs": {"organ_candidates": "search"},
-    "planning.search.arm_reach": {"with_reach": "reach"},
-    "planning.search.phases.arm_phases": {"with_breathing_reach": "reach"},
+    "planning.search.search": {"organ_distances": "search", "organ_candidates": "search"},
+    "planning.search.constraints": {"with_reach": "reach"},
+    "planning.search.phases": {"with_breathing_reach": "reach"},
     "planning.search.candidate_chances": {
         "with_chances": "chances",
         "with_best_refined": "chances",

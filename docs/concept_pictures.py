@@ -20,13 +20,13 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.case.tables.structures_section import AIR_HU
-from puncture_twin.planning.collision.bodies.sphere_tree import sphere_tree
+from puncture_twin.planning.case.tables import AIR_HU
+from puncture_twin.planning.collision.bodies import sphere_tree
 from puncture_twin.planning.evidence.edges import Placement, compare, edge_image, sample_surfaces
 from puncture_twin.planning.evidence.label_placement import REFUSING_Z
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.plan.plan_document import read_plan
-from puncture_twin.planning.reach.skin_gap import skin_gaps
+from puncture_twin.planning.reach.standoff import skin_gaps
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
 from tools.phantoms import supine
 from tools.phantoms.ct_image import rendered

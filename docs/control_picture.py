@@ -5,7 +5,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 from benchmarks.experiment.workbench import TIP_M, UR3, Position, impedance, press
-from puncture_twin.twin.world.control.insertion import Admittance, VirtualMass
+from puncture_twin.twin.world.control import Admittance, VirtualMass
 
 PICTURE = Path(__file__).parent / "pictures" / "control.png"
 BLUE, ORANGE, GREEN, RED, GREY = "#1f4e8c", "#b9770e", "#1e8449", "#c0392b", "#8a8a8a"

@@ -7,15 +7,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.breathing.lujan import fraction_within, positions
+from puncture_twin.planning.breathing.breathing import Breathing, fraction_within, positions
 from puncture_twin.planning.formats.labels.naming import ByName
-from puncture_twin.planning.needle.bevel_path import bevel_path
+from puncture_twin.planning.needle.deflection import GAUGES, Layer, Shaft, Tissue, bevel_path
 from puncture_twin.planning.needle.insertion_force import insertion_force
-from puncture_twin.planning.needle.shaft import GAUGES, Shaft
-from puncture_twin.planning.needle.tissue import Layer, Tissue
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 
 PICTURES = Path(__file__).parent / "pictures"
 BLUE, ORANGE, GREEN, RED, GREY = "#1f4e8c", "#b9770e", "#1e8449", "#c0392b", "#d9d9d9"

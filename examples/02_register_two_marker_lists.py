@@ -11,8 +11,7 @@ import numpy as np
 
 import puncture_twin as pt
 from puncture_twin.meshes import folder
-from puncture_twin.planning.geometry.rigid import apply, inverse, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, log_rotation, pose
 
 SLIP = pose(exp_rotation(np.array([0.0, 0.0, np.radians(1.0)])), [0.0, 0.0, 3.0])
 """How the patient might slip, in the CT frame: 3 mm to the head and a turn of 1 degree about that axis."""

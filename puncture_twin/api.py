@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.case.case import Case
     from puncture_twin.planning.certify.certificate import Certificate
     from puncture_twin.planning.certify.checker import Verification
-    from puncture_twin.planning.formats.points.point_files import NamedPoints
+    from puncture_twin.planning.formats.points import NamedPoints
     from puncture_twin.planning.formats.volumes.volume_files import Volume
     from puncture_twin.planning.geometry.mesh import TriangleMesh
     from puncture_twin.planning.plan.plan import Plan
@@ -200,7 +200,7 @@ def read_points(path: Path | str) -> NamedPoints:
     Raises:
         InputError: It cannot be read, or is not whole.
     """
-    from puncture_twin.planning.formats.points.point_files import read_points
+    from puncture_twin.planning.formats.points import read_points
 
     return read_points(Path(path))
 
@@ -211,7 +211,7 @@ def write_points(points: Points, path: Path | str) -> None:
     Raises:
         InputError: A point that is not three finite numbers, or a place that cannot be written to.
     """
-    from puncture_twin.planning.formats.points.point_files import write_points
+    from puncture_twin.planning.formats.points import write_points
 
     write_points(Path(path), _named(points, "write_points"))
 
@@ -229,8 +229,7 @@ def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS", up: str
         InputError: It is cut, contradicts itself, is empty, or has coordinates that are no finite numbers.
     """
     from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
-    from puncture_twin.planning.geometry.spaces import Space, Up
-    from puncture_twin.planning.geometry.units import Unit
+    from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
     try:
         known, axis = (Unit(unit), Space(space)), None if up is None else Up(up)
@@ -327,7 +326,7 @@ def _named(points: Points, where: str) -> NamedPoints:
         InputError: A point that is not three finite numbers.
     """
     from puncture_twin.planning.formats.guard import guard_points
-    from puncture_twin.planning.formats.points.point_files import NamedPoints
+    from puncture_twin.planning.formats.points import NamedPoints
 
     if isinstance(points, NamedPoints):
         return points

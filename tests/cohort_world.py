@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 from case_world import ORGAN, SKIN, case_text, structure, write_balls
 
 from puncture_twin.planning.base.cache.memory import NO_MEMORY
-from puncture_twin.planning.batch.cohort.cohort_case import CohortCase
+from puncture_twin.planning.batch.cohort import CohortCase
 from puncture_twin.planning.batch.plan import planned, read_plan_table
 from puncture_twin.planning.batch.run_case import CaseTask, run_case
 from puncture_twin.planning.case.options import case_options

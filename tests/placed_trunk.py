@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.placements import phantoms
-from puncture_twin.twin.plant.scanner.nifti_writer import write_nifti
+from puncture_twin.twin.plant.scanner.writers import write_nifti
 
 PHANTOMS = dict(phantoms())
 

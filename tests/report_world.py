@@ -16,7 +16,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
-from puncture_twin.planning.search.selection.choice import best_pick
+from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.twin.report.page.page import write_page
 from puncture_twin.twin.report.slices.sheet import draw_slices
 from puncture_twin.twin.report.slices.subject import Subject

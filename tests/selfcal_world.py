@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate
 from puncture_twin.twin.guidance.ultrasound.simulate import (
     ImagePose,
     draw_image_poses,

@@ -8,12 +8,10 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.twin.guidance.stereo.joint.erring_rod import N_ROD
-from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed, Unknowns
-from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
+from puncture_twin.twin.guidance.stereo.joint.joint_model import N_ROD, Guess, Observed, Unknowns
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
-from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.stereo_room import calibration_frame, draw_workcell, head_pose, planned_cameras
 
 CASE = load_servo_case(folder() / "head")

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.beside.scene import Asked, judged
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.plant.beside.beside import Beside
+from puncture_twin.twin.plant.outside_objects import Beside
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 
 ARMS, BEDS = ("beside", "pressed", "across"), ("flat", "curved", "pad", "none")

@@ -17,7 +17,7 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, scan_case
 from puncture_twin.twin.jobs.patient.init_job import init_case
-from puncture_twin.twin.plant.beside.beside import Beside
+from puncture_twin.twin.plant.outside_objects import Beside
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from tools.phantoms.drawn.trunk import draw_trunk
 from tools.phantoms.drawn.trunk_case import CASE, write_trunk_case

@@ -10,12 +10,11 @@ import numpy as np
 
 from benchmarks.experiment.row import Row
 from puncture_twin.meshes import folder
-from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.breathing.lujan import fraction_within
+from puncture_twin.planning.breathing.breathing import Breathing, fraction_within
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 
 WEIGHTS = {
     "*": 0.0, "skin": 0.3, "liver": 1.0, "gallbladder": 1.0, "portal_vein": 0.9, "hepatic_veins": 1.0, "kidney_*": 0.7,

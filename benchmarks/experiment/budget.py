@@ -9,8 +9,7 @@ import numpy as np
 from benchmarks.experiment.row import Row
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.registration.fits.least_squares import carried, design, fit_rigid, least_squares_map
-from puncture_twin.twin.experiment.declarations import AS_STATED
-from puncture_twin.twin.experiment.printed import READ, rows_of
+from puncture_twin.twin.experiment.chen2019 import AS_STATED, READ, rows_of
 
 SETS = ("ABC", "ABE", "ACD", "ABCE", "ABCDE")
 DRAWS = 100_000

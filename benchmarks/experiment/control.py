@@ -24,10 +24,9 @@ from benchmarks.experiment.workbench import (
     true_tip,
 )
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.plant.felt import Felt
-from puncture_twin.twin.world.client import step
-from puncture_twin.twin.world.control.insertion import Admittance, VirtualMass
-from puncture_twin.twin.world.engine import pybullet
+from puncture_twin.twin.plant.true_needle import Felt
+from puncture_twin.twin.world.client import pybullet, step
+from puncture_twin.twin.world.control import Admittance, VirtualMass
 
 WALL_N_M, OVER_M = 1e5, 3e-3
 MOUNTS = {"table": [0, 0, -1.0], "side": [1.0, 0, 0], "carton": DOWN, "ceiling": [0, 0, 1.0]}

@@ -8,9 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.experiment.row import Row
-from puncture_twin.twin.experiment.declarations import AS_FOUND, AS_STATED
-from puncture_twin.twin.experiment.monte_carlo import paper_strains, run_draws
-from puncture_twin.twin.experiment.skew import find_skew
+from puncture_twin.twin.experiment.chen2019 import AS_FOUND, AS_STATED, find_skew, paper_strains, run_draws
 
 DRAWS = 100_000
 LESIONS_MM = (1.28, 1.39, 1.67)

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.experiment.row import Row
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.rigid import apply
@@ -22,8 +22,7 @@ from puncture_twin.twin.guidance.ct.markers import find_markers
 from puncture_twin.twin.guidance.ct.needle import find_needle
 from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, scan_case
 from puncture_twin.twin.plant.scanner.coverage import cut_solids
-from puncture_twin.twin.plant.scanner.image import ScanSettings, scan_solids
-from puncture_twin.twin.plant.scanner.solids import Solid, ball, box, rod
+from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, box, rod, scan_solids
 
 PIXEL_MM = 0.7
 SCANS = 40

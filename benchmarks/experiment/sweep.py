@@ -7,10 +7,10 @@ import numpy as np
 from benchmarks.experiment.row import Row
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.case.tables.errors_section import RehearsalSection
+from puncture_twin.planning.case.tables import RehearsalSection
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.sweep.sweep_planner import plan_sweep
-from puncture_twin.twin.rehearsal.executed import execute_sweep
+from puncture_twin.twin.rehearsal.rehearsal import execute_sweep
 
 START, END, REJECTED = (tuple(np.radians(pair)) for pair in ((22.0, 208.0), (40.0, 224.0), (22.0, 260.0)))
 

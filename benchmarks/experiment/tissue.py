@@ -8,11 +8,19 @@ from time import process_time
 import numpy as np
 
 from benchmarks.experiment.row import Row
-from puncture_twin.planning.needle.bevel_path import Beam, bevel_path, step_for
-from puncture_twin.planning.needle.deflection import ALLOWANCE, MOST_SLENDER, deflection_bound
+from puncture_twin.planning.needle.deflection import (
+    ALLOWANCE,
+    GAUGES,
+    MOST_SLENDER,
+    Beam,
+    Layer,
+    Shaft,
+    Tissue,
+    bevel_path,
+    deflection_bound,
+    step_for,
+)
 from puncture_twin.planning.needle.insertion_force import insertion_force
-from puncture_twin.planning.needle.shaft import GAUGES, Shaft
-from puncture_twin.planning.needle.tissue import Layer, Tissue
 
 SHAFT = Shaft(200.0, 1.27)
 STIFFNESSES = (0.01, 0.1, 0.4)

@@ -7,12 +7,11 @@ import numpy as np
 
 from benchmarks.experiment.row import Row
 from puncture_twin.meshes import folder
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation, pose
+from puncture_twin.planning.search.choice import Choice
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.twin.guidance.ct.pivot import pivot_calibration
-from puncture_twin.twin.jobs.experiment.pivot_tour import pivot_tour
+from puncture_twin.twin.jobs.experiment.pivot_job import pivot_tour
 from puncture_twin.twin.jobs.experiment.touch_job import touch_case
 
 TIP, PLACE = np.array([1.5, -0.8, 210.0]), np.array([350.0, 60.0, 40.0])

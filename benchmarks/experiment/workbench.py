@@ -9,27 +9,28 @@ from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.geometry.frames import frame_about
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.motion.timing import Rates, time_law
+from puncture_twin.planning.geometry.rigid import frame_about, pose
+from puncture_twin.planning.motion.follow import Rates, time_law
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
-from puncture_twin.planning.needle.bevel_path import bevel_path
+from puncture_twin.planning.needle.deflection import Layer, Shaft, Tissue, bevel_path
 from puncture_twin.planning.needle.insertion_force import insertion_force
-from puncture_twin.planning.needle.shaft import Shaft
-from puncture_twin.planning.needle.tissue import Layer, Tissue
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.search.bending.insertion import Insertion
-from puncture_twin.twin.plant.true_tissue import StraightPath, TrueTissue
+from puncture_twin.planning.search.bending import Insertion
+from puncture_twin.twin.plant.true_needle import StraightPath, TrueTissue
 from puncture_twin.twin.world.arm import load_arm
-from puncture_twin.twin.world.bodies import load_box
-from puncture_twin.twin.world.client import physics_client
-from puncture_twin.twin.world.control.gains import Stiffness
-from puncture_twin.twin.world.control.impedance import Impedance
-from puncture_twin.twin.world.control.reference import reference_of
-from puncture_twin.twin.world.control.rigid_model import rigid_model
-from puncture_twin.twin.world.control.run import Goals, Push, Surroundings, run
-from puncture_twin.twin.world.control.tip import tips
-from puncture_twin.twin.world.engine import pybullet
+from puncture_twin.twin.world.client import physics_client, pybullet
+from puncture_twin.twin.world.control import (
+    Goals,
+    Impedance,
+    Push,
+    Stiffness,
+    Surroundings,
+    reference_of,
+    rigid_model,
+    run,
+    tips,
+)
+from puncture_twin.twin.world.workcell import load_box
 
 UR3 = ur_model("ur3")
 TOOL = Tool(401.0, 250.0, 2.0, 30.0)

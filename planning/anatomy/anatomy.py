@@ -27,7 +27,7 @@ from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
 from puncture_twin.planning.formats.labels.label_surface import field_surface
-from puncture_twin.planning.formats.meshes.mesh_warnings import kept_mesh_warnings
+from puncture_twin.planning.formats.meshes.mesh_files import kept_mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.triangle_distance import squared_distance

@@ -8,8 +8,8 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.containment import settled_crossings
 from puncture_twin.planning.geometry.creases import smooth_normals
-from puncture_twin.planning.geometry.crossings import settled_crossings
 
 
 @dataclass(frozen=True, eq=False)

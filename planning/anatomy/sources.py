@@ -17,15 +17,14 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.base.text_names import first_few
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.tables.structures_section import StructureSection, StructuresSection
+from puncture_twin.planning.case.tables import StructureSection, StructuresSection
 from puncture_twin.planning.formats.labels.mask_folder import check_one_grid
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, RuleKind, names_for, select
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, refuse_lost_grid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, Up, parse_space
-from puncture_twin.planning.geometry.units import Unit, parse_unit
+from puncture_twin.planning.geometry.spaces import Space, Unit, Up, parse_space, parse_unit
 
 EMPTY_MASKS = "{folder}: {count} masks are empty, so that nothing is there: {names}"
 

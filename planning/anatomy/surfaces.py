@@ -36,7 +36,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Value = TypeVar("Value")
 
-READERS = "puncture_twin.planning.case.case_volumes"
+READERS = "puncture_twin.planning.case.named_files"
 """The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
 them has changed; nothing here imports them, so that a case without DICOM does not load its library."""
 

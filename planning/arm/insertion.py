@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, least_term, singularity
+from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, least_term, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import allocation_free

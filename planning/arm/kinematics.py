@@ -3,17 +3,50 @@
 The base frame is the controller's (a URDF's ``base_link`` is rotated by 180 deg about z against it). Frames follow
 Denavit and Hartenberg: T_{i-1}_{i} = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Compiled loops take an arm as its lengths
 (d1, a2, a3, d4, d5, d6) in mm.
+
+How the errors of an arm and of the needle on it move the needle: 28 parameters, by Denavit and Hartenberg.
+
+Source: Mooring, Roth, Driels, "Fundamentals of Manipulator Calibration", 1991: one column a parameter, its axis times
+its lever. With z_{i-1}, o_{i-1} axis and origin of joint i, and x_i, o_i of the frame behind it, at the tip p:
+
+    a_i: (x_i; 0)   d_i: (z_{i-1}; 0)   alpha_i: (x_i x (p - o_i); x_i)   q_i: (z_{i-1} x (p - o_{i-1}); z_{i-1})
+    tip offset: (R_flange; 0)   needle direction: (0; first two columns of R_flange)
+
+d2 is left out: axes 2 and 3 are parallel, and d3 moves the arm alike.
+
+Kinematics of an arm whose Denavit-Hartenberg numbers are not the nominal ones.
+
+T_{i-1}_{i} = Rz(q_i + zero_i) Tz(d_i) Tx(a_i) Rx(alpha_i). The parameters that err, and their order, are the first 23
+of `error_jacobian`. A calibration estimates such an arm, a twin draws one.
+
+How far a configuration of a UR arm is from its three singularities: of shoulder, elbow and wrist.
+
+How fast a plan may move: the needle's tip, and the joints as a fraction of what the arm can.
+
+Are the joints of this arm? Held against what the same file says of where flange, tool or tip was.
+
+A UR3e's joints read as a UR3's are 18 mm off, and nothing in six angles says so. But a recording often states the same
+thing twice: a controller's own pose beside its joints, a touched point, a flange. With the arm's nominal lengths both
+must agree, up to what a controller's own calibration moves.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.arm.ur import UR_MODELS, UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.numba_kernels import allocation_free
+from puncture_twin.planning.formats.points import JointRecording
 
 
 def _rows(q: Floats) -> Floats:
@@ -103,3 +136,354 @@ def jacobians(frames, J):  # type: ignore[no-untyped-def]  # numba infers
                 lever_j, lever_k = flange[j, 3] - frame[j, 3], flange[k, 3] - frame[k, 3]
                 J[row, i, joint] = frame[j, 2] * lever_k - frame[k, 2] * lever_j
                 J[row, 3 + i, joint] = frame[i, 2]
+
+
+N_PARAMETERS = 28
+
+PARAMETERS: Mapping[str, slice] = MappingProxyType(
+    {
+        "link": slice(0, 11),
+        "twist": slice(11, 17),
+        "joint": slice(17, 23),
+        "tip_offset": slice(23, 26),
+        "needle_direction": slice(26, 28),
+    }
+)
+"""Which columns belong to which kind: a1..a6 and d1, d3..d6; alpha1..6; zeros q1..6; flange axes; flange x and y."""
+
+FREE_D = (0, 2, 3, 4, 5)
+"""Indices of the link offsets that are parameters."""
+
+
+def error_jacobian(model: UrModel, q: Floats, tip_mm: float) -> Floats:
+    """The needle's motion per unit of each parameter's error.
+
+    Args:
+        model: The nominal arm.
+        q: Shape (..., 6), rad.
+        tip_mm: Flange to tip, along the flange's z.
+
+    Returns:
+        Shape (..., 6, 28), base frame: rows 0-2 the tip in mm, rows 3-5 the rotation in rad; per mm of a length or an
+        offset, per rad of an angle.
+    """
+    frames = link_poses(model, q)
+    R_flange = frames[..., 6, :3, :3]
+    tip = frames[..., 6, :3, 3] + tip_mm * R_flange[..., 2]
+    x, at_x = np.moveaxis(frames[..., 1:, :3, 0], -2, -1), frames[..., 1:, :3, 3]
+    z, at_z = np.moveaxis(frames[..., :6, :3, 2], -2, -1), frames[..., :6, :3, 3]
+    J = np.zeros((*np.shape(q)[:-1], 6, N_PARAMETERS))
+    J[..., :3, 0:6] = x
+    J[..., :3, 6:11] = z[..., list(FREE_D)]
+    J[..., :3, PARAMETERS["twist"]] = _levers(x, tip, at_x)
+    J[..., 3:, PARAMETERS["twist"]] = x
+    J[..., :3, PARAMETERS["joint"]] = _levers(z, tip, at_z)
+    J[..., 3:, PARAMETERS["joint"]] = z
+    J[..., :3, PARAMETERS["tip_offset"]] = R_flange
+    J[..., 3:, PARAMETERS["needle_direction"]] = R_flange[..., :2]
+    return J
+
+
+def _levers(axes: Floats, tip: Floats, origins: Floats) -> Floats:
+    """The axis x (tip - origin) in columns, shape (..., 3, 6)."""
+    levers = tip[..., :, None] - np.moveaxis(origins, -2, -1)
+    return np.asarray(np.cross(axes, levers, axisa=-2, axisb=-2, axisc=-2))
+
+
+class ErringArm(NamedTuple):
+    """Denavit-Hartenberg numbers of one arm, each of shape (6,), mm and rad."""
+
+    a: Floats
+    d: Floats
+    alpha: Floats
+    zeros: Floats
+    """True zero minus nominal zero of each joint."""
+
+    def link_poses(self, q: Floats) -> Floats:
+        """T_base_link, shape (..., 7, 4, 4), mm, of configurations (..., 6), rad: base first, flange last."""
+        q = np.asarray(q, dtype=np.float64) + self.zeros
+        poses = np.empty((*q.shape[:-1], 7, 4, 4))
+        poses[..., 0, :, :] = np.eye(4)
+        for i in range(6):
+            step = dh_step(q[..., i], self.d[i], self.a[i], self.alpha[i])
+            poses[..., i + 1, :, :] = poses[..., i, :, :] @ step
+        return poses
+
+
+def erring_arm(nominal: UrModel, eta: Floats) -> ErringArm:
+    """The nominal arm with its errors (23,), mm and rad: a1..a6, d1, d3..d6, alpha1..alpha6, zeros of q1..q6."""
+    d = np.array(nominal.d)
+    d[list(FREE_D)] += eta[6:11]
+    alpha = np.array(nominal.alpha) + eta[PARAMETERS["twist"]]
+    return ErringArm(np.array(nominal.a) + eta[:6], d, alpha, np.asarray(eta[PARAMETERS["joint"]]))
+
+
+def dh_step(q: Floats, d: Floats | float, a: Floats | float, alpha: Floats | float) -> Floats:
+    """T_{i-1}_{i} = Rz(q) Tz(d) Tx(a) Rx(alpha), shape (..., 4, 4), of angles (...); d, a, alpha: as many, or one."""
+    c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
+    T = np.zeros((*np.shape(q), 4, 4))
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, 2], T[..., 0, 3] = c, -s * ca, s * sa, a * c
+    T[..., 1, 0], T[..., 1, 1], T[..., 1, 2], T[..., 1, 3] = s, c * ca, -c * sa, a * s
+    T[..., 2, 1], T[..., 2, 2], T[..., 2, 3] = sa, ca, d
+    T[..., 3, 3] = 1.0
+    return T
+
+
+MIN_SINGULARITY = 0.05
+"""Each term of :class:`Singularity` must exceed this over the whole insertion. For the wrist
+that is 2.9 deg; joint speeds there are up to 20 times those of the best pose, and worse below."""
+
+TIE_DIGITS = 9
+"""Distances from singular that agree to so many digits are equal: mirrored branches and rolls are, but for rounding."""
+
+ELBOW = 2
+"""The row of `link_poses` whose origin is the elbow: where the upper arm ends."""
+
+ELBOW_DIGITS = 6
+"""The same of its place, mm: it does not move with the roll."""
+
+
+class Singularity(NamedTuple):
+    """How far a configuration is from the three singularities of a UR arm; each 0 (singular) to 1. Shapes (...)."""
+
+    shoulder: Floats
+    """In-plane distance of the wrist centre from axis 1, over the longest possible."""
+    elbow: Floats
+    """|sin q3|."""
+    wrist: Floats
+    """|sin q5|."""
+
+    def least(self) -> Floats:
+        """The smallest of the three, shape (...)."""
+        return np.minimum(np.minimum(self.shoulder, self.elbow), self.wrist)
+
+    @property
+    def nearest(self) -> str:
+        """Name of the nearest one, for a single configuration."""
+        return min(self._fields, key=lambda name: float(getattr(self, name)))
+
+
+def singularity(model: UrModel, q: Floats) -> Singularity:
+    """Distance from the three singularities.
+
+    The Jacobian's determinant is, up to sign and constant lengths, the product of sin q3, sin q5 and the shoulder
+    term a2 cos q2 + a3 cos q23 + d5 sin q234 (tests hold this).
+
+    Args:
+        model: The arm.
+        q: Shape (..., 6), rad.
+    """
+    rows = np.array(q, dtype=np.float64, order="C").reshape(-1, 6)  # a copy: read-only ones would be compiled for too
+    terms = np.empty((3, len(rows)))
+    _singularities(model.lengths, rows, terms)
+    return Singularity(*terms.reshape(3, *np.shape(q)[:-1]))
+
+
+def away_from_singularities(model: UrModel, q: Floats) -> NDArray[np.bool_]:
+    """Whether configurations (..., 6) keep their distance from every singularity; NaN does not. Shape (...)."""
+    return np.asarray(singularity(model, q).least() > MIN_SINGULARITY)
+
+
+def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> Floats:
+    """Of configurations the one farthest from singular; of equals the one whose elbow lies farthest along a direction.
+
+    A branch and its mirror image, and all rolls about the flange's axis, are equally far but for rounding: a choice
+    among them by the last bit differs between machines.
+
+    Args:
+        model: The arm.
+        q: Shape (n, 6), rad; rows may be NaN, not all of them.
+        elbow_towards: Shape (3,), base frame: where there is room for the elbow.
+
+    Returns:
+        Shape (6,), rad.
+    """
+    least = np.round(singularity(model, q).least(), TIE_DIGITS)
+    equal = q[least == np.nanmax(least)]
+    elbow = link_poses(model, equal)[:, ELBOW, :3, 3] @ elbow_towards
+    return np.asarray(equal[int(np.argmax(np.round(elbow, ELBOW_DIGITS)))])
+
+
+@allocation_free()
+def _singularities(lengths, q, terms):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``terms`` (3, n) from ``q`` (n, 6)."""
+    for row in range(len(q)):
+        shoulder, elbow, wrist = _singular_terms(lengths, q[row, 1], q[row, 2], q[row, 3], q[row, 4])
+        terms[0, row], terms[1, row], terms[2, row] = shoulder, elbow, wrist
+
+
+@allocation_free()
+def _singular_terms(lengths, q2, q3, q4, q5):  # type: ignore[no-untyped-def]  # numba infers
+    """Shoulder, elbow and wrist term, each 0 (singular) to 1."""
+    a2, a3, d5 = lengths[1], lengths[2], lengths[4]
+    in_plane = a2 * math.cos(q2) + a3 * math.cos(q2 + q3) + d5 * math.sin(q2 + q3 + q4)
+    return abs(in_plane) / (abs(a2) + abs(a3) + d5), abs(math.sin(q3)), abs(math.sin(q5))
+
+
+@allocation_free()
+def least_term(lengths, q):  # type: ignore[no-untyped-def]  # numba infers
+    """The least of the three terms of one configuration (6,); NaN where there is none."""
+    shoulder, elbow, wrist = _singular_terms(lengths, q[1], q[2], q[3], q[4])
+    return min(shoulder, elbow, wrist) if not math.isnan(shoulder) else math.nan
+
+
+class SpeedLimits(NamedTuple):
+    """What a case allows, and its plan keeps. The names are the keys of ``[robot]``."""
+
+    tip_speed_mm_s: float = 250.0
+    """Of the needle's tip, on the approach: what ISO 10218-1 calls reduced speed."""
+
+    insertion_speed_mm_s: float = 10.0
+    """Of the tip, along the insertion: a needle is inserted slowly, and an operator must be able to stop it."""
+
+    joint_speed_fraction: float = 0.5
+    """Of each joint's highest speed, as MoveIt's velocity scaling."""
+
+    joint_acceleration_fraction: float = 1.0
+    """Of each joint's highest acceleration, as MoveIt's acceleration scaling."""
+
+
+DEFAULT_SPEEDS = SpeedLimits()
+"""Where nobody says how fast."""
+
+HIGHEST = SpeedLimits(1000.0, 100.0, 1.0, 1.0)
+"""That a case may ask for: a UR's usual tool speed, a needle that is pushed briskly, and all that the joints can."""
+
+
+def slowed(model: UrModel, speeds: SpeedLimits) -> UrModel:
+    """The arm with its joints' speed and acceleration limits cut down to the fractions."""
+    return replace(
+        model,
+        max_speeds=speeds.joint_speed_fraction * model.max_speeds,
+        max_acceleration=speeds.joint_acceleration_fraction * model.max_acceleration,
+    )
+
+
+class TipLimit(NamedTuple):
+    """The highest speed of a point on the flange's z axis."""
+
+    tip_mm: float
+    """Flange to tip."""
+
+    speed_mm_s: float
+
+
+def tip_rates(model: UrModel, q: Floats, directions: Floats, tip_mm: float) -> Floats:
+    """How fast the tip moves while the joints move at given speeds: |J_v u + (J_w u) x l z|, l from flange to tip.
+
+    Args:
+        model: The arm.
+        q: Shape (m, 6), rad.
+        directions: Shape (m, 6) or (6,), u: joint speeds, rad/s; or per whatever else the tip's speed is then per.
+        tip_mm: Flange to tip, along the flange's z.
+
+    Returns:
+        Shape (m,), mm/s.
+    """
+    twists = np.einsum("mij,mj->mi", jacobian(model, q), np.broadcast_to(directions, q.shape))
+    lever = tip_mm * flange_pose(model, q)[:, :3, 2]
+    return np.asarray(np.linalg.norm(twists[:, :3] + np.cross(twists[:, 3:], lever), axis=1))
+
+
+def tip_speeds(model: UrModel, q: Floats, times_s: Floats, tip_mm: float) -> Floats:
+    """The tip's mean speed between the samples of a motion, mm/s.
+
+    Args:
+        model: The arm.
+        q: Shape (m, 6), rad.
+        times_s: Shape (m,), s, rising.
+        tip_mm: Flange to tip, along the flange's z.
+
+    Returns:
+        Shape (m - 1,).
+    """
+    poses = flange_pose(model, q)
+    tips = poses[:, :3, 3] + tip_mm * poses[:, :3, 2]
+    return np.asarray(np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(times_s))
+
+
+MOST_OFF_MM = 5.0
+"""A controller with its own calibration puts the tip up to some mm from where the data sheet's arm does."""
+
+FITS_MM = 1.5
+"""Another model whose joints put the tool so near to where it was is the arm that was recorded."""
+
+LEVER_MM = 95.0
+"""A flange's axes are held against joints by points so far out: 3 degrees move them by 5 mm."""
+
+
+def check_arm(
+    model: UrModel,
+    q: Floats,
+    points_base: Floats,
+    tools_flange: Sequence[Floats],
+    *,
+    names: Sequence[str],
+    where: str | Path,
+    any_tool: bool = False,
+) -> None:
+    """Refuse joints that do not put the tool where the same file says that it was.
+
+    Args:
+        model: The case's arm.
+        q: Shape (n, 6), rad.
+        points_base: Shape (n, 3), mm: where the tool was.
+        tools_flange: What the tool may be: points (3,) of the flange, mm.
+        names: Of the n rows.
+        where: What the error names.
+        any_tool: Whether it may also be any other point, the same in all rows.
+
+    Raises:
+        InputError: Names the row that is farthest off, and the models that would fit.
+    """
+
+    def off(one: UrModel, known: bool) -> Floats:
+        flanges = flange_pose(one, q)
+        R, gaps = flanges[:, :3, :3], points_base - flanges[:, :3, 3]
+        tools = [*tools_flange] if known else [np.median(np.einsum("nji,nj->ni", R, gaps), axis=0)]
+        return min((np.linalg.norm(R @ tool - gaps, axis=1) for tool in tools), key=lambda misses: float(misses.max()))
+
+    own = off(model, True)
+    if own.max() <= MOST_OFF_MM:
+        return
+    likely = [one.name for one in UR_MODELS.values() if one != model and off(one, True).max() <= FITS_MM]
+    if any_tool and not likely:
+        own = off(model, False)
+        if own.max() <= MOST_OFF_MM:
+            return
+        likely = [one.name for one in UR_MODELS.values() if one != model and off(one, False).max() <= FITS_MM]
+    row = int(np.argmax(own))
+    arm = f"; those of a {' or '.join(likely)} do not" if likely else ""
+    what = f"the joints of {names[row]} put the tool of a {model.name} {own[row]:.1f} mm from where it was{arm}"
+    allowed = f"within {MOST_OFF_MM:g} mm: joints of the case's arm, in their unit, with its needle"
+    raise InputError(what, where=where, allowed=allowed, code="joints_of_another_arm")
+
+
+def check_recording(model: UrModel, tip_mm: float, recording: JointRecording, *, where: str | Path) -> None:
+    """Refuse a recording whose controller had its tool where this arm's joints do not put one; without a tool, nothing.
+
+    Args:
+        model: The case's arm.
+        tip_mm: Flange to tip of its needle.
+        recording: Joints, and where the controller had its tool: flange, tip, or another point that all rows share.
+        where: What the error names.
+
+    Raises:
+        InputError: As `check_arm`.
+    """
+    if recording.tool_base is None:
+        return
+    tools = [np.zeros(3), np.array([0.0, 0.0, tip_mm])]
+    names = [f"row {number}" for number in range(1, len(recording.q) + 1)]
+    check_arm(model, recording.q, recording.tool_base, tools, names=names, where=where, any_tool=True)
+
+
+def check_flanges(model: UrModel, q: Floats, T_base_flange: Floats, *, names: Sequence[str], where: str | Path) -> None:
+    """Refuse joints (n, 6), rad, that do not belong to flanges (n, 4, 4), mm, in place and axes.
+
+    Raises:
+        InputError: As `check_arm`.
+    """
+    for tool in (np.zeros(3), *(LEVER_MM * np.eye(3)[:2])):
+        points = T_base_flange[:, :3, 3] + T_base_flange[:, :3, :3] @ tool
+        check_arm(model, q, points, [tool], names=names, where=where)

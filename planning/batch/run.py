@@ -1,33 +1,118 @@
-"""A cohort's cases, or a part, run by one at a time until each has a row; what has one is left as it is."""
+"""A cohort's cases, or a part, run by one at a time until each has a row; what has one is left as it is.
+
+A part of a cohort: ``i/n``, as stated or as SLURM's array says it.
+
+How long a cohort will take, and how much memory and disk: measured at its first case that can be read.
+
+What has become of a cohort: done, failed with reasons, missing, stale.
+
+The same cases on the workers of a ``dask.distributed`` scheduler, on as many machines as it has.
+
+Dask runs a task again whose worker died, finished or not: every case is run at least once, and committed exactly once,
+because its result appears by a rename that only the first can make. The cohort, its output folder and this package are
+where every worker sees them under one path; a worker reads a patient's files itself, and keeps meshes and trees in
+memory by the hash of their bytes, so that no mesh travels with a case.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import os
+import re
+import resource
 import shutil
+import tempfile
+import threading
+import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.cache.memory import MEMORY_BYTES, Memory
+from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.extras import require_extra
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.processes import worker_count
-from puncture_twin.planning.base.progress import Watcher
-from puncture_twin.planning.batch.part import WHOLE, Part
-from puncture_twin.planning.batch.plan import PlannedCase, read_plan_table
-from puncture_twin.planning.batch.result import WORK_PREFIX, discard, is_final, read_row
-from puncture_twin.planning.batch.run_case import CaseEnd, CaseTask, WritePage
-from puncture_twin.planning.batch.workers import NO_LIMITS, Limits, run_tasks
+from puncture_twin.planning.base.progress import Count, Watcher
+from puncture_twin.planning.batch.plan import (
+    WORK_PREFIX,
+    PlannedCase,
+    discard,
+    identified,
+    is_final,
+    read_plan_table,
+    read_row,
+)
+from puncture_twin.planning.batch.run_case import CaseEnd, CaseTask, WritePage, commit_failure, ended, run_case
+from puncture_twin.planning.batch.workers import NO_LIMITS, WORKER_DIED, Limits, run_tasks
+
+Item = TypeVar("Item")
+
+ALLOWED_PARTS = "i/n with 1 <= i <= n, such as 3/8"
+TASK, COUNT, FIRST, STEP = (f"SLURM_ARRAY_TASK_{name}" for name in ("ID", "COUNT", "MIN", "STEP"))
+"""What SLURM tells each task of an array: https://slurm.schedmd.com/job_array.html."""
+
+
+class Part(NamedTuple):
+    """Part ``number`` of ``parts``, from 1 on."""
+
+    number: int
+    parts: int
+
+    @property
+    def text(self) -> str:
+        """As it is typed."""
+        return f"{self.number}/{self.parts}"
+
+    def of(self, items: Sequence[Item]) -> Sequence[Item]:
+        """This part's items: neighbours stay together, and every item is in one part."""
+        size = len(items)
+        return items[(self.number - 1) * size // self.parts : self.number * size // self.parts]
+
+
+WHOLE = Part(1, 1)
+
+
+def parse_part(text: str) -> Part:
+    """A part as it is typed.
+
+    Raises:
+        InputError: Something else.
+    """
+    found = re.fullmatch(r"([0-9]{1,7})/([0-9]{1,7})", text)
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise InputError(f"'{text[:40]}' is no part", where="--part", allowed=ALLOWED_PARTS)
+    return Part(int(found[1]), int(found[2]))
+
+
+def slurm_part(environment: Mapping[str, str]) -> Part | None:
+    """The part of this task of a SLURM array; None outside of one.
+
+    Raises:
+        InputError: An array from whose numbers the part cannot be told.
+    """
+    if TASK not in environment:
+        return None
+    stated = {name: environment.get(name, "1" if name == STEP else "") for name in (TASK, COUNT, FIRST, STEP)}
+    if not all(re.fullmatch(r"[0-9]{1,9}", value) for value in stated.values()):
+        raise InputError(f"{stated} are no numbers", where="SLURM's array", allowed=f"--part {ALLOWED_PARTS}")
+    task, count, first, step = (int(stated[name]) for name in (TASK, COUNT, FIRST, STEP))
+    place, odd = divmod(task - first, max(step, 1))
+    if odd or not 0 <= place < count:
+        what = f"task {task} of an array of {count} from {first} in steps of {step}"
+        raise InputError(what, where="SLURM's array", allowed=f"an array without gaps, or --part {ALLOWED_PARTS}")
+    return Part(place + 1, count)
+
 
 RunTasks = Callable[[Sequence[CaseTask], Limits], Generator[CaseEnd, None, None]]
 """Runs cases somewhere, and yields how each ended."""
 
 LOCK_NAME = ".puncture-twin-run-lock"
-ALLOWED = "one run at a time, parts beside each other (--part i/n), or another folder"
+ALLOWED_AT_ONCE = "one run at a time, parts beside each other (--part i/n), or another folder"
 
 
 @dataclass(frozen=True)
@@ -177,8 +262,214 @@ def _locked(out: Path, name: str, kind: int) -> Iterator[None]:
         fcntl.flock(handle, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(handle)
-        raise InputError("another run is at work in this folder", where=out, allowed=ALLOWED) from None
+        raise InputError("another run is at work in this folder", where=out, allowed=ALLOWED_AT_ONCE) from None
     try:
         yield
     finally:
         os.close(handle)
+
+
+COPIES = 2
+"""Of each table: the case's own, and that of the merged dataset."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Of a cohort.
+
+    Attributes:
+        cases: In all.
+        refused: That cannot be read.
+        sample: The case that was measured, as the cohort writes it; None where none can be read.
+        seconds: A case, in a worker that is warm.
+        disk_bytes: Of all cases, run and merged.
+        memory_bytes: Of one worker, at its most.
+    """
+
+    cases: int
+    refused: int
+    sample: str | None = None
+    seconds: float = 0.0
+    disk_bytes: int = 0
+    memory_bytes: int = 0
+
+
+def estimate(cases: Sequence[PlannedCase]) -> Estimate:
+    """Run the first case that can be read twice, the second time warm, and take all others to be like it.
+
+    Args:
+        cases: The plan's.
+    """
+    readable = [one for one in cases if not one.refusal]
+    refused = len(cases) - len(readable)
+    if not readable:
+        return Estimate(len(cases), refused)
+    for _ in range(2):
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            run_case(CaseTask(readable[0], Path(folder), Path(folder)))
+            seconds = time.perf_counter() - start
+            size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return Estimate(len(cases), refused, readable[0].case, seconds, COPIES * size * len(readable), peak)
+
+
+@dataclass
+class CohortState:
+    """Cases of a plan, each counted once.
+
+    Attributes:
+        planned: Cases in all.
+        safe: Done, with a safe direction.
+        no_safe: Done, without one.
+        reasons: Failed, by reason: refused inputs, and failures of the program.
+        missing: Not run.
+        stale: Their inputs have changed since the plan: `batch plan` again.
+        stale_cases: As the cohort writes them.
+    """
+
+    planned: int = 0
+    safe: int = 0
+    no_safe: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+    missing: int = 0
+    stale_cases: list[str] = field(default_factory=list)
+
+    @property
+    def done(self) -> int:
+        """Cases with a verdict."""
+        return self.safe + self.no_safe
+
+    @property
+    def failed(self) -> int:
+        """Cases whose row is a refusal or a failure."""
+        return sum(self.reasons.values())
+
+    @property
+    def stale(self) -> int:
+        """Cases whose inputs have changed."""
+        return len(self.stale_cases)
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "cases": self.planned,
+            "done": self.done,
+            "safe": self.safe,
+            "no_safe": self.no_safe,
+            "failed": self.failed,
+            "reasons": [{"reason": reason, "count": count} for reason, count in self.reasons.most_common()],
+            "missing": self.missing,
+            "stale": self.stale,
+            "stale_cases": self.stale_cases,
+        }
+
+    def add(self, planned: PlannedCase, out: Path) -> None:
+        """Count one more; its files are read and hashed."""
+        self.planned += 1
+        row = read_row(out, planned.id)
+        if identified(planned).id != planned.id:
+            self.stale_cases.append(planned.case)
+        elif row is None:
+            self.missing += 1
+        elif row["exit_code"] > 1:
+            self.reasons[str(row["reason"])] += 1
+        elif row["exit_code"] == 1:
+            self.no_safe += 1
+        else:
+            self.safe += 1
+
+
+def cohort_state(out: Path, progress: Count) -> CohortState:
+    """Look at every case of a plan.
+
+    Args:
+        out: The cohort's folder.
+        progress: Called with (cases looked at, cases).
+
+    Raises:
+        InputError: The folder has no plan.
+    """
+    plan, state = read_plan_table(out), CohortState()
+    for number, one in enumerate(plan.cases, start=1):
+        state.add(one, out)
+        progress(number, len(plan.cases))
+    return state
+
+
+CONNECT_S = 20.0
+"""So long a scheduler may take to answer."""
+
+KEPT = "puncture_twin_kept"
+"""Attribute of Dask's worker object: what this process keeps, and who is at it."""
+
+
+class _Kept:
+    """Of one worker process. Its threads run one case at a time: FCL's objects are moved for each question."""
+
+    def __init__(self) -> None:
+        self.memory = Memory(MEMORY_BYTES)
+        self.turn = threading.Lock()
+
+
+def on_scheduler(address: str) -> RunTasks:
+    """Whoever runs cases on a scheduler's workers.
+
+    Args:
+        address: Such as ``tcp://10.0.0.1:8786``.
+
+    Raises:
+        InputError: The extra ``dask`` is not installed.
+    """
+    require_extra("dask", "--scheduler")
+    import distributed
+
+    def run(tasks: Sequence[CaseTask], limits: Limits) -> Generator[CaseEnd, None, None]:
+        if limits != NO_LIMITS:
+            what = "memory and time of a case are limited by Dask's workers"
+            raise InputError(what, where="--scheduler", allowed="dask worker --memory-limit alone")
+        try:
+            library: Any = distributed
+            client = library.Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            what = f"no scheduler answers there ({one_line(str(error), 150)})"
+            raise InputError(what, where=f"--scheduler {address[:80]}", allowed="tcp://HOST:PORT of one") from error
+        with client:
+            yield from _dask_ends(distributed, client, tasks)
+
+    return run
+
+
+def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Generator[CaseEnd, None, None]:
+    """How each case ended, as they end; one that killed its workers gets its row here."""
+    futures = {client.submit(run_on_worker, task, pure=False): task for task in tasks}
+    try:
+        for future in distributed.as_completed(list(futures), loop=client.loop):
+            task = futures.pop(future)
+            error = future.exception() if future.status == "error" else None
+            if future.status not in ("error", "finished"):
+                what = f"the scheduler has lost a case ({future.status})"
+                raise InputError(what, where="--scheduler", allowed="a scheduler that stays; what is done is kept")
+            if error is None:
+                yield future.result()
+            elif isinstance(error, distributed.KilledWorker):
+                yield _killed(task)
+            else:
+                raise error
+            future.release()
+    finally:
+        client.cancel(list(futures))
+
+
+def _killed(task: CaseTask) -> CaseEnd:
+    """Its row; or the result that was there before its worker died."""
+    return ended(task) or commit_failure(task, WORKER_DIED)
+
+
+def run_on_worker(task: CaseTask) -> CaseEnd:
+    """Run a case in a worker's process, one at a time."""
+    from distributed import get_worker
+
+    kept: _Kept = vars(get_worker()).setdefault(KEPT, _Kept())
+    with kept.turn:
+        return run_case(task, kept.memory)

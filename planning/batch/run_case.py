@@ -18,15 +18,18 @@ from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.progress import Stages
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
-from puncture_twin.planning.batch.case_row import blank_row, found_row
-from puncture_twin.planning.batch.plan import PlannedCase, case_id, identified, relative_text
-from puncture_twin.planning.batch.result import (
+from puncture_twin.planning.batch.merge import blank_row, found_row
+from puncture_twin.planning.batch.plan import (
     PAGE_NAME,
     PROGRAM_FAILED,
     TABLE_NAME,
+    PlannedCase,
+    case_id,
     commit,
+    identified,
     new_draft,
     read_row,
+    relative_text,
     write_row,
 )
 from puncture_twin.planning.case.options import case_options

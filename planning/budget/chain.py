@@ -10,13 +10,11 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.breathing.lujan import mean_square_within
+from puncture_twin.planning.breathing.breathing import Breathing, mean_square_within
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.needle.deflection import Bending
-from puncture_twin.planning.needle.shaft import GAUGES, Shaft
+from puncture_twin.planning.needle.deflection import GAUGES, Bending, Shaft
 from puncture_twin.planning.reach.standoff import own_paths
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_uncertainty
@@ -25,7 +23,7 @@ from puncture_twin.planning.registration.fits.least_squares import fit_triad
 from puncture_twin.planning.registration.marker_noise import reading_noise, touches
 from puncture_twin.planning.registration.placement import default_method
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.search.bending.insertion import insertion_along
+from puncture_twin.planning.search.bending import insertion_along
 from puncture_twin.planning.uncertainty.pose_error import Bend, PoseError
 
 

@@ -11,7 +11,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.breathing.lujan import fraction_within
+from puncture_twin.planning.breathing.breathing import fraction_within
 from puncture_twin.planning.budget.chain import GATES, Chain, other_gauges
 from puncture_twin.planning.case.errors import ARM_KINDS, UNIFORM, ErrorModel
 from puncture_twin.planning.geometry.rigid import apply

@@ -1,36 +1,48 @@
-"""A case: a validated case file, in LPS (or local) mm and radians, with the hash of every input."""
+"""A case: a validated case file, in LPS (or local) mm and radians, with the hash of every input.
+
+The bed frame: which way is up and which way lies the bed, as a case states it or as a patient usually lies.
+
+How a case shows itself in a notebook.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
 
 from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.brief import brief
+from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.provenance import Input, InputFiles
 from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.case.case_volumes import CaseVolumes
-from puncture_twin.planning.case.entry import Directions, direction, grid
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, grid
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.case.html import case_html
-from puncture_twin.planning.case.named_files import MASK_ROLE
+from puncture_twin.planning.case.named_files import MASK_ROLE, CaseVolumes
 from puncture_twin.planning.case.settings import (
+    Axis,
     CtSettings,
     Gantry,
     Needle,
     Obstacle,
     RobotSettings,
     SearchSettings,
+    axes_frame,
 )
-from puncture_twin.planning.case.tables.errors_section import RehearsalSection
-from puncture_twin.planning.case.tables.place_section import PlaceSection
-from puncture_twin.planning.case.tables.registration_section import MarkerSection
-from puncture_twin.planning.case.tables.search_section import RankingSection
-from puncture_twin.planning.case.tables.structures_section import StructureSection, StructuresSection
+from puncture_twin.planning.case.tables import (
+    MarkerSection,
+    PlaceSection,
+    RankingSection,
+    RehearsalSection,
+    StructureSection,
+    StructuresSection,
+)
 from puncture_twin.planning.formats.labels.mask_folder import structure_name
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.needle.deflection import Bending
 
 
@@ -138,3 +150,84 @@ def view_frame(R_ct_entry: Floats, target_ct: Floats) -> Floats:
     T = pose(R_ct_entry, target_ct)
     T.setflags(write=False)
     return T
+
+
+Vector = tuple[float, float, float]
+
+UPRIGHT = 0.5
+"""An entry frame whose z lies within 60 degrees of the body's long axis is not the direction up."""
+
+
+def bed_frame(case: Case) -> Floats:
+    """T_ct_bed: x along the bed (to the head), y across it (to the right of a patient on the back), z up; mm.
+
+    ``place.up`` and ``place.along`` say both, see `up_axis` and `along_axis`.
+
+    Returns:
+        Shape (4, 4), read-only.
+
+    Raises:
+        InputError: The two are parallel.
+    """
+    R_ct_bed = axes_frame(up_axis(case), along_axis(case), Space.LPS, case.path, "place: up and along")
+    return view_frame(R_ct_bed, case.target_ct)
+
+
+def up_axis(case: Case) -> Vector:
+    """Up in LPS (or the local frame), of any length: ``place.up``.
+
+    Left out, it is the entry frame's z, or the front where that z runs along the body.
+    """
+    up, head = case.T_ct_entry[:3, 2], np.array(ANATOMICAL_LPS["head"])
+    if case.space is not Space.LOCAL and abs(up @ head) > UPRIGHT:
+        up = np.array(ANATOMICAL_LPS["anterior"])
+    return _stated(case.place.up, case.space, up)
+
+
+def along_axis(case: Case) -> Vector:
+    """Along the bed, likewise: ``place.along``, else the head, or the entry frame's x where there is no head."""
+    along = case.T_ct_entry[:3, 0] if case.space is Space.LOCAL else np.array(ANATOMICAL_LPS["head"])
+    return _stated(case.place.along, case.space, along)
+
+
+def _stated(axis: Axis | None, space: Space, otherwise: Floats) -> Vector:
+    """An axis that the case states, or another, in LPS (or the local frame)."""
+    if isinstance(axis, str):
+        return ANATOMICAL_LPS[axis]
+    vector = otherwise if axis is None else to_lps(np.array([axis]), space)[0]
+    return float(vector[0]), float(vector[1]), float(vector[2])
+
+
+@never_raises
+def case_html(case: Any) -> str:
+    """A table of facts: target, needle, structures, grid, robot, and what the case leaves open."""
+    return card(f"Case {case.name}", _facts(case))
+
+
+def _facts(case: Any) -> Facts:
+    x, y, z = case.target_ct
+    axes = "the local frame" if str(case.space) == "local" else "LPS"
+    yield "target", f"{case.target_name} in {case.target_structure}: ({x:.1f}, {y:.1f}, {z:.1f}) mm in {axes}"
+    needle = case.needle
+    yield "needle", f"⌀ {needle.diameter_mm:g} mm, shaft {needle.shaft_mm:g} mm, tip to flange {needle.length_mm:g} mm"
+    if case.tool is not None:
+        size = " × ".join(f"{edge:.0f}" for edge in np.ptp(case.tool.mesh.bounds, axis=0))
+        yield "tool", f"{case.tool.file.name}, {size} mm along the flange's axes"
+    stated = [one.name for one in case.structure] + [f"those of {one.source}" for one in case.structures]
+    yield "structures", ", ".join(stated) or "none"
+    (low, high), (first, last) = np.degrees(case.search.theta), np.degrees(case.search.beta)
+    step = np.degrees(case.search.step)
+    yield "search", f"θ {low:g}° to {high:g}°, β {first:g}° to {last:g}°, every {step:g}°"
+    yield "robot", case.robot.model.name
+    yield "its base", _base(case)
+    yield "inputs", f"{len(case.inputs)} files, {case.path}"
+    for warning in case.warnings:
+        yield "warning", warning
+
+
+def _base(case: Any) -> str:
+    if case.registration is not None:
+        return f"by registration of markers ({case.registration.method})"
+    if case.robot.transform is not None:
+        return f"by the stated transform {case.robot.transform}: no residuals"
+    return "not stated" if case.robot.T_base_ct_mount is None else "by a stated mount"

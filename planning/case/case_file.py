@@ -13,22 +13,27 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import Field, Strict, model_validator
 
 from puncture_twin.planning.base.text_names import unprintable_texts
-from puncture_twin.planning.case.sections.tool_section import ToolSection
-from puncture_twin.planning.case.tables.breathing_section import BreathingSection
-from puncture_twin.planning.case.tables.errors_section import ErrorsSection, RehearsalSection
-from puncture_twin.planning.case.tables.needle_section import NeedleSection, TargetSection, TissueSection
-from puncture_twin.planning.case.tables.place_section import PlaceSection
-from puncture_twin.planning.case.tables.registration_section import RegistrationSection
-from puncture_twin.planning.case.tables.robot_section import RobotSection
-from puncture_twin.planning.case.tables.search_section import RankingSection, SearchSection
-from puncture_twin.planning.case.tables.structures_section import (
+from puncture_twin.planning.case.tables import (
     MAX_LABEL_MAPS,
     MAX_STRUCTURES,
+    BreathingSection,
     CtSection,
+    ErrorsSection,
+    GantrySection,
+    NeedleSection,
+    ObstacleSection,
+    PlaceSection,
+    RankingSection,
+    RegistrationSection,
+    RehearsalSection,
+    RobotSection,
+    SearchSection,
     StructureSection,
     StructuresSection,
+    TargetSection,
+    TissueSection,
+    ToolSection,
 )
-from puncture_twin.planning.case.tables.surroundings_section import GantrySection, ObstacleSection
 from puncture_twin.planning.case.toml_types import CaseName, CaseSchema, Section, Text
 
 COUNT_KEY = "structures = N"

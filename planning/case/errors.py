@@ -17,9 +17,9 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case_file import CaseFile
-from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
-from puncture_twin.planning.case.tables.errors_section import ErrorsSection, RehearsalSection
+from puncture_twin.planning.case.named_files import CaseVolumes
+from puncture_twin.planning.case.tables import ErrorsSection, RehearsalSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 DEFAULT_READING_MM = 0.5

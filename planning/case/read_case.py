@@ -14,25 +14,14 @@ from puncture_twin.planning.base.provenance import CASE_ROLE, InputFiles
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.case import Case, view_frame
 from puncture_twin.planning.case.case_file import CaseFile
-from puncture_twin.planning.case.case_volumes import CaseVolumes
 from puncture_twin.planning.case.entry import entry_frame
 from puncture_twin.planning.case.errors import errors_of
-from puncture_twin.planning.case.named_files import read_named_files
+from puncture_twin.planning.case.named_files import CaseVolumes, read_named_files, robot_warnings
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions
-from puncture_twin.planning.case.sections.bend import bending_of
-from puncture_twin.planning.case.sections.breath import breathing_of
-from puncture_twin.planning.case.sections.robot import robot_of
-from puncture_twin.planning.case.sections.tool_section import tool_of
-from puncture_twin.planning.case.settings import (
-    Needle,
-    ct_of,
-    gantry_of,
-    obstacle_of,
-    search_of,
-)
-from puncture_twin.planning.case.tables.registration_section import MarkerSection
-from puncture_twin.planning.case.whole_case import robot_warnings
-from puncture_twin.planning.formats.points.point_files import parse_points
+from puncture_twin.planning.case.sections import bending_of, breathing_of, robot_of
+from puncture_twin.planning.case.settings import Needle, ct_of, gantry_of, obstacle_of, search_of
+from puncture_twin.planning.case.tables import MarkerSection, tool_of
+from puncture_twin.planning.formats.points import parse_points
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"

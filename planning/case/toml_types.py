@@ -20,7 +20,7 @@ from pydantic import (
 )
 
 from puncture_twin.planning.base.text_names import MAX_NAME
-from puncture_twin.planning.formats.joint_readings import plainly_radians
+from puncture_twin.planning.formats.points import plainly_radians
 
 
 def _plain_name(value: str) -> str:

@@ -1,9 +1,14 @@
-"""A certified map of a cap of directions, as a value and as a versioned file."""
+"""A certified map of a cap of directions, as a value and as a versioned file.
+
+How a certificate shows itself in a notebook.
+
+The safe cone of every safe candidate, as a column and a term of the ranking.
+"""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,9 +20,11 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.provenance import inputs_document, read_inputs
-from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason, Rgb
 from puncture_twin.planning.base.strict_json import (
     array,
     field,
@@ -30,10 +37,12 @@ from puncture_twin.planning.base.strict_json import (
     texts,
     whole,
 )
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
-from puncture_twin.planning.certify.html import certificate_html
 from puncture_twin.planning.certify.question import Question
+from puncture_twin.planning.search.candidates import CONE_CERTIFIED, Candidates
+from puncture_twin.planning.search.ranking import ranked
 
 CERTIFICATE_VERSION = 7
 """Version of the file's layout and of what a cell claims. 3: lists its inputs with their roles, files that a file names
@@ -72,7 +81,7 @@ TOUCH_CERTIFIED = "chance to touch each structure: at most {:g}"
 NOT_CERTIFIED = ("reach of the arm", "approach of the arm", "limits of chances (min_hit, max_touch)")
 """What a certificate says nothing about."""
 
-SAFE, REJECTED, UNDECIDED = "SRU"
+PROVED_SAFE, REJECTED, UNDECIDED = "SRU"
 """Letters of the leaves in the tree; lower-case letters are splits (`puncture_twin.planning.certify.cells.SPLITS`)."""
 
 
@@ -109,7 +118,7 @@ class Certificate:
 
     @brief
     def __repr__(self) -> str:
-        words = {SAFE: "safe for the organs", REJECTED: "rejected", UNDECIDED: "undecided"}
+        words = {PROVED_SAFE: "safe for the organs", REJECTED: "rejected", UNDECIDED: "undecided"}
         areas = ", ".join(f"{self.areas[letter]:.1f} square degrees {word}" for letter, word in words.items())
         return f"case {self.question.case_name}, {len(self.verdict):,} cells to {np.degrees(self.size):g} deg: {areas}"
 
@@ -121,7 +130,7 @@ class Certificate:
     def areas(self) -> dict[str, float]:
         """Verdict letter to area, square degrees."""
         area = self.leaves.solid_angle() * SQUARE_DEGREES
-        return {letter: float(area[self.verdict == letter].sum()) for letter in (SAFE, REJECTED, UNDECIDED)}
+        return {letter: float(area[self.verdict == letter].sum()) for letter in (PROVED_SAFE, REJECTED, UNDECIDED)}
 
     def fraction(self, letter: str) -> float | None:
         """Part of the cap's area with a verdict, 0..1; None for a cap without area."""
@@ -131,7 +140,7 @@ class Certificate:
     def at(self, theta: Floats, beta: Floats) -> NDArray[np.str_]:
         """Verdict letter at directions (n,) of the entry frame, rad; "" outside the cap."""
         found = np.full(len(theta), "", dtype="U1")
-        for letter in (UNDECIDED, REJECTED, SAFE):
+        for letter in (UNDECIDED, REJECTED, PROVED_SAFE):
             found[self._distance(theta, beta, self.verdict == letter) == 0] = letter
         return found
 
@@ -144,7 +153,7 @@ class Certificate:
             outward_ct: Shape (n, 3), unit vectors.
         """
         theta, beta = angles(outward_ct @ self.question.R_ct_entry)
-        free = self._distance(theta, beta, self.verdict != SAFE)
+        free = self._distance(theta, beta, self.verdict != PROVED_SAFE)
         return np.maximum(np.minimum(free, self._to_border(theta, beta)) - CONE_ROUNDING_RAD, 0.0)
 
     def _distance(self, theta: Floats, beta: Floats, which: NDArray[np.bool_]) -> Floats:
@@ -168,7 +177,7 @@ class Certificate:
         """The main numbers as plain values; degrees, square degrees."""
         areas, cells = (
             self.areas,
-            {letter: int((self.verdict == letter).sum()) for letter in (SAFE, REJECTED, UNDECIDED)},
+            {letter: int((self.verdict == letter).sum()) for letter in (PROVED_SAFE, REJECTED, UNDECIDED)},
         )
         touch = self.question.touch
         return {
@@ -176,12 +185,12 @@ class Certificate:
             "certified": [*CERTIFIED, *(() if touch is None else (TOUCH_CERTIFIED.format(touch),))],
             "not_certified": list(NOT_CERTIFIED),
             "touch": touch,
-            "safe_square_deg": areas[SAFE],
+            "safe_square_deg": areas[PROVED_SAFE],
             "rejected_square_deg": areas[REJECTED],
             "undecided_square_deg": areas[UNDECIDED],
-            "safe_share": self.fraction(SAFE),
+            "safe_share": self.fraction(PROVED_SAFE),
             "undecided_share": self.fraction(UNDECIDED),
-            "safe_cells": cells[SAFE],
+            "safe_cells": cells[PROVED_SAFE],
             "rejected_cells": cells[REJECTED],
             "undecided_cells": cells[UNDECIDED],
             "queries": self.queries,
@@ -329,3 +338,52 @@ def _question(document: dict[str, Any]) -> Question:
 def _range(values: Any) -> tuple[float, float]:
     low, high = map(number, values)
     return low, high
+
+
+UNDECIDED_COLOUR: Rgb = (255, 255, 255)
+"""Of cells that are too small to say: neither a safe colour nor a reason's."""
+
+
+@never_raises
+def certificate_html(certificate: Any) -> str:
+    """A table of facts, and the map of the cells: proven safe for the organs, rejected, undecided."""
+    title = f"Certificate of {certificate.question.case_name}"
+    return card(title, _facts(certificate), _map(certificate))
+
+
+def _facts(certificate: Any) -> Facts:
+    summary = certificate.summary()
+    for word in ("safe", "rejected", "undecided"):
+        text = "proven safe for the organs" if word == "safe" else word
+        yield text, f"{summary[f'{word}_square_deg']:.2f} deg², {summary[f'{word}_cells']:,} cells"
+    yield "cells are halved down to", f"{summary['size_deg']:g}°"
+    yield "holds all over a safe cell", "; ".join(summary["certified"])
+    yield "says nothing about", "; ".join(summary["not_certified"])
+
+
+def _map(certificate: Any) -> str:
+    reasons = list(REASON_COLOURS)
+    legend = [
+        Entry("proven safe for the organs", SAFE),
+        *(Entry(REASON_TEXT[reason], REASON_COLOURS[reason]) for reason in reasons),
+        Entry("undecided", UNDECIDED_COLOUR),
+    ]
+    number = {reason.value: row for row, reason in enumerate(reasons, start=1)}
+    letters = zip(certificate.verdict, certificate.reason, strict=True)
+    code = np.array([{"S": 0, "U": len(legend) - 1}.get(letter, number.get(str(why), 1)) for letter, why in letters])
+    beta = certificate.leaves.beta
+    shifted = beta - 2 * np.pi * np.floor(beta[:, :1] / (2 * np.pi))
+    return polar_map(Sectors(certificate.leaves.theta, shifted, code), legend)
+
+
+def with_safe_cone(case: Case, found: Candidates, certificate: Certificate) -> Candidates:
+    """The candidates with their safe cones, ranked again.
+
+    Args:
+        case: The case of both.
+        found: A search's result.
+        certificate: The case's certified map.
+    """
+    cone, rows = np.full(len(found), np.nan), np.flatnonzero(found.safe)
+    cone[rows] = certificate.safe_cone(found.outward_ct[rows])
+    return ranked(case, replace(found, safe_cone=cone, cone_source=CONE_CERTIFIED))

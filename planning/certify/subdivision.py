@@ -17,7 +17,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.certify.cells import OFF_CENTRE, Cells, Cones, split
-from puncture_twin.planning.certify.certificate import REJECTED, SAFE, UNDECIDED, Certificate
+from puncture_twin.planning.certify.certificate import PROVED_SAFE, REJECTED, UNDECIDED, Certificate
 from puncture_twin.planning.certify.cones import Lists, narrowed, zones
 from puncture_twin.planning.certify.near_organs import Organs, organ_facts
 from puncture_twin.planning.certify.question import Question, question_of
@@ -187,7 +187,7 @@ class _Evaluator:
             self._check_skin(verdicts, cells, cones, ~known.skin_good | _filled(state.organs[1])[state.parent])
         around = self._near(1, verdicts, cones, state, known.flange)
         clear = ~_filled(within) & ~_filled(around)
-        verdicts.letter[clear & known.skin_good & (verdicts.letter == UNDECIDED)] = SAFE
+        verdicts.letter[clear & known.skin_good & (verdicts.letter == UNDECIDED)] = PROVED_SAFE
         return replace(verdicts, state=replace(known, organs=(within, around)))
 
     def _near(self, part: int, verdicts: _Verdicts, cones: Cones, state: _State, lengths: Floats) -> Lists:

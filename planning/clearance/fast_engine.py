@@ -1,30 +1,42 @@
-"""The fast engine: exact distances of all needle axes at once, from surfaces packed once and placed about a target."""
+"""The fast engine: exact distances of all needle axes at once, from surfaces packed once and placed about a target.
+
+Directions in bundles: neighbours on the sphere share one walk through the tree.
+
+The order of each surface's triangles in its blocks, kept: to find it takes half of the time of packing.
+
+One surface as seen from one target.
+
+The faces of a structure near one needle axis: all that a small displacement of the needle can meet.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Arrays, Cache
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.processes import on_threads
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.clearance.block_orders import block_orders
-from puncture_twin.planning.clearance.direction_tiles import Tiles, bundle
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
-from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
+from puncture_twin.planning.clearance.kernels.blocks import Blocks, block_order, pack
+from puncture_twin.planning.clearance.kernels.displaced_axis import displaced_distances
 from puncture_twin.planning.clearance.kernels.lanes import LANES
+from puncture_twin.planning.clearance.kernels.near_blocks import blocks_near, spheres_around
+from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
 from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
-from puncture_twin.planning.clearance.near_faces import near_faces
-from puncture_twin.planning.clearance.placed_surface import PlacedSurface, placed_surface
+from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 FCL_BEYOND_MM = 1.0
@@ -208,3 +220,220 @@ def measure_structure(
         bundles, scratch_for(len(placed.nodes)), found, LANES,
     )  # fmt: skip
     distance[tiles.order], depth[tiles.order], nearest[tiles.order] = np.sqrt(found.square), found.depth, found.triangle
+
+
+TILE = 12
+"""Directions of a bundle at most."""
+
+WIDEST = 0.12
+"""Chord from a bundle's axis to its members above which it is divided: about 7 degrees."""
+
+LEAST_BUNDLES = 256
+"""A run of fewer bundles is not worth a piece of work of its own."""
+
+CHORD_SLACK = 1e-6
+"""More than float32 takes from a chord or a unit vector."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tiles:
+    """Directions in an order in which neighbours follow each other, cut into bundles.
+
+    Attributes:
+        order: Shape (n,), row of each direction in the caller's order.
+        outward: Shape (n, 3), unit vectors in the new order.
+        starts: Shape (t + 1,), where each bundle starts.
+        middle: Shape (t,), row in ``outward`` of the member amid each bundle: its axis.
+        chord: Shape (t,), largest |u - axis| of its members, rounded up.
+    """
+
+    order: NDArray[np.int64]
+    outward: Floats
+    starts: NDArray[np.int64]
+    middle: NDArray[np.int64]
+    chord: Floats
+
+    def parts(self, most: int) -> list[Tiles]:
+        """The same bundles in at most so many runs of about as many each, none below ``LEAST_BUNDLES``."""
+        count = max(1, min(most, len(self.middle) // LEAST_BUNDLES))
+        edges = np.linspace(0, len(self.middle), count + 1).astype(int)
+        return [self._run(low, high) for low, high in itertools.pairwise(edges)]
+
+    def _run(self, low: int, high: int) -> Tiles:
+        """Bundles ``low`` to ``high``."""
+        first = self.starts[low]
+        members = slice(first, self.starts[high])
+        starts, middle = self.starts[low : high + 1] - first, self.middle[low:high] - first
+        return Tiles(self.order[members], self.outward[members], starts, middle, self.chord[low:high])
+
+
+def bundle(outward: Floats) -> Tiles:
+    """Bundle directions, in any order and number, shape (n, 3), unit vectors."""
+    order = kd_order(outward, TILE)
+    sorted_outward = np.ascontiguousarray(outward[order], dtype=np.float64)
+    starts = _cut(sorted_outward, np.empty(len(outward) + 1, np.int64))
+    middle, chord = np.empty(len(starts) - 1, np.int64), np.empty(len(starts) - 1)
+    _axes(sorted_outward, starts, middle, chord)
+    return Tiles(order, sorted_outward, starts, middle, chord)
+
+
+@nb.njit(cache=True)
+def _cut(outward, starts):  # type: ignore[no-untyped-def]  # numba infers
+    """Runs of TILE directions, ended early where the next one is too far from the run's first."""
+    count, first = 0, 0
+    starts[0] = 0
+    for i in range(1, len(outward)):
+        if i % TILE == 0 or _square_between(outward, i, first) > WIDEST * WIDEST:
+            count += 1
+            first = i
+            starts[count] = i
+    count += 1 if len(outward) else 0
+    starts[count] = len(outward)
+    return starts[: count + 1].copy()
+
+
+@nb.njit(cache=True)
+def _axes(outward, starts, middle, chord):  # type: ignore[no-untyped-def]  # numba infers
+    """The member nearest to the mean of each bundle, and the widest chord from it."""
+    for tile in range(len(middle)):
+        x, y, z = 0.0, 0.0, 0.0
+        for i in range(starts[tile], starts[tile + 1]):
+            x, y, z = x + outward[i, 0], y + outward[i, 1], z + outward[i, 2]
+        middle[tile], most = starts[tile], -np.inf
+        for i in range(starts[tile], starts[tile + 1]):
+            along = outward[i, 0] * x + outward[i, 1] * y + outward[i, 2] * z
+            if along > most:
+                middle[tile], most = i, along
+        widest = 0.0
+        for i in range(starts[tile], starts[tile + 1]):
+            widest = max(widest, _square_between(outward, i, middle[tile]))
+        chord[tile] = np.sqrt(widest) * (1 + CHORD_SLACK) + CHORD_SLACK
+
+
+@nb.njit(cache=True)
+def _square_between(outward, i, k):  # type: ignore[no-untyped-def]  # numba infers
+    """Square of the chord between two directions."""
+    x, y, z = outward[i, 0] - outward[k, 0], outward[i, 1] - outward[k, 1], outward[i, 2] - outward[k, 2]
+    return x * x + y * y + z * z
+
+
+Order = NDArray[np.int32]
+
+
+def block_orders(meshes: Sequence[TriangleMesh], cache: Cache, threads: int) -> tuple[Order, ...]:
+    """`block_order` of each surface, from the cache where all of them are there.
+
+    The blocks themselves are not kept: they are thirty times as large, and filled sooner than read.
+
+    Args:
+        meshes: The surfaces.
+        cache: Where the orders are kept, one entry for all.
+        threads: How many are found side by side.
+    """
+    made_from = {"what": "block orders", "meshes": [mesh.digest for mesh in meshes]}
+    make = partial(_found, meshes, threads)
+    return cache.value(made_from, make, partial(_of_each, [len(mesh.faces) for mesh in meshes]), by=__name__)
+
+
+def _found(meshes: Sequence[TriangleMesh], threads: int) -> Arrays:
+    orders: dict[int, Order] = {}
+
+    def work(k: int) -> None:
+        orders[k] = block_order(meshes[k])
+
+    for _ in on_threads(work, len(meshes), threads):
+        pass
+    return {"orders": np.concatenate([np.empty(0, np.int32), *(orders[k] for k in range(len(meshes)))])}
+
+
+def _of_each(counts: Sequence[int], stored: Arrays) -> tuple[Order, ...]:
+    """The order of each surface.
+
+    Raises:
+        KeyError, TypeError, ValueError: One leaves out a triangle, which the search would never see then.
+    """
+    orders = stored["orders"]
+    if orders.dtype != np.int32 or orders.shape != (sum(counts),):
+        raise TypeError("orders of other surfaces")
+    each = np.split(orders, np.cumsum(counts)[:-1])
+    for order, count in zip(each, counts, strict=True):
+        found = np.zeros(count, np.bool_)
+        if count and (order.min() < 0 or order.max() >= count):
+            raise ValueError("no triangle of the surface")
+        found[order] = True
+        if not found.all():
+            raise ValueError("a triangle is left out")
+    return tuple(each)
+
+
+COORDINATE_SLACK = 1e-6
+"""Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSurface:
+    """One surface as seen from one target: the nodes of `bounds.disc_bounds`, and the target's own distance."""
+
+    nodes: NDArray[np.float32]
+    slack: float
+    distance: float
+    nearest: int
+
+
+def placed_surface(blocks: Blocks, target: Floats) -> PlacedSurface:
+    """A surface as seen from a target."""
+    nodes = np.empty((10, len(blocks.center)), np.float32)
+    nodes[:3] = (blocks.center - target).T
+    nodes[3:8] = blocks.disc
+    nodes[8] = np.hypot(nodes[6], nodes[7]) * np.float32(1 + 1e-6)
+    away = np.sqrt(nodes[0] ** 2 + nodes[1] ** 2 + nodes[2] ** 2)
+    nodes[9] = (away + nodes[8]) * np.float32(1 + 1e-6)
+    slack = COORDINATE_SLACK * float(nodes[9][: len(blocks.local)].max())
+    grouped = np.ascontiguousarray(nodes.reshape(10, -1, LANES).transpose(1, 0, 2))
+    distance, nearest = nearest_triangle(blocks.triangles, grouped, blocks.base, target, slack)
+    return PlacedSurface(grouped, slack, distance, nearest)
+
+
+@dataclass(frozen=True, eq=False)
+class NearFaces:
+    """Faces of one structure, and spheres around them; CT frame, mm.
+
+    Attributes:
+        triangles: Shape (m, 9), corners, in blocks of 16, those that may be nearest first.
+        faces: Shape (m, 4), a sphere around each: centre, radius.
+        blocks: Shape (m / 16, 4), around each 16.
+    """
+
+    triangles: Floats
+    faces: Floats
+    blocks: Floats
+
+    def __len__(self) -> int:
+        return len(self.triangles)
+
+    def distance(self, origins_ct: Floats, outward_ct: Floats, length: float) -> Floats:
+        """Of axes from ``origins_ct`` (n, 3) along ``outward_ct`` (n, 3) from these faces, shape (n,), mm."""
+        found = np.empty(len(origins_ct))
+        origins, outward = (np.ascontiguousarray(rows, dtype=np.float64) for rows in (origins_ct, outward_ct))
+        displaced_distances(self.triangles, self.faces, self.blocks, origins, outward, float(length), found)
+        return found
+
+
+def near_faces(
+    blocks: Blocks, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]
+) -> NearFaces:
+    """All faces within reach of an axis, and some beyond.
+
+    Args:
+        blocks: The packed surface.
+        origin_ct: Shape (3,), where the axis starts.
+        outward_ct: Shape (3,), unit.
+        length: Of the axis, mm.
+        reach: At its start and at its end, mm; linear in between.
+    """
+    rows, bounds = blocks_near(blocks.center, blocks.disc, len(blocks.local), origin_ct, outward_ct, length, reach)
+    order = rows[np.argsort(bounds, kind="stable")]
+    triangles = blocks.triangles[(order[:, None] * LANES + np.arange(LANES)).ravel()]
+    faces, groups = np.empty((len(triangles), 4)), np.empty((len(order), 4))
+    spheres_around(triangles, faces, groups)
+    return NearFaces(triangles, faces, groups)

@@ -19,20 +19,21 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import Link, collision_links
-from puncture_twin.planning.arm.model_urdf import model_urdf
+from puncture_twin.planning.arm.links import Link, collision_links, model_urdf
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.base_place import refuse_base_in
-from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.body import NEVER_TESTED, NEVER_TOUCHING, Body
-from puncture_twin.planning.collision.bodies.shapes import convex, surface
-from puncture_twin.planning.collision.bodies.solid import Solid
-from puncture_twin.planning.collision.check import Check
-from puncture_twin.planning.collision.hanging import check_hanging
-from puncture_twin.planning.collision.patient import FclPatient, FclSkin
+from puncture_twin.planning.collision.bodies import (
+    NEVER_TESTED,
+    NEVER_TOUCHING,
+    Body,
+    Solid,
+    arm_bodies,
+    convex,
+    surface,
+)
+from puncture_twin.planning.collision.patient import Check, FclPatient, FclSkin, check_hanging, refuse_base_in
 from puncture_twin.planning.collision.state_checker import (
     DISTANCE_PAIRS,
     NEEDLE_IN_PATIENT,
@@ -41,9 +42,9 @@ from puncture_twin.planning.collision.state_checker import (
     Distances,
     FirstContact,
     Nearest,
+    SweptBodies,
     require_finite,
 )
-from puncture_twin.planning.collision.sweep import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
 

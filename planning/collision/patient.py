@@ -1,7 +1,15 @@
-"""The patient as FCL is asked about it: the skin and what else the CT shows, in parts that are made when needed."""
+"""The patient as FCL is asked about it: the skin and what else the CT shows, in parts that are made when needed.
+
+One question to FCL, and its answer.
+
+The robot's base must not stand in the patient.
+
+Whether a tool of the user's own hangs on the arm: one that floats could lie wholly in the patient, unseen.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -9,13 +17,24 @@ import fcl
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
+from puncture_twin.planning.arm.links import collision_links
+from puncture_twin.planning.arm.tool import ToolBody
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.bodies.body import Body
-from puncture_twin.planning.collision.bodies.shapes import surface, touch
-from puncture_twin.planning.collision.bodies.solid import Solid
-from puncture_twin.planning.collision.loose_parts import LooseParts, within
-from puncture_twin.planning.collision.state_checker import PATIENT
+from puncture_twin.planning.collision.bodies import (
+    FLANGE_FRAME,
+    Body,
+    LooseParts,
+    Solid,
+    convex,
+    padded,
+    surface,
+    touch,
+    within,
+)
+from puncture_twin.planning.collision.state_checker import PATIENT, Contact
+from puncture_twin.planning.geometry.containment import Side, side_of, winding_number
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of
 
@@ -131,3 +150,112 @@ def _bounds_at(pose: fcl.Transform, box: Floats) -> tuple[Floats, Floats]:
     centre = R @ (0.5 * (box[0] + box[1])) + pose.getTranslation()
     reach = np.abs(R) @ (0.5 * (box[1] - box[0])) + ROUNDING_MM
     return centre - reach, centre + reach
+
+
+class Check(NamedTuple):
+    """One question to FCL: do two shapes touch."""
+
+    contact: Contact
+    """What it means if they do."""
+    first: Solid | FclPatient
+    """The patient, a box, or a piece of a body."""
+    second: Solid
+    first_body: Body | None
+    """The body that ``first`` moves with; None for skin and boxes."""
+    second_body: Body
+    hulls: tuple[Floats | None, Floats] | None
+    """Corners that enclose either, in the frames of their shapes; None for a box, and for the pair with the skin."""
+
+    @property
+    def before_last_joint(self) -> bool:
+        """Whether it is of two bodies of the arm neither of which moves with the last joint."""
+        return self.first_body is not None and max(self.first_body.frame, self.second_body.frame) < FLANGE_FRAME
+
+    def contact_at(self, frames: Floats) -> Contact | None:
+        """The contact, if the two shapes touch where ``link_poses`` (7, 4, 4) has them; see `contact_found`."""
+        self.second.place(self.second_body.pose(frames))
+        if self.first_body is not None:
+            assert not isinstance(self.first, FclPatient)  # it belongs to no body
+            self.first.place(self.first_body.pose(frames))
+        return self.contact_found()
+
+    def contact_found(self) -> Contact | None:
+        """The contact, if the two shapes touch where they are: ``outside_body`` where that is all of the patient."""
+        if not isinstance(self.first, FclPatient):
+            return self.contact if touch(self.first.made, self.second.made) else None
+        part = self.first.touched_part(self.second_body)
+        return None if part is None else self.contact._replace(other=part)
+
+
+class BaseInPatientError(InputError):
+    """The robot's base stands where the patient is, or their table."""
+
+
+def refuse_base_in(
+    model: UrModel, base: Body, placed: FclPatient, patient: TriangleMesh, surface: TriangleMesh
+) -> None:
+    """Refuse a base that stands in the patient, or in what the CT shows outside of the body.
+
+    Args:
+        model: The arm.
+        base: Its first body.
+        placed: Both surfaces for FCL.
+        patient: The skin, base frame, mm.
+        surface: The skin, and behind it what the CT shows besides, likewise; the same where that is nothing.
+
+    Raises:
+        BaseInPatientError: It does.
+    """
+    centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
+    met = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
+    if met or _encloses(patient, centre):
+        what = "the robot's base stands in the patient"
+        raise BaseInPatientError(what, where="workcell", allowed="a base outside the skin")
+    if surface is not patient and _encloses(surface, centre):
+        what = "the robot's base stands in what is not known to be free: the table that a CT shows, or beyond its end"
+        allowed = 'a base outside of it; where no body lies there, [ct] arms = "none" or beyond_mm'
+        raise BaseInPatientError(what, where="workcell", allowed=allowed, code="base_in_unseen")
+
+
+def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
+    """Whether a point lies inside a surface; more than half around an open one counts too."""
+    low, high = mesh.bounds
+    if not np.all((point >= low) & (point <= high)) and abs(winding_number(mesh, point)) <= 0.5:
+        return False  # outside, or an open surface that goes less than half around: whether it is open need not be told
+    side = side_of(mesh, point)
+    return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
+
+
+APART_MM = 1.0
+"""What a mesh may leave between its parts, or to the flange: less than a gap through which a surface could pass."""
+
+CARRIERS = ("wrist_3", "holder", "needle")
+"""What a tool is bolted to."""
+
+
+def check_hanging(tool: ToolBody, bodies: Sequence[Body]) -> None:
+    """Refuse a tool of which a part touches neither wrist, holder nor needle, nor a part that does.
+
+    Args:
+        tool: The tool.
+        bodies: Of the arm; those of the flange all move with one frame.
+
+    Raises:
+        InputError: Says how large the tool is and where it lies.
+    """
+    free = [fcl.CollisionObject(convex(padded(piece, APART_MM))) for piece in tool.pieces]
+    carriers = [body for body in bodies if body.name in CARRIERS]
+    hanging: list[fcl.CollisionObject] = []
+    for body in carriers:
+        for solid in body.bare.solids:
+            solid.place(fcl.Transform(body.T_frame_body[:3, :3], body.T_frame_body[:3, 3]))
+            hanging.append(solid.made)
+    while hanging and free:
+        one = hanging.pop()
+        hanging += [piece for piece in free if touch(one, piece)]
+        free = [piece for piece in free if piece not in hanging]
+    if free:
+        low, high = tool.mesh.bounds
+        span = " by ".join(f"{a:.4g}..{b:.4g}" for a, b in zip(low, high, strict=True))
+        what = f"the tool ({span} mm in the flange's frame) does not hang on wrist, holder or needle"
+        raise InputError(what, where=tool.key, allowed="a body that touches them: see unit, position_mm, rotation_deg")

@@ -1,21 +1,29 @@
-"""The workcell of a case for the arm: the needle on its flange, the patient, what stands around it, where it waits."""
+"""The workcell of a case for the arm: the needle on its flange, the patient, what stands around it, where it waits.
+
+What a case file says stands about the patient: obstacles and gantry, as boxes for the arm and solids for the needle.
+
+They are solids for the needle too: it is checked against them with and without an arm.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.structure import Role
-from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.arm.tool import Box, Tool, gantry_boxes
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.collision.base_place import BaseInPatientError
+from puncture_twin.planning.case.settings import Gantry, Obstacle
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.surroundings import case_boxes, check_gantry
-from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.collision.patient import BaseInPatientError
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box, joined
+from puncture_twin.planning.geometry.rigid import apply, pose
 
 ARM_PADDING_MM = 5.0
 """The arm keeps this distance from all around it: more than the registration's error, and enough to prove the path
@@ -96,3 +104,133 @@ def home_configuration(case: Case) -> Floats:
         what = f"robot.home_deg: home ({', '.join(f'{angle:g}' for angle in np.degrees(home))}) is beyond the limits"
         raise InputError(what, where=case.path, allowed="home_deg within the arm's limits")
     return home
+
+
+GANTRY = "gantry"
+OF_CASE_FILE = "case file"
+"""Source of the solids that the case file describes."""
+
+NOWHERE = (
+    'obstacles of the frame "base" are not checked, since the case does not say where the robot\'s base is: {names}'
+)
+
+
+def case_boxes(case: Case, T_base_ct: Floats) -> tuple[Box, ...]:
+    """The obstacles and the gantry, in the base frame; the gantry's boxes are called ``gantry_0`` ..."""
+    boxes = tuple(_box(obstacle, T_base_ct) for obstacle in case.obstacles)
+    return boxes if case.gantry is None else (*boxes, *_gantry_boxes(case.gantry, T_base_ct))
+
+
+def gantry_in_ct(gantry: Gantry) -> tuple[Box, ...]:
+    """The gantry's boxes in the CT frame, which stands in for their base frame."""
+    return _gantry_boxes(gantry, np.eye(4))
+
+
+def _gantry_boxes(gantry: Gantry, T_base_ct: Floats) -> tuple[Box, ...]:
+    return gantry_boxes(
+        T_base_ct @ gantry.T_ct_gantry,
+        bore_diameter_mm=gantry.bore_diameter_mm,
+        wall_mm=gantry.wall_mm,
+        depth_mm=gantry.thickness_mm,
+    )
+
+
+def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
+    """How far the skin reaches outward of the bore within the gantry's thickness; 0 where it does nowhere.
+
+    Decided about is each whole triangle and the round bore: the wall, and all that lies outward of it, is what is
+    farther from the axis than the bore's radius between the two planes of its faces. The distance from the axis is a
+    convex function, so of the part of a triangle between the planes a corner is farthest: a vertex, or where an edge
+    passes through a plane. A body that is in the wall anywhere has skin there or farther outward, also where the wall
+    lies wholly inside of it, and where the skin is open only its surface counts.
+
+    The checkers' boxes leave a bore up to 0.9 % narrower: a patient who fits the round one is not refused for that.
+
+    Args:
+        gantry: The wall.
+        skin: CT frame.
+
+    Returns:
+        mm, along the bore's radius.
+    """
+    at = apply(np.linalg.inv(gantry.T_ct_gantry), skin.vertices)
+    bore, half = gantry.bore_diameter_mm / 2, gantry.thickness_mm / 2
+    corners = at[skin.faces[(np.hypot(at[:, 0], at[:, 1])[skin.faces] > bore).any(axis=1)]]
+    start, end = corners.reshape(-1, 3), np.roll(corners, 1, axis=1).reshape(-1, 3)
+    between = [start[np.abs(start[:, 2]) <= half], *(_crossings(start, end, z) for z in (-half, half))]
+    far = np.concatenate(between)
+    return max(0.0, float(np.hypot(far[:, 0], far[:, 1]).max(initial=0.0)) - bore)
+
+
+def _crossings(start: Floats, end: Floats, z: float) -> Floats:
+    """Where segments between points (n, 3) pass through the plane of a height, shape (m, 3)."""
+    passing = (start[:, 2] < z) != (end[:, 2] < z)
+    a, b = start[passing], end[passing]
+    return np.asarray(a + ((z - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a))
+
+
+def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
+    T = pose(np.eye(3), obstacle.center_mm)
+    T_base_box = T if obstacle.frame == "base" else T_base_ct @ T
+    x, y, z = obstacle.size_mm
+    return Box(obstacle.name, T_base_box, (float(x), float(y), float(z)))
+
+
+def check_gantry(case: Case, skin: TriangleMesh) -> None:
+    """Refuse a gantry that does not go around the patient.
+
+    The skin alone is held against it. What the CT shows outside of the skin is not: a bed goes through the bore, and
+    beyond the image its surface goes on by assumption.
+
+    Args:
+        case: The case.
+        skin: CT frame.
+
+    Raises:
+        InputError: Its wall cuts the patient.
+    """
+    deep = 0.0 if case.gantry is None else gantry_in_patient_mm(case.gantry, skin)
+    if deep > 0.0:
+        what = f"the gantry's wall stands {np.ceil(10 * deep) / 10:g} mm in the patient"
+        raise InputError(what, where=f"{case.path}: gantry", allowed="a bore about the body: see center_mm, tilt_deg")
+
+
+def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) -> Anatomy:
+    """The anatomy with the case's obstacles and gantry beside what the CT shows outside of the body.
+
+    Raises:
+        InputError: An obstacle has the name of a structure, or the gantry's wall stands in the patient.
+    """
+    check_gantry(case, anatomy.skin.mesh)
+    solids = surroundings(case, T_base_ct)
+    taken = {structure.name for structure in anatomy.checked}
+    for solid in solids:
+        if solid.name in taken:
+            what = f"obstacle '{solid.name}' has the name of a structure"
+            raise InputError(what, where=case.path, allowed="a name of its own")
+    nowhere = [obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"] if T_base_ct is None else []
+    warnings = (*anatomy.warnings, *([NOWHERE.format(names=", ".join(nowhere))] if nowhere else []))
+    return replace(anatomy, surroundings=anatomy.surroundings + solids, warnings=warnings)
+
+
+def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
+    """Obstacles and gantry as structures of role ``avoid`` without a margin, CT frame.
+
+    Args:
+        case: The case.
+        T_base_ct: Shape (4, 4); None where nothing says where the arm is: obstacles of the frame ``base`` are then
+            nowhere, and are left out.
+    """
+    T = np.eye(4) if T_base_ct is None else T_base_ct
+    fixed = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "ct" or T_base_ct is not None}
+    boxes = [one for one in case_boxes(case, T) if one.name in fixed]
+    T_ct_base = np.asarray(np.linalg.inv(T), dtype=np.float64)
+    structures = [_structure(one.name, box(T_ct_base @ one.T_base_box, one.size_mm)) for one in boxes]
+    if case.gantry is not None:
+        wall = [box(one.T_base_box, one.size_mm) for one in gantry_in_ct(case.gantry)]
+        structures.append(_structure(GANTRY, joined(wall)))
+    return tuple(structures)
+
+
+def _structure(name: str, mesh: TriangleMesh) -> Structure:
+    return Structure(name, Role.AVOID, 0.0, mesh, OF_CASE_FILE, True, np.zeros((3, 3)))  # as stated

@@ -20,18 +20,25 @@ from puncture_twin.planning.collision_cases.checks_file import (
     PlanSection,
     WindowSection,
     read_checks,
+    table_lines,
 )
-from puncture_twin.planning.collision_cases.finding import Difference, Finding, NewNumber
-from puncture_twin.planning.collision_cases.pytest_run import ARM_PROPERTY, UPDATE, updating
-from puncture_twin.planning.collision_cases.rewrite import Change
-from puncture_twin.planning.collision_cases.session import Session, session_of
-from puncture_twin.planning.collision_cases.table_lines import table_lines
+from puncture_twin.planning.collision_cases.session import (
+    ARM_PROPERTY,
+    UPDATE,
+    Change,
+    Difference,
+    Finding,
+    NewNumber,
+    Session,
+    session_of,
+    updating,
+)
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, reason_text
-from puncture_twin.planning.search.selection.windows import Windows, find_windows, nearest_row
+from puncture_twin.planning.search.windows import Windows, find_windows, nearest_row
 
 DIGIT = 0.1
 """Of a tolerance: a rewritten number keeps the rest of it."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from puncture_twin.planning.collision_cases.pytest_run import add_flag, arm_notes, updating
+from puncture_twin.planning.collision_cases.session import add_flag, arm_notes, updating
 
 if TYPE_CHECKING:
     from puncture_twin.planning.search.explain import Explanation

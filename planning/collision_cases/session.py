@@ -1,14 +1,29 @@
-"""What one run of pytest keeps: cases that were read, their searches, and numbers that are to be rewritten."""
+"""What one run of pytest keeps: cases that were read, their searches, and numbers that are to be rewritten.
+
+What the plugin asks of a run of pytest, and what it says at its end: light, since every run wants it.
+
+A green run must not be read as if arms had been checked, where they were not.
+
+New numbers in a file that people wrote: its comments, order and spaces stay.
+
+What a case was found to be, against what a file expects, and the number that a file would have to expect.
+"""
 
 from __future__ import annotations
 
+import tomllib
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Decimal
 from pathlib import Path
+from typing import Any
 
 import pytest
+import tomlkit
 
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision_cases.rewrite import Change, rewrite
+from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext, prepare
 
@@ -73,3 +88,184 @@ def write_changes(config: pytest.Config) -> bool:
 def rewritten_lines(config: pytest.Config) -> list[str]:
     """What was rewritten, one line a number."""
     return session_of(config).lines
+
+
+ARM_PROPERTY = "arm"
+"""Of a test's report: it comes back from other processes too, and into JUnit's file."""
+
+CHECKED = "checked"
+
+UPDATE = "--collision-update"
+SEVERAL = f"{UPDATE} rewrites files: run it in one process, without -n"
+
+
+def arm_notes(reports: Iterable[object]) -> list[str]:
+    """A line for each case and reason for which an arm was not checked; none where it always was.
+
+    Args:
+        reports: Of pytest; only what it calls the call of a test is counted.
+    """
+    notes: Counter[str] = Counter()
+    for report in reports:
+        if getattr(report, "when", "") == "call":
+            properties = dict(getattr(report, "user_properties", ()))
+            if properties.get(ARM_PROPERTY, CHECKED) != CHECKED:
+                notes[f"{properties['case']}: arm {properties[ARM_PROPERTY]}"] += 1
+    return [f"{line} ({count} test{'s' if count != 1 else ''})" for line, count in notes.items()]
+
+
+def add_flag(parser: pytest.Parser) -> None:
+    """Tell pytest of it."""
+    text = "rewrite the numbers that *.collision.toml files expect; never a verdict"
+    parser.getgroup("collision").addoption(UPDATE, action="store_true", help=text)
+
+
+def updating(config: pytest.Config) -> bool:
+    """Whether numbers are to be rewritten.
+
+    Raises:
+        UsageError: By several processes at once.
+    """
+    wanted = bool(config.getoption(UPDATE))
+    if wanted and config.getoption("numprocesses", None):
+        raise pytest.UsageError(SEVERAL)
+    return wanted
+
+
+@dataclass(frozen=True)
+class Change:
+    """A number of one table.
+
+    Attributes:
+        kind: The array of the table, such as ``check``.
+        at: Its number in the array, from 0 on.
+        test: Its name, for a person.
+        number: What is to be written.
+    """
+
+    kind: str
+    at: int
+    test: str
+    number: NewNumber
+
+
+def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
+    """Rewrite a file, whole or not at all.
+
+    Args:
+        path: The file.
+        data: What it held when it was read.
+        changes: The numbers.
+
+    Returns:
+        One line a number: where, old and new.
+
+    Raises:
+        InputError: The file is another one by now, or cannot be written.
+    """
+    path = path.resolve()
+    if path.read_bytes() != data:
+        raise InputError("changed while the tests ran", where=path, allowed="the same file; run again")
+    text, lines = _rewritten(data.decode("utf-8"), path, changes)
+    with atomic(path) as draft:
+        draft.write_bytes(text.encode("utf-8"))
+    return lines
+
+
+def _rewritten(text: str, path: Path, changes: Sequence[Change]) -> tuple[str, list[str]]:
+    document, expected, lines = tomlkit.parse(text), tomllib.loads(text), []
+    for change in changes:
+        tables: tuple[str | int, ...] = (change.kind, change.at, *change.number.keys[:-1])
+        key = change.number.keys[-1]
+        old = _at(document, tables)[key].as_string()
+        new = change.number.written(old)
+        _at(document, tables)[key] = tomlkit.value(new)
+        _at(expected, tables)[key] = tomllib.loads(f"x = {new}")["x"]
+        weaker = " (a weaker demand)" if change.number.is_limit else ""
+        lines.append(f"{path.name}: {change.test}: {'.'.join(change.number.keys)} {old} -> {new}{weaker}")
+    written = tomlkit.dumps(document)
+    if tomllib.loads(written) != expected:
+        raise InputError("cannot be rewritten without changing more", where=path, allowed="the numbers by hand")
+    return written, lines
+
+
+def _at(document: Any, keys: Sequence[str | int]) -> Any:
+    for key in keys:
+        document = document[key]
+    return document
+
+
+MOST_DECIMALS = 17
+"""More than a double has."""
+
+MOST_LINES, MOST_DIFFERENCES, MOST_CHARACTERS = 15, 6, 300
+"""Of a failure: more is not read. Of its lines that say what differs; and of a line."""
+
+
+@dataclass(frozen=True)
+class NewNumber:
+    """What was found for a key.
+
+    Attributes:
+        keys: From the table inward.
+        value: As computed.
+        within: By how much the written number may differ.
+        rounding: `ROUND_FLOOR` for a least value, `ROUND_CEILING` for a largest one: what is written must be satisfied.
+    """
+
+    keys: tuple[str, ...]
+    value: float
+    within: float
+    rounding: str = ROUND_HALF_EVEN
+
+    @property
+    def is_limit(self) -> bool:
+        """Whether it is a bound that a person demands, which a rewrite makes weaker."""
+        return self.rounding in {ROUND_FLOOR, ROUND_CEILING}
+
+    def written(self, old: str) -> str:
+        """The number as text, with the old text's decimals, or with as many as it needs."""
+        exact = Decimal(repr(self.value))
+        for decimals in range(len(old.partition(".")[2]) if "e" not in old.lower() else 0, MOST_DECIMALS):
+            rounded = exact.quantize(Decimal(1).scaleb(-decimals), rounding=self.rounding)
+            if abs(rounded - exact) <= Decimal(repr(self.within)):
+                return f"{rounded:f}"
+        return repr(self.value)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One thing that is not as expected.
+
+    Attributes:
+        line: What a person reads.
+        number: What the file would have to expect; None where only a person may change it.
+    """
+
+    line: str
+    number: NewNumber | None = None
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one test.
+
+    Attributes:
+        differences: None where everything is as expected.
+        detail: Lines for a person, the most telling first.
+        last: How to see all of it; "" where nothing shows more.
+    """
+
+    differences: tuple[Difference, ...] = ()
+    detail: tuple[str, ...] = ()
+    last: str = ""
+
+    def text(self, why: str) -> str:
+        """What differs, why it was expected, and what was found, in `MOST_LINES` lines."""
+        lines = [difference.line for difference in self.differences]
+        if len(lines) > MOST_DIFFERENCES:
+            lines[MOST_DIFFERENCES - 1 :] = [f"and {len(lines) - MOST_DIFFERENCES + 1} more that differ"]
+        lines += [f"why: {why}"] if why.strip() else []
+        last = [self.last] if self.last else []
+        lines += [*self.detail[: MOST_LINES - len(lines) - len(last)], *last]
+        return "\n".join(line if len(line) <= MOST_CHARACTERS else one_line(line, MOST_CHARACTERS) for line in lines)

@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
-from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 
 HU_RANGE = (-200.0, 400.0)
 """What lies beyond counts as its end: air against skin or the core of a bone must not outweigh an organ's edge."""

@@ -16,7 +16,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.geometry.crossings import settled_crossings
+from puncture_twin.planning.geometry.containment import settled_crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 

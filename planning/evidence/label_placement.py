@@ -49,8 +49,7 @@ from puncture_twin.planning.evidence.edges import (
     turns,
 )
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of
-from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.rotations import log_rotation
+from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.planning.geometry.spaces import Space
 
 REFUSING_Z = 6.0

@@ -15,11 +15,9 @@ from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.geometry.containment import Side, holds, side_of
-from puncture_twin.planning.geometry.spaces import Space, point_text, to_lps
+from puncture_twin.planning.geometry.containment import Side, holds, odd_fraction, side_of, winding_number
+from puncture_twin.planning.geometry.spaces import Space, Unit, point_text, to_lps
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
-from puncture_twin.planning.geometry.units import Unit
-from puncture_twin.planning.geometry.winding import odd_fraction, winding_number
 
 UNNAMED = frozenset((None, "phantom"))
 """Regions in which structures have any name."""

@@ -19,11 +19,9 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.collision.state_checker import StateChecker
-from puncture_twin.planning.export.motion import SampledMotion, check_sampled
-from puncture_twin.planning.export.program import program_of, waypoint_rows
+from puncture_twin.planning.export.program import SampledMotion, check_sampled, heading, program_of, waypoint_rows
 from puncture_twin.planning.export.program_check import check_program
 from puncture_twin.planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
-from puncture_twin.planning.export.text import heading
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
 from puncture_twin.planning.motion.path_check import MAX_SWEEP_MM
 from puncture_twin.planning.motion.trajectory import Trajectory

@@ -4,13 +4,26 @@ The approach is the plan's own way: its straight joint segments from rest to res
 waypoints, so the waypoints are found again in the samples. A smooth approach has no rests, and is streamed instead.
 The insertion is one ``movel``: the plan's tip runs straight at one orientation, and so does this move, on the one
 branch that leads on from the standoff without a jump.
+
+What a file of samples says: both phases over time. And whether that is what the plan says.
+
+The exported numbers against the arm's limits: positions, speeds and accelerations.
+
+The waypoints of a joint path, found again in its samples.
+
+Words and numbers in exported files: nothing that a plan names can leave its comment or its string.
 """
 
 from __future__ import annotations
 
 import math
+import string
+import textwrap
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +34,10 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.export.corners import STRAIGHT_RAD, corner_rows, rests_at
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import POSE_TOLERANCE_MM
+from puncture_twin.planning.plan.plan_document import PLAN_VERSION
 
 STREAM_S = SAMPLE_S
 """Period of a streamed approach: that of a CB3 controller, and four of an e-Series one."""
@@ -211,3 +224,265 @@ def _trapezoid(length: float, speed: float, acceleration: float) -> tuple[Floats
     travelled = acceleration * early**2 / 2 + speed * (times - early) - acceleration * late**2 / 2
     travelled[-1] = length
     return times, travelled
+
+
+ANGLE_TOLERANCE_RAD = 1e-9
+"""How far an angle that was read back may be from the plan's."""
+
+TIME_TOLERANCE_S = 1e-9
+"""How far a time that was read back may be from the plan's: ROS counts nanoseconds, which is half of one at most."""
+
+
+class SampledMotion(NamedTuple):
+    """Both phases as samples, each from time 0."""
+
+    approach: Trajectory
+    insertion: Trajectory
+
+
+def check_sampled(motion: SampledMotion, plan: Plan, *, time_resolution_s: float, where: Path) -> None:
+    """Refuse samples that are not the plan's, or that break a limit.
+
+    Args:
+        motion: What was read back.
+        plan: What was exported.
+        time_resolution_s: To what the format rounds times; 0 for exact ones.
+        where: The plan's file.
+
+    Raises:
+        InputError: Says what differs or which limit is broken.
+    """
+    for name in SampledMotion._fields:
+        read, planned = getattr(motion, name), getattr(plan, name)
+        same = (
+            read.q.shape == planned.q.shape
+            and np.abs(read.q - planned.q).max() <= ANGLE_TOLERANCE_RAD
+            and np.abs(read.times_s - planned.times_s).max() <= TIME_TOLERANCE_S
+        )
+        if not same:
+            raise InputError(f"the {name} does not read back as the plan's", where=where, allowed="the plan's samples")
+        check_trajectory(plan.model, read, time_resolution_s=time_resolution_s, what=name, where=where)
+
+
+POSITION_SLACK_RAD = 1e-9
+"""A printed angle may round beyond its limit by this."""
+
+RELATIVE_SLACK = 1e-6
+"""Rounding of printed speeds and of differences, as a fraction of the limit."""
+
+ROUNDINGS = 8.0
+"""Differences of differences of angles carry at most this many roundings of one angle."""
+
+
+def check_positions(model: UrModel, q: Floats, *, what: str, where: Path) -> None:
+    """Refuse angles outside the joints' limits.
+
+    Args:
+        model: The arm.
+        q: Shape (m, 6), rad.
+        what: The phase.
+        where: The plan.
+
+    Raises:
+        InputError: Names the joint and the angle. NaN is outside.
+    """
+    inside = (q >= model.joint_limits[:, 0] - POSITION_SLACK_RAD) & (q <= model.joint_limits[:, 1] + POSITION_SLACK_RAD)
+    if not inside.all():
+        row, joint = np.argwhere(~inside)[0]
+        low, high = np.degrees(model.joint_limits[joint])
+        raise InputError(
+            f"{what}: {model.joint_names[joint]} at {np.degrees(q[row, joint]):.3f} deg",
+            where=where,
+            allowed=f"{low:.0f} to {high:.0f} deg",
+        )
+
+
+def check_rates(model: UrModel, speeds: Floats, accelerations: Floats, *, what: str, where: Path) -> None:
+    """Refuse speeds and accelerations above the limits.
+
+    Args:
+        model: The arm.
+        speeds: Shape (m, 6), rad/s.
+        accelerations: Shape (k, 6), rad/s^2.
+        what: The phase.
+        where: The plan.
+
+    Raises:
+        InputError: Names the joint, the rate and the limit. NaN is above.
+    """
+    for rates, limits, unit in (
+        (speeds, model.max_speeds, "rad/s"),
+        (accelerations, np.full(6, model.max_acceleration), "rad/s^2"),
+    ):
+        kept = np.abs(rates) <= limits * (1.0 + RELATIVE_SLACK)
+        if not kept.all():
+            row, joint = np.argwhere(~kept)[0]
+            raise InputError(
+                f"{what}: {model.joint_names[joint]} at {abs(rates[row, joint]):.6g} {unit}",
+                where=where,
+                allowed=f"at most {limits[joint]:.6g} {unit}",
+            )
+
+
+def check_trajectory(
+    model: UrModel, trajectory: Trajectory, *, time_resolution_s: float, what: str, where: Path
+) -> None:
+    """Refuse samples outside any limit, by differences, from rest to rest.
+
+    The mean speeds of neighbouring intervals differ by no more than the acceleration times the distance of their
+    middles, so a motion within the limits is never refused, but for rounding, which is taken off here.
+
+    Args:
+        model: The arm.
+        trajectory: The samples.
+        time_resolution_s: To what the times were rounded; 0 for exact ones.
+        what: The phase.
+        where: The plan.
+
+    Raises:
+        InputError: Names joint, number and limit.
+    """
+    q, steps = trajectory.q, np.diff(trajectory.times_s)[:, None]
+    check_positions(model, q, what=what, where=where)
+    if len(q) == 1:
+        return
+    speeds = np.diff(q, axis=0) / steps
+    change = np.diff(np.concatenate([np.zeros((1, 6)), speeds, np.zeros((1, 6))]), axis=0)
+    between = (np.concatenate([np.zeros((1, 1)), steps]) + np.concatenate([steps, np.zeros((1, 1))])) / 2.0
+    angle_rounding = ROUNDINGS * np.finfo(float).eps * max(1.0, float(np.abs(q).max()))
+    blur = angle_rounding / steps + time_resolution_s * np.abs(speeds) / steps
+    blur_between = np.maximum(np.concatenate([blur, blur[-1:]]), np.concatenate([blur[:1], blur])) * 2.0
+    check_rates(
+        model,
+        np.maximum(np.abs(speeds) - blur, 0.0),
+        np.maximum(np.abs(change) - blur_between, 0.0) / between,
+        what=what,
+        where=where,
+    )
+
+
+STRAIGHT_RAD = 1e-9
+"""Joint distance within which samples lie on a straight segment: far above rounding, a millionth of a degree."""
+
+REST_SLACK = 1e-6
+"""Relative rounding of a speed by differences."""
+
+
+def corner_rows(q: Floats) -> NDArray[np.intp]:
+    """Rows at which a path turns or turns back, with both ends: every other row lies between two of them.
+
+    Splits at the row farthest from the chord until none is off (Douglas and Peucker 1973, in six dimensions). For a
+    path of straight segments that row is always one of its waypoints.
+
+    Args:
+        q: Shape (m, 6), rad.
+
+    Returns:
+        Rising rows, shape (k,); ``[0]`` for a single row.
+    """
+    kept, pending = {0, len(q) - 1}, [(0, len(q) - 1)]
+    while pending:
+        first, last = pending.pop()
+        split = _turning_row(q[first : last + 1])
+        if split is not None:
+            kept.add(first + split)
+            pending += [(first, first + split), (first + split, last)]
+    return np.array(sorted(kept), dtype=np.intp)
+
+
+def _turning_row(rows: Floats) -> int | None:
+    """The row farthest from the segment between the ends, or the last before the path reverses; None if straight."""
+    if len(rows) < 3:
+        return None
+    away, chord = rows - rows[0], rows[-1] - rows[0]
+    length = float(np.linalg.norm(chord))
+    unit = chord / length if length > STRAIGHT_RAD else np.zeros(6)
+    along = np.clip(away @ unit, 0.0, length)
+    off = np.linalg.norm(away - along[:, None] * unit, axis=1)
+    if off[1:-1].max() > STRAIGHT_RAD:
+        return int(np.argmax(off[1:-1])) + 1
+    back = np.flatnonzero(np.diff(along) < -STRAIGHT_RAD)
+    return int(back[0]) if len(back) else None
+
+
+def rests_at(model: UrModel, trajectory: Trajectory, rows: NDArray[np.intp]) -> bool:
+    """Whether the arm can be at rest at each of the rows: beside it no joint is faster than one step of braking allows.
+
+    Args:
+        model: The arm: its acceleration limit.
+        trajectory: The samples.
+        rows: Rows between the ends.
+    """
+    steps = np.diff(trajectory.times_s)[:, None]
+    most = model.max_acceleration * steps**2 * (1.0 + REST_SLACK)
+    slow = np.all(np.abs(np.diff(trajectory.q, axis=0)) <= most, axis=1)
+    return bool((slow[rows - 1] & slow[rows]).all())
+
+
+PLAIN = frozenset(string.ascii_letters + string.digits + " ._-+:/()")
+"""What may stand in a comment or a string of any of the formats: nothing that ends, escapes or nests one."""
+
+LONGEST = 200
+"""Characters of one name; a longer one is cut."""
+
+
+def plain_text(text: str) -> str:
+    """A name with every character outside ``PLAIN`` turned into an underscore, cut at ``LONGEST``.
+
+    >>> plain_text('liver"); halt #')
+    'liver_)_ halt _'
+    """
+    return "".join(character if character in PLAIN else "_" for character in text[:LONGEST])
+
+
+SENTENCE_WIDTH = 110
+"""Columns of a warning's lines in a comment."""
+
+WARNINGS_UNKNOWN = "warnings: not known, the plan's file is older than their statement; plan again"
+
+
+def warning_lines(warnings: Sequence[str] | None) -> list[str]:
+    """The warnings of a plan for a comment: how many, then each whole, on as many lines as it needs.
+
+    >>> warning_lines(("the 'skin' is open; a box",))
+    ['1 warning stood when this was planned:', 'warning: the skin is open, a box']
+    """
+    if warnings is None:
+        return [WARNINGS_UNKNOWN]
+    if not warnings:
+        return ["warnings: none stood when this was planned"]
+    lines = [line for one in warnings for line in textwrap.wrap(f"warning: {plain_sentence(one)}", SENTENCE_WIDTH)]
+    return [f"{counted(warnings)} stood when this was planned:", *lines]
+
+
+def counted(warnings: Sequence[str]) -> str:
+    """How many there are, in words that can be read aloud."""
+    return f"{len(warnings)} warning{'s' if len(warnings) > 1 else ''}"
+
+
+def plain_sentence(text: str) -> str:
+    """A sentence whole, in the characters of ``PLAIN`` and commas: no quotes, and a comma for a semicolon."""
+    text = text.translate({ord("'"): None, ord('"'): None, ord(";"): ",", ord("%"): "percent"})
+    return "".join(character if character in PLAIN or character == "," else "_" for character in text)
+
+
+def heading(plan: Plan, notes: Iterable[str], *, case_checked: bool) -> list[str]:
+    """Comment lines that say what a file is, what it was made from, and how to read it.
+
+    Args:
+        plan: The plan that the file holds.
+        case_checked: Whether the plan was compared with its case when it was exported.
+        notes: Further lines.
+    """
+    lines = [
+        "research software, not a medical device",
+        f"made by puncture-twin {version('puncture-twin')} from a plan of version {PLAN_VERSION}, seed {plan.seed}",
+        f"case: {plain_text(plan.case_name)}",
+        *(f"input: {plain_text(f'{one.role}: {one.path}')} sha256 {plain_text(one.sha256)}" for one in plan.inputs),
+        f"robot: {plain_text(plan.model.name)}",
+        f"direction: theta {np.degrees(plan.theta):g} deg, beta {np.degrees(plan.beta):g} deg",
+        "this plan was " + ("checked against its case again" if case_checked else "NOT checked against its case again"),
+        *warning_lines(plan.warnings),
+        *notes,
+    ]
+    return [f"# {line}" for line in lines]

@@ -8,15 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.speed_limits import tip_rates
+from puncture_twin.planning.arm.kinematics import flange_pose, tip_rates
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.export.limits import check_positions, check_rates, check_trajectory
-from puncture_twin.planning.export.motion import ANGLE_TOLERANCE_RAD
 from puncture_twin.planning.export.program import (
+    ANGLE_TOLERANCE_RAD,
     Program,
+    check_positions,
+    check_rates,
+    check_trajectory,
     program_of,
     straight_move,
     stream_times,

@@ -10,10 +10,7 @@ import numpy as np
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.export.corners import corner_rows, rests_at
-from puncture_twin.planning.export.limits import check_rates
-from puncture_twin.planning.export.motion import SampledMotion
-from puncture_twin.planning.export.text import heading
+from puncture_twin.planning.export.program import SampledMotion, check_rates, corner_rows, heading, rests_at
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 

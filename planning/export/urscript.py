@@ -18,10 +18,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.export.program import STREAM_S, JointMove, Program
-from puncture_twin.planning.export.text import counted, heading, plain_sentence
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
+from puncture_twin.planning.export.program import STREAM_S, JointMove, Program, counted, heading, plain_sentence
+from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, pose
 from puncture_twin.planning.plan.plan import Plan
 
 M_PER_MM = 1e-3

@@ -1,14 +1,30 @@
-"""Is a point inside a surface? By the winding number, or by rays; and it is said when the question has no answer."""
+"""Is a point inside a surface? By the winding number, or by rays; and it is said when the question has no answer.
+
+How far a surface goes around a point: the winding number, and by rays, which do not ask how triangles are wound.
+
+Where rays from one point cross a surface: every crossing, in float64, without a missed edge.
+
+All rays start at the target, so a triangle is met exactly by the rays inside the solid angle that it subtends. Rays are
+binned by direction; each triangle visits the bins that its bounding cone touches, and of their rays those inside of the
+cone: where a ray lies in the plane of a triangle far beside it, the edge functions are rounding alone.
+
+Corners are moved along the ray into a plane, each by its own numbers alone, so triangles that share corners share them
+there. On which side of an edge the ray passes is then told rightly or as both: a ray through an edge or a corner hits
+at least one of the triangles about it (Woop, Benthin and Wald, JCGT 2(1), 2013).
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.winding import winding_number, winding_numbers
 
 RAYS, SEED = 5, 3
 """Random directions that vote, always the same: where one of them happens to meet an edge, the others do not."""
@@ -77,3 +93,377 @@ def _leaves_oddly(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
     around = np.abs(np.sign(weights).sum(axis=0)) == len(weights)
     odd = (around & ahead).sum(axis=0) % 2 == 1
     return bool(odd.mean() > 0.5)
+
+
+SUM_RAYS = 1000
+"""A fraction of all directions is found to about a percent."""
+
+
+def winding_number(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
+    """0 outside a closed surface, 1 or -1 (by orientation) inside, in between for an open one.
+
+    The sum of the triangles' signed solid angles over 4 pi, each by Van Oosterom and Strackee, "The solid angle of a
+    plane triangle", IEEE Trans. Biomed. Eng. 30(2), 1983, Eq. 8.
+
+    Args:
+        mesh: The surface, mm.
+        point: Shape (3,), mm, in the mesh's frame.
+    """
+    return float(winding_numbers(mesh, point[None])[0])
+
+
+def winding_numbers(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`winding_number` of many points (n, 3), mm: shape (n,)."""
+    found = np.empty(len(points))
+    _solid_angles(mesh.vertices, mesh.faces, np.array(points, dtype=np.float64, order="C"), found)
+    return found / (4 * np.pi)
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _solid_angles(vertices, faces, points, found):  # type: ignore[no-untyped-def]  # numba infers
+    """The sum over all triangles (m, 3) of vertices (n, 3), as in `winding_number`, of each point."""
+    for row in range(len(points)):
+        x, y, z = points[row]
+        total = 0.0
+        for face in faces:
+            a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
+            ax, ay, az = a[0] - x, a[1] - y, a[2] - z
+            bx, by, bz = b[0] - x, b[1] - y, b[2] - z
+            cx, cy, cz = c[0] - x, c[1] - y, c[2] - z
+            na, nb_ = np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(bx * bx + by * by + bz * bz)
+            nc = np.sqrt(cx * cx + cy * cy + cz * cz)
+            triple = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
+            below = na * nb_ * nc + (ax * bx + ay * by + az * bz) * nc
+            below += (bx * cx + by * cy + bz * cz) * na + (cx * ax + cy * ay + cz * az) * nb_
+            total += 2.0 * np.arctan2(triple, below)
+        found[row] = total
+
+
+def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
+    """Of all directions from a point, the part in which a ray crosses the surface an odd number of times.
+
+    0 outside of a closed surface, 1 inside, in between for an open one; a triangle that is given twice counts once.
+
+    Args:
+        mesh: The surface, mm.
+        point: Shape (3,), mm, in the mesh's frame.
+    """
+    surface = TriangleMesh(mesh.vertices, mesh.faces[mesh.distinct])
+    return float(np.mean(crossings(surface, point, _rays()).count % 2))
+
+
+def hit_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
+    """Of all directions from a point, the part in which a ray meets the surface at all.
+
+    1 inside a closed surface, and also in a hollow of it, of which `winding_number` is 0.
+
+    Args:
+        mesh: The surface, mm.
+        point: Shape (3,), mm, in the mesh's frame.
+    """
+    return float(np.mean(crossings(mesh, point, _rays()).count > 0))
+
+
+def _rays() -> NDArray[np.float64]:
+    """Unit vectors, shape (SUM_RAYS, 3), evenly about: a spiral of equal steps in z and golden turns."""
+    z = 1.0 - (2.0 * np.arange(SUM_RAYS) + 1.0) / SUM_RAYS
+    turn, ring = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(SUM_RAYS), np.sqrt(1.0 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+
+
+MOST_POLAR_BINS = 120
+"""Bins over the polar angle (1.5 degrees each) for many rays; twice as many over the azimuth."""
+
+LEAST_POLAR_BINS = 2
+"""For few rays: of fewer bins a cone's window would hold some twice."""
+
+SAME_CROSSING_MM = 1e-6
+"""Crossings of one ray closer than this are one: the ray runs through an edge or a corner."""
+
+USUAL_CROSSINGS = 4
+"""Of a ray: room for so many is made before they are counted; where there are more, they are found once again."""
+
+CONE_SLACK = 1e-9
+"""Radians by which a bounding cone is widened against rounding."""
+
+OUTSIDE = 1e-12
+"""By so much less than a cone's is the cosine of a ray that is outside of it whatever rounding did."""
+
+DOUBTFUL = 1e-12
+"""A triangle seen so nearly edge-on that the share of its area across the ray is of rounding: where on it the ray is
+crossed is not known."""
+
+NUDGE = 1e-7
+"""Radians by which a ray through an edge or corner is turned when its crossings do not add up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Every crossing, sorted by ray and then by depth.
+
+    Attributes:
+        ray: Shape (c,), row of the ray.
+        depth: Shape (c,), mm from the origin.
+        face: Shape (c,), triangle that is crossed.
+        way: Shape (c,), 1 where the ray comes out through the triangle's front (its corners run counterclockwise seen
+            from there), -1 where it goes in, 0 where it does both at once (two surfaces touch there, or one is folded)
+            or the triangle is seen edge-on.
+        count: Shape (n,), crossings of each ray.
+        first: Shape (n,), row in ``depth`` of each ray's first crossing (meaningless where count is 0).
+    """
+
+    ray: Ints
+    depth: Floats
+    face: Ints
+    way: Ints
+    count: Ints
+    first: Ints
+
+
+def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: float = np.inf) -> Crossings:
+    """All crossings of rays with a surface.
+
+    Args:
+        mesh: The surface.
+        origin: Shape (3,), where every ray starts, mm.
+        directions: Shape (n, 3), unit vectors.
+        length: Crossings beyond are left out, mm.
+    """
+    order, starts, bins = _binned(directions)
+    rays = np.take(directions, order, axis=0)
+    lengths = np.sqrt(np.einsum("ij,ij->i", rays, rays))
+    origin = np.array(origin, dtype=np.float64)
+    room, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
+    while total > room:
+        room = total
+        ray, depth, face = np.empty(room, np.int64), np.empty(room), np.empty(room, np.int64)
+        way = np.empty(room, np.int64)
+        binned = rays, lengths, order, starts, bins
+        total = _visit(mesh.vertices, mesh.faces, origin, binned, length, ray, depth, face, way)
+    ray, depth, face, way = ray[:total], depth[:total], face[:total], way[:total]
+    rows = np.lexsort((depth, ray))
+    ray, depth, face, way = ray[rows], depth[rows], face[rows], way[rows]
+    fresh = np.ones(total, bool)
+    fresh[1:] = (ray[1:] != ray[:-1]) | (depth[1:] - depth[:-1] > SAME_CROSSING_MM)
+    way = _ways(way, fresh)
+    ray, depth, face = ray[fresh], depth[fresh], face[fresh]
+    count = np.bincount(ray, minlength=len(directions))
+    return Crossings(ray, depth, face, way, count, np.cumsum(count) - count)
+
+
+def _ways(way: Ints, fresh: Bools) -> Ints:
+    """Of crossings that are one, from one that is fresh to the next: the way that all have, 0 if they differ."""
+    starts = np.flatnonzero(fresh)
+    if len(starts) == 0:
+        return way
+    most, least = np.maximum.reduceat(way, starts), np.minimum.reduceat(way, starts)
+    return np.where(most == least, most, 0)
+
+
+def first_crossing(mesh: TriangleMesh, origin: Floats, directions: Floats, length: float) -> Floats:
+    """Depth of each ray's first crossing, shape (n,), mm; 0 for a ray that crosses nothing (it lies in the surface)."""
+    found = crossings(mesh, origin, directions, length)
+    depth = np.zeros(len(directions))
+    hit = found.count > 0
+    depth[hit] = found.depth[found.first[hit]]
+    return depth
+
+
+def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
+    """Ray numbers sorted by direction bin, where each bin starts, and how many there are over the polar angle.
+
+    Shapes (n,) and (bins + 1,). There is about a ray a bin, as long as that gives no more than the most.
+    """
+    count = min(MOST_POLAR_BINS, max(LEAST_POLAR_BINS, math.isqrt(len(directions) // 2)))
+    polar = np.arccos(np.clip(directions[:, 2], -1, 1))
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0]) + np.pi
+    row = np.minimum((polar * (count / np.pi)).astype(np.int64), count - 1)
+    column = np.minimum((azimuth * (count / np.pi)).astype(np.int64), 2 * count - 1)
+    bins = (row * 2 * count + column).astype(np.uint16)  # numpy sorts small numbers ten times as fast
+    starts = np.zeros(2 * count**2 + 1, np.int64)
+    np.cumsum(np.bincount(bins, minlength=2 * count**2), out=starts[1:])
+    return np.argsort(bins, kind="stable"), starts, count
+
+
+@allocation_free()
+def _visit(vertices, faces, origin, binned, length, ray, depth, face, way):  # type: ignore[no-untyped-def]  # numba infers
+    """Count the crossings; write them too where the output arrays have room."""
+    rays, lengths, order, starts, bins = binned
+    found, per_radian = 0, bins / np.pi
+    for f in range(len(faces)):
+        a, b, c = (
+            _seen(vertices, faces[f, 0], origin),
+            _seen(vertices, faces[f, 1], origin),
+            _seen(vertices, faces[f, 2], origin),
+        )
+        if _beyond(a, b, c, length):
+            continue
+        center, radius = _cone(a, b, c)
+        polar = np.arccos(min(1.0, max(-1.0, center[2])))
+        first_row = max(0, int((polar - radius) * per_radian))
+        last_row = min(bins - 1, int((polar + radius) * per_radian))
+        low, high = _azimuths(center, polar, radius, bins)
+        if radius >= 1.5:  # all bins, each once: in one piece, since most of them hold no ray
+            first_row, last_row, low, high = 0, 0, 0, 0
+        least = -2.0 if radius >= 1.5 else np.cos(radius) - OUTSIDE
+        for row in range(first_row, last_row + 1):
+            for column in range(low, high + 1):
+                cell = row * 2 * bins + column % (2 * bins)
+                begin, end = (0, len(order)) if radius >= 1.5 else (starts[cell], starts[cell + 1])
+                for k in range(begin, end):
+                    inside = _along(center, rays[k]) >= least * lengths[k]
+                    t, out = _cross(a, b, c, rays[k]) if inside else (-1.0, 0)
+                    if 0.0 <= t <= length:
+                        if found < len(ray):
+                            ray[found], depth[found], face[found], way[found] = order[k], t, f, out
+                        found += 1
+    return found
+
+
+@allocation_free()
+def _seen(vertices, row, origin):  # type: ignore[no-untyped-def]  # numba infers
+    """A vertex, seen from where the rays start."""
+    return vertices[row, 0] - origin[0], vertices[row, 1] - origin[1], vertices[row, 2] - origin[2]
+
+
+@allocation_free()
+def _beyond(a, b, c, length):  # type: ignore[no-untyped-def]  # numba infers
+    """Whether no ray from the origin crosses a triangle at a length or less, told by its corners' distances.
+
+    No point is nearer than the first corner less the longer side from it; two points are no farther apart than twice
+    that side, which is what rounding can do to the depth of a ray that grazes the triangle's plane.
+    """
+    to_b = _length(b[0] - a[0], b[1] - a[1], b[2] - a[2])
+    to_c = _length(c[0] - a[0], c[1] - a[1], c[2] - a[2])
+    return _length(a[0], a[1], a[2]) - 3.0 * max(to_b, to_c) > length + SAME_CROSSING_MM
+
+
+@allocation_free()
+def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
+    """Axis and half-angle of a cone about the origin that holds a triangle; half-angle pi where none is narrow."""
+    na, nb_, nc = _length(a[0], a[1], a[2]), _length(b[0], b[1], b[2]), _length(c[0], c[1], c[2])
+    if min(na, nb_, nc) == 0.0:
+        return (0.0, 0.0, 1.0), np.pi
+    x = a[0] / na + b[0] / nb_ + c[0] / nc
+    y = a[1] / na + b[1] / nb_ + c[1] / nc
+    z = a[2] / na + b[2] / nb_ + c[2] / nc
+    norm = _length(x, y, z)
+    if norm < 0.3:
+        return (0.0, 0.0, 1.0), np.pi
+    x, y, z = x / norm, y / norm, z / norm
+    to_a, to_b = (x * a[0] + y * a[1] + z * a[2]) / na, (x * b[0] + y * b[1] + z * b[2]) / nb_
+    cosine = min(to_a, to_b, (x * c[0] + y * c[1] + z * c[2]) / nc)
+    if cosine < 0.2:
+        return (0.0, 0.0, 1.0), np.pi
+    return (x, y, z), np.arccos(min(1.0, cosine)) + CONE_SLACK + 1e-7
+
+
+@allocation_free()
+def _length(x, y, z):  # type: ignore[no-untyped-def]  # numba infers
+    """Of a vector."""
+    return np.sqrt(x * x + y * y + z * z)
+
+
+@allocation_free()
+def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # numba infers
+    """First and last azimuth bin that a cone touches (the last may run past the full circle)."""
+    if radius >= 1.5 or polar - radius <= 0.0 or polar + radius >= np.pi:
+        return 0, 2 * bins - 1
+    half = np.arcsin(min(1.0, np.sin(radius) / np.sin(polar)))
+    azimuth = np.arctan2(center[1], center[0]) + np.pi
+    low = int(np.floor((azimuth - half) * (bins / np.pi) - 1e-9))
+    high = int(np.floor((azimuth + half) * (bins / np.pi) + 1e-9))
+    return low, high  # half is a right angle at most: no bin twice
+
+
+@allocation_free()
+def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
+    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; and its way."""
+    p, q, r = _beside(a, u), _beside(b, u), _beside(c, u)
+    wa, wb, wc = _turn(q, r), _turn(r, p), _turn(p, q)
+    if not ((wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)):
+        return -1.0, 0
+    total = wa + wb + wc
+    if total == 0.0:
+        return -1.0, 0
+    depth = (wa * _along(a, u) + wb * _along(b, u) + wc * _along(c, u)) / total
+    if abs(total) < DOUBTFUL * _largest(a, b, c) * max(_span(p), _span(q), _span(r)):
+        return depth, 0
+    return depth, 1 if total * _most(u) > 0.0 else -1
+
+
+@allocation_free()
+def _largest(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
+    """The largest coordinate of three points."""
+    return max(abs(a[0]), abs(a[1]), abs(a[2]), abs(b[0]), abs(b[1]), abs(b[2]), abs(c[0]), abs(c[1]), abs(c[2]))
+
+
+@allocation_free()
+def _span(p):  # type: ignore[no-untyped-def]  # numba infers
+    """How far from the ray a point of the plane across it lies, along one axis or the other."""
+    return max(abs(p[0]), abs(p[1]))
+
+
+@allocation_free()
+def _beside(p, u):  # type: ignore[no-untyped-def]  # numba infers
+    """A point moved along the ray into the plane of the two axes that the ray follows least."""
+    if abs(u[2]) >= max(abs(u[0]), abs(u[1])):
+        return p[0] - u[0] / u[2] * p[2], p[1] - u[1] / u[2] * p[2]
+    if abs(u[1]) >= abs(u[0]):
+        return p[2] - u[2] / u[1] * p[1], p[0] - u[0] / u[1] * p[1]
+    return p[1] - u[1] / u[0] * p[0], p[2] - u[2] / u[0] * p[0]
+
+
+@allocation_free()
+def _most(u):  # type: ignore[no-untyped-def]  # numba infers
+    """The component of a ray along the axis that it follows most: where it is negative, `_beside` mirrors."""
+    if abs(u[2]) >= max(abs(u[0]), abs(u[1])):
+        return u[2]
+    return u[1] if abs(u[1]) >= abs(u[0]) else u[0]
+
+
+@allocation_free()
+def _turn(p, q):  # type: ignore[no-untyped-def]  # numba infers
+    """On which side of the edge p-q the ray passes: the right sign or 0, for rounding keeps two products' order."""
+    return p[0] * q[1] - p[1] * q[0]
+
+
+@allocation_free()
+def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
+    """How far a point lies along a ray."""
+    return p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
+
+
+def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
+    """Crossings, and of which rays they add up: as those of a ray from inside a closed surface must.
+
+    Such a ray leaves an odd number of times. Where triangles are wound alike it comes out and goes in by turns: if not,
+    one shell lies within another, or two share a wall, and the first crossing need not be the way out.
+
+    A ray through an edge or corner may count twice or touch without crossing; it is turned by `NUDGE` and asked again.
+    """
+    found = crossings(mesh, origin, directions)
+    settled = _adds_up(mesh, found)
+    if mesh.closed and not settled.all():
+        rotated = directions.copy()
+        rotated[~settled] = _rotated(directions[~settled])
+        found = crossings(mesh, origin, rotated)
+        settled = _adds_up(mesh, found)
+    return found, settled
+
+
+def _adds_up(mesh: TriangleMesh, found: Crossings) -> Bools:
+    """Of which rays the crossings are odd and, on a closed surface wound alike, out and in by turns."""
+    odd = found.count % 2 == 1
+    if not (mesh.closed and mesh.wound_alike):
+        return odd
+    wrong = found.way == 0
+    wrong[1:] |= (found.ray[1:] == found.ray[:-1]) & (found.way[1:] == found.way[:-1])
+    return np.asarray(odd & (np.bincount(found.ray[wrong], minlength=len(odd)) == 0))
+
+
+def _rotated(directions: Floats) -> Floats:
+    helper = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
+    aside = np.cross(directions, helper)
+    rotated = directions + NUDGE * aside / np.linalg.norm(aside, axis=1, keepdims=True)
+    return np.asarray(rotated / np.linalg.norm(rotated, axis=1, keepdims=True))

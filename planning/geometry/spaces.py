@@ -4,6 +4,10 @@ Patient spaces differ in the sign of two axes: LPS counts toward the patient's l
 right and anterior; both count toward superior. Neither is guessed: a file states its space, or the case does.
 
 The command line reads the names of spaces from here, so numpy is not imported.
+
+In which unit of length a file speaks.
+
+The command line reads the names of units from here, so numpy is not imported.
 """
 
 from __future__ import annotations
@@ -62,3 +66,27 @@ def parse_space(text: str, *, where: str) -> Space:
         if text.strip().lower() == space.lower():
             return space
     raise InputError(f"unknown space {text!r}", where=where, allowed=", ".join(Space))
+
+
+class Unit(StrEnum):
+    """A unit of length that a file may use."""
+
+    MM = "mm"
+    CM = "cm"
+    M = "m"
+
+    @property
+    def mm(self) -> float:
+        """How many millimetres one of this unit is."""
+        return {Unit.MM: 1.0, Unit.CM: 10.0, Unit.M: 1000.0}[self]
+
+
+def parse_unit(text: str, *, where: str) -> Unit:
+    """The unit of length that a text names.
+
+    Raises:
+        InputError: If it names none.
+    """
+    if text.strip() in tuple(Unit):
+        return Unit(text.strip())
+    raise InputError(f"unknown unit of length {text!r}", where=where, allowed=", ".join(Unit))

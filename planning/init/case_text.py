@@ -13,7 +13,7 @@ from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, Anatomy, body_
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import error_model
-from puncture_twin.planning.case.tables.errors_section import ErrorsSection
+from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.finder import Markers
 from puncture_twin.planning.init.overrides import STATED, with_keys, with_line

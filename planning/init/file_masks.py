@@ -11,7 +11,7 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.tables.structures_section import StructuresSection
+from puncture_twin.planning.case.tables import StructuresSection
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.init.segmentation import Assigned, Place, quoted, rules_text
 

@@ -31,11 +31,10 @@ from puncture_twin.planning.formats.labels.labelmaps import labelmap_of, whole_l
 from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, not_read, refuse_one_name, structure_name
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS
 from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING
-from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
+from puncture_twin.planning.formats.points import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
-from puncture_twin.planning.geometry.spaces import Space, Up
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 from puncture_twin.planning.init.file_masks import file_masks
 from puncture_twin.planning.init.label_files import Mask, Masks, is_named_by_table, label_file, mask_of
 from puncture_twin.planning.init.mesh_folder import is_mesh, mesh_folder

@@ -14,8 +14,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, UP_NOT_STATED, mesh_extent, read_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, Up
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 from puncture_twin.planning.init.segmentation import Assigned, Place, margin_line, quoted
 
 LEAST_EXTENT = ((Unit.MM, 130.0), (Unit.CM, 5.0), (Unit.M, 0.0))

@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case_volumes import CaseVolumes
+from puncture_twin.planning.case.named_files import CaseVolumes
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

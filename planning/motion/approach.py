@@ -15,20 +15,25 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed
+from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.segments import halving_order
+from puncture_twin.planning.collision.fast_checker import FastChecker, halving_order
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
-from puncture_twin.planning.motion.cut import UPPER_ARM, Cut
 from puncture_twin.planning.motion.follow import follow, rounded
-from puncture_twin.planning.motion.joint_space import SegmentContact
 from puncture_twin.planning.motion.path_check import dense_states, first_contact
-from puncture_twin.planning.motion.rrt_connect import Connected
-from puncture_twin.planning.motion.shortcuts import CLEARANCE_MM
-from puncture_twin.planning.motion.shortest import MAX_SAMPLES, RUNS, Path, Task, direct_path, shortest_path
+from puncture_twin.planning.motion.rrt_connect import CLEARANCE_MM, Connected, SegmentContact
+from puncture_twin.planning.motion.shortest import (
+    MAX_SAMPLES,
+    RUNS,
+    UPPER_ARM,
+    Cut,
+    Path,
+    Task,
+    direct_path,
+    shortest_path,
+)
 from puncture_twin.planning.motion.trajectory import Trajectory
 
 RESOLUTION_RAD = 0.05

@@ -5,22 +5,30 @@ Source: Kuffner and LaValle 2000, "RRT-Connect: an efficient approach to single-
 Nothing here depends on the clock: the planner stops after a number of samples, or when one of its trees has not grown
 for some of them in a row, so the same seed gives the same path.
 OMPL keeps one random generator for the whole process and reseeds it here; two plans must not run in two threads.
+
+OMPL's space of joint angles: its bounds, and its states as angles.
+
+OMPL measures distances in it with the wrist's joints counted for half: what a robot's arm touches is decided by the
+first three joints most of the time, and branches that reach farther in those find the way through a gap sooner
+(``python -m benchmarks.approach_planners``).
+
+OMPL's shortcuts of a path, counted in steps, never in time.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-from ompl import base as ob, geometric as og
+from ompl import base as ob, geometric as og, util as ou
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import Contact
-from puncture_twin.planning.motion.joint_space import Angles, JointSpace, SegmentContact, angles_of, seeded
-from puncture_twin.planning.motion.shortcuts import shortened
 
 RANGE_RAD = 1.0
 """Longest branch of the planner's trees, with the wrist's joints counted for half."""
@@ -178,3 +186,122 @@ def _with_exact_ends(waypoints: Floats, home: Floats, goals: Floats) -> tuple[Fl
     if len(waypoints) < 2 or max(from_home, off[goal_index]) > END_TOLERANCE_RAD:
         raise NoAnswerError(f"the planner's path does not join home and goal: {from_home:.3g}, {off.min():.3g} rad off")
     return np.concatenate([home[None], waypoints[1:-1], goals[goal_index][None]]), goal_index
+
+
+SegmentContact = Callable[[Floats, Floats], Contact | None]
+"""What the straight joint segment between two states (6,) meets; None when it is free, its end included. Of a segment
+that begins at a state known to be free the check gets that state first."""
+
+Angles = tuple[float, ...]
+"""Six joint angles, rad."""
+
+WRIST_DIVISOR = 2.0
+"""OMPL's coordinates of the wrist's three joints are their angles over this: a power of two, so that no bit is lost."""
+
+SEEDS = 2**31 - 1
+"""OMPL takes positive seeds; 0 would mean its own choice."""
+
+
+class JointSpace:
+    """A box of joint angles as OMPL sees it.
+
+    Args:
+        bounds: Shape (6, 2), rad: lowest and highest angles.
+        wrist_divisor: What the wrist's angles are divided by; a power of two.
+    """
+
+    def __init__(self, bounds: Floats, wrist_divisor: float = WRIST_DIVISOR) -> None:
+        self._divisors = np.array([1.0, 1.0, 1.0, wrist_divisor, wrist_divisor, wrist_divisor])
+        box = ob.RealVectorBounds(6)
+        for joint, (low, high) in enumerate((bounds / self._divisors[:, None]).tolist()):
+            box.setLow(joint, low)
+            box.setHigh(joint, high)
+        space = ob.RealVectorStateSpace(6)
+        space.setBounds(box)
+        self.information = ob.SpaceInformation(space)
+        self.information.setStateValidityChecker(_everything)  # a segment is checked with its end
+
+    def set_up(self, validator: ob.MotionValidator) -> None:
+        """Have segments checked by a validator."""
+        self.information.setMotionValidator(validator)
+        self.information.setup()
+
+    def state(self, q: Floats) -> ob.State:
+        """A new state at angles (6,), rad."""
+        state = self.information.allocState()
+        for joint, value in enumerate((q / self._divisors).tolist()):
+            state[joint] = value
+        return state
+
+
+def angles_of(state: ob.State, wrist_divisor: float = WRIST_DIVISOR) -> Angles:
+    """The angles of a state, rad. Beyond six coordinates OMPL reads garbage."""
+    wrist = wrist_divisor * state[3], wrist_divisor * state[4], wrist_divisor * state[5]
+    return state[0], state[1], state[2], *wrist
+
+
+def _everything(state: ob.State) -> bool:
+    return True
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """OMPL's one generator seeded, and its messages off: reseeding makes it complain; a test holds that it works."""
+    level = ou.getLogLevel()
+    ou.setLogLevel(ou.LOG_NONE)
+    try:
+        ou.RNG.setSeed(1 + seed % SEEDS)
+        yield
+    finally:
+        ou.setLogLevel(level)
+
+
+ROUNDS = 2
+"""Of shortcuts."""
+
+STEPS = 60
+"""Shortcuts tried in each round. By itself OMPL tries as many as the path has vertices: few where branches are long."""
+
+CLEARANCE_MM = 20.0
+"""What a shortcut keeps from patient and boxes beyond the arm's padding, where both of its ends do. The shortest path
+round an obstacle runs along it, and then an arm that errs by more than the padding touches."""
+
+UNSCALED = 1.0
+"""What the wrist's angles are divided by here: nothing."""
+
+
+def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Floats) -> Floats:
+    """A path with the same ends that is no longer, with every joint counted in full.
+
+    Args:
+        joint_limits: Shape (6, 2), rad.
+        contact_of: Checks a shortcut.
+        waypoints: Shape (k, 6), rad: straight free segments.
+
+    Returns:
+        Shape (m, 6), rad.
+    """
+    space = JointSpace(joint_limits, UNSCALED)
+    space.set_up(_ShortcutValidator(space.information, contact_of))
+    path = og.PathGeometric(space.information)
+    for q in waypoints:
+        path.append(space.state(q))
+    simplifier = og.PathSimplifier(space.information)
+    simplifier.reduceVertices(path)
+    for _ in range(ROUNDS):
+        simplifier.partialShortcutPath(path, STEPS, STEPS)
+        simplifier.reduceVertices(path)
+    simplifier.collapseCloseVertices(path)  # corners close together are taken slowly
+    return np.array([angles_of(state, UNSCALED) for state in path.getStates()])
+
+
+class _ShortcutValidator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without types
+    """Hands segments between states of the path to a check."""
+
+    def __init__(self, information: ob.SpaceInformation, contact_of: SegmentContact) -> None:
+        super().__init__(information)  # and not kept: it keeps the validator, and no one would free the two
+        self._contact_of = contact_of
+
+    def checkMotion(self, start: ob.State, end: ob.State) -> bool:  # noqa: N802  # OMPL's name
+        ends = angles_of(start, UNSCALED), angles_of(end, UNSCALED)
+        return self._contact_of(np.array(ends[0]), np.array(ends[1])) is None

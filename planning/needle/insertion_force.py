@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.needle.tissue import Layer
+from puncture_twin.planning.needle.deflection import Layer
 
 SAMPLE_MM = 0.1
 """Between two samples of the force."""

@@ -10,16 +10,14 @@ import numpy as np
 
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import N_BRANCHES, inverse
-from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, singularity
+from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, link_poses, singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.place.arm_spheres import ArmSpheres, Surroundings, base_is_clear, clear_branches
-from puncture_twin.planning.place.directions import WantedDirections
-from puncture_twin.planning.place.mounts import Site
+from puncture_twin.planning.place.mounts import Site, WantedDirections
 
 STATES = 3
 """Of an insertion, from standoff to target: enough to see most of what ends it."""

@@ -1,46 +1,76 @@
-"""The search for a place to stand the arm: all regions coarsely, the best of each finely, the finalists exactly."""
+"""The search for a place to stand the arm: all regions coarsely, the best of each finely, the finalists exactly.
+
+What a placement is worth: the search's own answer for the arm, for every organ-safe direction.
+
+How far a tip is expected to miss from another stand of the arm, its markers touched anew from there.
+
+Where the needle itself cannot stand before the insertion, whatever holds it.
+
+The search's result on disk: ``placements.csv`` for a table, ``place.json`` with everything.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import csv
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
 
+import fcl
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
-from puncture_twin.planning.arm.tool import Box
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.processes import map_all
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.case.bed import bed_frame
-from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.mount import mount_pose
-from puncture_twin.planning.case.tables.robot_section import MountSection
+from puncture_twin.planning.case.case import Case, bed_frame
+from puncture_twin.planning.case.settings import mount_pose
+from puncture_twin.planning.case.tables import MountSection
+from puncture_twin.planning.collision.bodies import Solid, connected_parts
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.loose_parts import connected_parts
-from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.patient import FclSkin
+from puncture_twin.planning.collision.state_checker import PATIENT, Contact
 from puncture_twin.planning.collision.workcell import (
     ARM_PADDING_MM,
+    case_boxes,
     case_tool,
     home_configuration,
     outside_surface,
     patient_surface,
 )
-from puncture_twin.planning.geometry.mesh import box_of
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.place.arm_spheres import Surroundings
-from puncture_twin.planning.place.directions import wanted_directions
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
+from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.place.arm_spheres import Boxes, SkinField, Surroundings
 from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
-from puncture_twin.planning.place.evaluate import PlacementCheck, Verdict
-from puncture_twin.planning.place.expected_error import expected_tip_error_mm
-from puncture_twin.planning.place.mounts import Site, mount_section, regions
-from puncture_twin.planning.place.needle_start import needle_can_start
-from puncture_twin.planning.place.obstacle_field import Boxes, SkinField
-from puncture_twin.planning.registration.placement import Placement
+from puncture_twin.planning.place.mounts import (
+    Site,
+    WantedDirections,
+    mount_lines,
+    mount_section,
+    regions,
+    wanted_directions,
+)
+from puncture_twin.planning.reach.reach import assess_reach_all
+from puncture_twin.planning.reach.survey import ReachRequest
+from puncture_twin.planning.registration.marker_noise import reading_noise, touches
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.placement import Placement, default_method
+from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 Progress = Callable[[str, int, int], None]
 
@@ -317,3 +347,227 @@ def _best_apart(
 def _far(one: Site, other: Site, distance_mm: float) -> bool:
     apart = float(np.linalg.norm(np.subtract(one.position, other.position)))
     return one.region != other.region or apart >= distance_mm
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """The exact answer for one placement.
+
+    Attributes:
+        fraction: Solid angle of the reached directions over that of all that are wanted, 0..1.
+        reached: How many directions the arm can reach and insert along.
+        count: How many directions are wanted.
+        margin: Mean reach margin of the reached ones, 0..1; 0 for none.
+        reasons: How many of the others fell to which reason.
+        home_contact: What the arm touches in its home configuration, or "".
+        q_insertion: Shape (reached, 6), rad, the tip on the target.
+    """
+
+    fraction: float
+    reached: int
+    count: int
+    margin: float
+    reasons: Mapping[str, int]
+    home_contact: str
+    q_insertion: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class PlacementCheck:
+    """Checks placements. Its values can be sent to another process.
+
+    Attributes:
+        model: The arm.
+        tool: What its flange carries.
+        skin: CT frame.
+        outside: CT frame, what the CT shows outside of it, or None.
+        fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
+        carried: Boxes that stand with the arm, base frame.
+        padding_mm: Of the arm.
+        target_ct: Shape (3,), mm.
+        wanted: The directions.
+        home: Shape (6,), rad.
+    """
+
+    model: UrModel
+    tool: Tool
+    skin: TriangleMesh
+    outside: TriangleMesh | None
+    fixed: tuple[Box, ...]
+    carried: tuple[Box, ...]
+    padding_mm: float
+    target_ct: Floats
+    wanted: WantedDirections
+    home: Floats
+
+    @cached_property
+    def patient(self) -> TriangleMesh:
+        """CT frame: the skin, and what the CT shows outside of it."""
+        return self.skin if self.outside is None else joined([self.skin, self.outside])
+
+    def verdict(self, T_base_ct: Floats) -> Verdict:
+        """Check every direction.
+
+        Raises:
+            InputError: The base stands in the patient.
+        """
+        checker = self._checker(T_base_ct)
+        target = T_base_ct[:3, :3] @ self.target_ct + T_base_ct[:3, 3]
+        requests = [
+            ReachRequest(target, T_base_ct[:3, :3] @ outward, self.tool.needle_length_mm, float(standoff))
+            for outward, standoff in zip(self.wanted.outward_ct, self.wanted.standoff_mm, strict=True)
+        ]
+        answers = assess_reach_all(checker, requests)
+        reached = np.array([answer.reachable for answer in answers], bool)
+        margins = [answer.margin for answer in answers if answer.reachable]
+        ends = [answer.insertion_q[-1] for answer in answers if answer.reachable]
+        return Verdict(
+            fraction=float(self.wanted.weight[reached].sum()),
+            reached=int(reached.sum()),
+            count=len(reached),
+            margin=float(np.mean(margins)) if margins else 0.0,
+            reasons=dict(Counter(answer.reason.value for answer in answers if not answer.reachable).most_common()),
+            home_contact=_contact_text(checker.contact(self.home, needle_may_touch_patient=False)),
+            q_insertion=np.array(ends).reshape(-1, 6),
+        )
+
+    def _checker(self, T_base_ct: Floats) -> FastChecker:
+        boxes = [Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed]
+        outside = None if self.outside is None else self.outside.transformed(T_base_ct)
+        model, everything = self.model, (*boxes, *self.carried)
+        skin, cache = self.skin.transformed(T_base_ct), user_cache()
+        return FastChecker(model, self.tool, everything, skin, outside=outside, padding_mm=self.padding_mm, cache=cache)
+
+
+def _contact_text(contact: Contact | None) -> str:
+    return "" if contact is None else f"{contact.body} touches {contact.other}"
+
+
+def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Floats, q: Floats) -> float | None:
+    """Root mean square over insertions (n, 6) of sqrt(trace(Sigma_dd)); None without declared errors, markers or q.
+
+    How the arm will touch the markers from there nobody has said, so that the arm's own errors do not cancel (2 J_f
+    Sigma_eta J_f' stands for them); the residuals of the old touches say nothing of the new ones.
+
+    Args:
+        case: Declares the errors.
+        placement: Where the case has the arm; gives the markers.
+        T_base_ct: Shape (4, 4), mm: where the arm is to stand.
+        q: Joints (rad) with the tip on the target from there.
+    """
+    registration = None if placement is None else placement.registration
+    if case.errors is None or registration is None or not len(q):
+        return None
+    covariance = pose_error_from(case, registration, T_base_ct).covariance(q)
+    return float(np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2).mean()))
+
+
+def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -> PoseError:
+    """The needle's pose error from another stand of the arm; arguments as above, the case with errors."""
+    assert case.errors is not None  # the caller has looked
+    errors, old = replace(case.errors, found=False), registration.markers
+    markers = MarkerPairs(old.names, old.points_ct, apply(T_base_ct, old.points_ct))
+    model, tip = case.robot.model, case.needle.length_mm
+    noise = reading_noise(errors, model, tip, touches(case, markers), known=False)
+    method = (None if case.registration is None else case.registration.method) or default_method(errors)
+    fitted = register(markers, method=method, target_ct=case.target_ct, noise=noise)
+    assert fitted.uncertainty is not None  # its markers have noise
+    return PoseError(model, tip, apply(T_base_ct, case.target_ct), errors, fitted.uncertainty)
+
+
+def needle_can_start(
+    tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections, padding_mm: float
+) -> NDArray[np.bool_]:
+    """Whether the padded needle, at standoff, is clear of the skin: no placement can reach a direction where it is not.
+
+    Args:
+        tool: With the needle.
+        skin: CT frame.
+        target_ct: Shape (3,), mm.
+        wanted: n directions.
+        padding_mm: What the arm's checker keeps from the patient.
+
+    Returns:
+        Shape (n,).
+    """
+    start, end = tool.needle_span_mm
+    radius, length = tool.needle_diameter_mm / 2 + padding_mm, end - start + 2 * padding_mm
+    needle, half = Solid(partial(fcl.Cylinder, radius, length)), np.array([radius, radius, length / 2])
+    patient = FclSkin(skin, PATIENT)
+    # From the tip, at the standoff from the target, the needle's middle is half its body farther out.
+    poses = flange_poses(target_ct, wanted.outward_ct, wanted.standoff_mm + (end - start) / 2)
+    clear = np.empty(len(wanted), np.bool_)
+    for row, T in enumerate(poses):
+        needle.place(fcl.Transform(T[:3, :3], T[:3, 3]))
+        clear[row] = not patient.touches(needle, np.array([-half, half]))
+    return clear
+
+
+PLACE_VERSION = 1
+"""Version of ``place.json``'s layout."""
+
+COLUMNS = (
+    *("rank", "placement", "along_mm", "across_mm", "height_mm", "share", "held", "asked", "margin", "home_contact"),
+    *("base_x_mm", "base_y_mm", "base_z_mm"),
+)
+"""Of ``placements.csv``; the base's coordinates are in the case's space."""
+
+EXPECTED = "expected_error_mm"
+"""A further column where the case declares errors and has markers."""
+
+
+def placement_rows(found: PlaceSearch) -> list[dict[str, Any]]:
+    """One row a checked placement, best first, rank 1; the case's own comes last, without a rank."""
+    rows = [_row(rank, one) for rank, one in enumerate(found.rated, start=1)]
+    return rows if found.own is None else [*rows, _row(None, found.own)]
+
+
+def _row(rank: int | None, one: RatedPlacement) -> dict[str, Any]:
+    along, across, height = (None, None, None) if one.site is None else one.site.position
+    values = (rank, one.name, along, across, height, one.verdict.fraction, one.verdict.reached, one.verdict.count)
+    rest = (one.verdict.margin, one.verdict.home_contact, *one.mount.position_mm)
+    row = dict(zip(COLUMNS, (*values, *rest), strict=True))
+    return row if one.expected_mm is None else {**row, EXPECTED: round(one.expected_mm, 4)}
+
+
+def _estimate(estimate: ReachEstimate) -> dict[str, float]:
+    return {
+        "reach": estimate.reach,
+        "room": estimate.unobstructed,
+        "share": estimate.fraction,
+        "margin": estimate.margin,
+    }
+
+
+def place_document(found: PlaceSearch, provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Everything as plain values: mm; fractions and margins 0..1."""
+    rows = placement_rows(found)
+    for row, one in zip(rows, (*found.rated, *((found.own,) if found.own else ())), strict=True):
+        row["mount"] = {key: list(value) for key, value in one.mount.model_dump().items()}
+        row["reasons"] = dict(one.verdict.reasons)
+        row["estimate"] = None if one.estimate is None else _estimate(one.estimate)
+    best = found.rated[0] if found.rated else None
+    return {
+        "version": PLACE_VERSION,
+        **provenance,
+        "T_ct_bed": np.asarray(found.T_ct_bed).tolist(),
+        "sites": {"coarse": len(found.coarse), "refined": found.refined, "judged": len(found.rated)},
+        "possible_share": found.possible,
+        "placements": rows,
+        "mount_lines": None if best is None else mount_lines(best.mount),
+    }
+
+
+def write_placements(found: PlaceSearch, path: Path) -> None:
+    """Write the table as CSV, whole or not at all."""
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
+        rows = placement_rows(found)
+        writer = csv.DictWriter(stream, (*COLUMNS, *([EXPECTED] if any(EXPECTED in row for row in rows) else [])))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_place_document(document: Mapping[str, Any], path: Path) -> None:
+    """Write the document as JSON, whole or not at all."""
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -1,19 +1,30 @@
-"""The chosen pose and its motion: what is rehearsed, exported and stored."""
+"""The chosen pose and its motion: what is rehearsed, exported and stored.
+
+How a plan shows itself in a notebook.
+
+A plan's motion, looked at anew: what it touches, and how near it comes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
+from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.brief import brief
+from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD
+from puncture_twin.planning.motion.path_check import dense_states, least_clearance
 from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.planning.plan.html import plan_html
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,3 +85,71 @@ class Plan:
     def _repr_html_(self) -> str:
         """What a notebook shows."""
         return plan_html(self)
+
+
+CLEARANCE_TEXT = MappingProxyType(
+    {
+        "approach": "arm's least clearance, approach",
+        "insertion": "arm's least clearance, insertion",
+        "needle": "needle's least clearance to a structure",
+    }
+)
+"""What each of a plan's clearances is of."""
+
+
+@never_raises
+def plan_html(plan: Any) -> str:
+    """A table of facts: direction, entry and target, motion, and the least distances that were found."""
+    return card(f"Plan of {plan.case_name}", _facts(plan))
+
+
+def _facts(plan: Any) -> Facts:
+    yield "direction", f"θ {np.degrees(plan.theta):g}°, β {np.degrees(plan.beta):g}°"
+    yield "skin entry, CT (LPS or local)", _point(plan.entry_ct)
+    yield "target, CT", _point(plan.target_ct)
+    yield "depth, skin to target", f"{np.linalg.norm(plan.entry_ct - plan.target_ct):.1f} mm"
+    yield "standoff", f"{plan.standoff_mm:g} mm, tip to target"
+    error = plan.expected_target_error_mm
+    yield (
+        "expected tip error",
+        f"{error:.2f} mm (rms)" if np.isfinite(error) else "not known: no markers",
+    )
+    yield "robot", plan.model.name
+    for name in ("approach", "insertion"):
+        phase = getattr(plan, name)
+        yield name, f"{phase.times_s[-1]:.1f} s, {len(phase.times_s):,} samples"
+    for phase, millimetres in plan.clearance_mm.items():
+        yield CLEARANCE_TEXT[phase], f"{millimetres:.1f} mm"
+    yield "seed", str(plan.seed)
+    yield "warnings", "not known: an older file" if plan.warnings is None else "; ".join(plan.warnings) or "none"
+
+
+def _point(point: Any) -> str:
+    return "({:.1f}, {:.1f}, {:.1f}) mm".format(*point)
+
+
+def phase_clearances(plan: Plan, checker: StateChecker) -> dict[str, float]:
+    """How near arm and holder come to patient and workcell in each phase of the stored motion; mm."""
+    found = {}
+    for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
+        least = least_clearance(checker, dense_states(checker, part.q, RESOLUTION_RAD / FINER))
+        found[phase] = min(least.patient.mm, least.boxes.mm)
+    return found
+
+
+def motion_contact(plan: Plan, checker: CellChecker) -> str | None:
+    """What a plan's motion touches, in words, or None: FCL at ten times the planner's resolution."""
+    for phase, q, needle_free in (("approach", plan.approach.q, False), ("insertion", plan.insertion.q, True)):
+        contact = _contact(checker, q, needle_free)
+        if contact is not None:
+            return f"{phase} is not free: {contact}"
+    return None
+
+
+def _contact(checker: CellChecker, q_path: Floats, needle_free: bool) -> str | None:
+    """What touches what along a motion, checked as densely as when it was planned; None if nothing does."""
+    for q in dense_states(checker, q_path, RESOLUTION_RAD / FINER):
+        contact = CellChecker.contact(checker, q, needle_may_touch_patient=needle_free)  # FCL alone, no bounds
+        if contact is not None:
+            return f"{contact.body} touches {contact.other}"
+    return None

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, HIGHEST, SpeedLimits
+from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, HIGHEST, SpeedLimits
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -30,9 +30,8 @@ from puncture_twin.planning.base.strict_json import (
 )
 from puncture_twin.planning.formats.guard import guard_transform
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Peaks, Trajectory
-from puncture_twin.planning.plan.arm_document import arm_document, read_arm
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.plan.plan_check import check_geometry, rate_limits
+from puncture_twin.planning.plan.plan_check import arm_document, check_geometry, rate_limits, read_arm
 
 PLAN_VERSION = 3
 """Version of the file's layout. 2: states the peaks of both phases beside the limits; the approach is smooth. 3: lists

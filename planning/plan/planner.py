@@ -7,20 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.speed_limits import slowed
+from puncture_twin.planning.arm.kinematics import slowed
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.motion.approach import plan_approach
 from puncture_twin.planning.motion.follow import follow_smoothly
-from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
-from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.reach.answer import ReachAnswer
-from puncture_twin.planning.reach.goals import approach_goals
+from puncture_twin.planning.plan.plan import Plan, motion_contact, phase_clearances
+from puncture_twin.planning.reach.reach import approach_goals
+from puncture_twin.planning.reach.survey import ReachAnswer
 from puncture_twin.planning.registration.placement import Placement
-from puncture_twin.planning.search.arm_reach import reach_request
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.constraints import reach_request
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chance_model import keeps_limits

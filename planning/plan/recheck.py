@@ -10,10 +10,8 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.workcell import home_configuration
-from puncture_twin.planning.plan.arm_document import same_arm
-from puncture_twin.planning.plan.motion import motion_contact, phase_clearances
-from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.plan.plan_check import check_angles, check_inputs
+from puncture_twin.planning.plan.plan import Plan, motion_contact, phase_clearances
+from puncture_twin.planning.plan.plan_check import check_angles, check_inputs, same_arm
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext

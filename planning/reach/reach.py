@@ -1,29 +1,53 @@
 """Which directions the arm can reach and insert along: standoff pose, straight insertion, nothing touched on the path.
 
 Retraction is the same motion backwards, so what may be inserted may be withdrawn.
+
+The search for the first clear motion of each of many requests.
+
+Motions checked for contacts, of many directions at once.
+
+What keeps every branch of the arm from a flange pose.
+
+Where the approach may end: every roll, branch and whole turn on which the arm holds one direction.
+
+A small workcell, asked once: on a new machine it has every kernel of the arm compiled before a case needs it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.insertion import first_stop, needle_lines
-from puncture_twin.planning.arm.singularity import away_from_singularities
-from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.arm.insertion import first_stop, needle_lines, reach_margin
+from puncture_twin.planning.arm.inverse_kinematics import inverse, pan_angle, wrapped_solutions, wrist_angles
+from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, away_from_singularities, singularity
+from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.collision.bodies import BODY_NAMES
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.state_checker import Contact, StateChecker
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.reach.answer import ReachAnswer, ReachRequest
-from puncture_twin.planning.reach.branch_paths import every_branch
-from puncture_twin.planning.reach.first_clear import FirstClear
-from puncture_twin.planning.reach.survey import Surveyed, surveyed
-from puncture_twin.planning.reach.trial import Blocked, tried_all
-from puncture_twin.planning.reach.unreachable import why_unreachable
+from puncture_twin.planning.reach.survey import (
+    MARGIN_DIGITS,
+    MAX_SWEEP_MM,
+    Insertion,
+    ReachAnswer,
+    ReachRequest,
+    Surveyed,
+    every_branch,
+    sampled,
+    surveyed,
+)
 
 
 def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAnswer:
@@ -148,3 +172,272 @@ def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: 
     outwards = np.array([request.outward_base for request in requests])
     rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls
     return surveyed(checker.model, requests, needle_lines(targets, outwards), rolls)
+
+
+class NextMotions(NamedTuple):
+    """Of each request whose search goes on, the motion that is tried next."""
+
+    rows: Ints
+    """Shape (m,): which requests."""
+    branches: Ints
+    rolls: Ints
+    standoffs: Floats
+    """Shape (m, 6), rad: where the motions begin."""
+    round_clear: Bools
+    """Shape (m,): whether holder and needle are known to touch neither patient nor boxes there."""
+
+
+class FirstClear:
+    """The searches of many requests, side by side: of each the motions that kinematics allows, the best margin first.
+
+    All motions of a request begin with the needle in the same place, and needle and holder are round about its axis: if
+    they were clear of patient and boxes once, they need not be checked again.
+
+    Attributes:
+        answers: Of each request its first motion that touches nothing; None as long as there is none.
+        deepest: Of each what blocked the motion that came farthest, of equals the best margin's; None if nothing did.
+    """
+
+    def __init__(self, surveyed: Sequence[Surveyed]) -> None:
+        self.answers: list[ReachAnswer | None] = [None] * len(surveyed)
+        self.deepest: list[Blocked | None] = [None] * len(surveyed)
+        self._surveyed = surveyed
+        self._starts = np.array([found.starts for found in surveyed])
+        self._turns = np.array([found.turns for found in surveyed])
+        margins = np.array([found.margins for found in surveyed])
+        flat = margins.reshape(len(surveyed), -1)
+        order = np.argsort(-np.round(flat, MARGIN_DIGITS), axis=1, kind="stable")  # NaN comes last
+        self._left = ~np.isnan(np.take_along_axis(flat, order, axis=1))
+        self._branches, self._rolls = np.divmod(order, margins.shape[2])
+        self._round_clear = np.zeros(len(surveyed), np.bool_)
+
+    def next_motions(self) -> NextMotions:
+        """What is tried next; of no requests where all searches are over."""
+        rows = np.flatnonzero(self._left.any(axis=1))
+        at = self._left[rows].argmax(axis=1)
+        branches, rolls = self._branches[rows, at], self._rolls[rows, at]
+        standoffs = self._starts[rows, branches] + self._turns[rows, branches, rolls]
+        return NextMotions(rows, branches, rolls, standoffs, self._round_clear[rows])
+
+    def take(self, checker: StateChecker, motions: NextMotions, contacts: Sequence[Contact | None]) -> None:
+        """Go on from what the motions touch at their standoffs, and check those along the path that touch nothing."""
+        tries = [self._tried(checker, motions, *each) for each in enumerate(contacts)]
+        for row, found in zip(motions.rows.tolist(), tries, strict=True):
+            if isinstance(found, ReachAnswer):
+                self.answers[row] = found
+            elif (most := self.deepest[row]) is None or found.depth_mm > most.depth_mm:
+                self.deepest[row] = found
+        over = np.array([isinstance(found, ReachAnswer) for found in tries], np.bool_)
+        hopeless = np.array([isinstance(found, Blocked) and found.at_any_roll for found in tries], np.bool_)
+        self._left[motions.rows, self._left[motions.rows].argmax(axis=1)] = False
+        self._left[motions.rows[over]] = False
+        rows = motions.rows[hopeless]
+        self._left[rows] &= self._branches[rows] != motions.branches[hopeless, None]
+        past = [contact is None or contact.other in BODY_NAMES for contact in contacts]  # the workcell is checked first
+        self._round_clear[motions.rows] |= np.array(past, np.bool_)
+
+    def drop_folded(self, checker: StateChecker) -> None:
+        """Drop the branches on which the arm touches itself at the standoff whatever the roll.
+
+        To be called where a motion of each request was tried: those that go no farther than the standoff change neither
+        its answer nor what was deepest.
+        """
+        rows, at = np.nonzero(self._left)
+        left = np.zeros(self._starts.shape[:2], np.bool_)
+        left[rows, self._branches[rows, at]] = True
+        branches, rows = np.nonzero(left.T)  # neighbours in turn: what is proven of one is nearly proven of the next
+        left[rows, branches] = ~checker.folded(self._starts[rows, branches] + self._turns[rows, branches, 0])
+        self._left &= np.take_along_axis(left, self._branches, axis=1)
+
+    def _tried(
+        self, checker: StateChecker, motions: NextMotions, at: int, contact: Contact | None
+    ) -> ReachAnswer | Blocked:
+        """What comes of one of the motions, which touches so at its standoff."""
+        if contact is not None:
+            return blocked_at_standoff(contact)
+        found, branch, roll = self._surveyed[motions.rows[at]], int(motions.branches[at]), int(motions.rolls[at])
+        turn = found.turns[branch, roll]
+        insertion = Insertion(found.line, branch, float(found.rolls[roll]), turn, motions.standoffs[at])
+        return tried(checker, found, insertion)
+
+
+ROLL_BODIES = frozenset({"wrist_3", "tool"})
+"""The bodies that turn with the roll and are not round about the needle: other contacts are the same at any roll."""
+
+
+class Blocked(NamedTuple):
+    """Where a motion ends early, and whether another roll on the same branch would touch the same."""
+
+    depth_mm: float
+    detail: str
+    at_any_roll: bool = True
+    at_standoff: bool = False
+    contact: Contact | None = None
+
+
+def tried_all(checker: StateChecker, motions: Sequence[tuple[Surveyed, Insertion]]) -> list[ReachAnswer | Blocked]:
+    """Check motions for contacts: the standoffs of all at once, then those motions whose standoff is clear.
+
+    Args:
+        checker: Checks contacts, in the base frame.
+        motions: Each with the survey that it comes from.
+
+    Returns:
+        For each motion: that the arm reaches the direction by it, or where it ends.
+    """
+    standoffs = np.array([insertion.standoff for _, insertion in motions]).reshape(-1, 6)
+    found: list[ReachAnswer | Blocked] = []
+    for motion, contact in zip(motions, checker.contacts(standoffs, needle_may_touch_patient=False), strict=True):
+        if contact is None:
+            found.append(tried(checker, *motion))
+        else:
+            found.append(blocked_at_standoff(contact))
+    return found
+
+
+def blocked_at_standoff(contact: Contact) -> Blocked:
+    """What a contact at its standoff makes of a motion."""
+    detail = f"{contact.body} touches {contact.other} at standoff"
+    return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
+
+
+def tried(checker: StateChecker, found: Surveyed, insertion: Insertion) -> ReachAnswer | Blocked:
+    """Check one motion for contacts, whose standoff is clear."""
+    model = checker.model
+    lengths = found.request.needle_length_mm, found.request.standoff_mm
+    line, branch, roll, turn, _ = insertion
+    q, depths = sampled(checker.swept, line, branch, turn, lengths, len(found.depths), MAX_SWEEP_MM)
+    stop = first_stop(model, q, depths)
+    if stop is not None:
+        return Blocked(stop.depth_mm, stop.detail)
+    margin = reach_margin(model, q)
+    if margin < 0.0:
+        return Blocked(0.0, "a joint leaves its limits on the way", at_any_roll=False)
+    first = checker.first_contact(q, needle_may_touch_patient=True)
+    if first is None:
+        return ReachAnswer(True, Reason.NONE, None, "", None, roll, branch, q, depths, margin)
+    depth, contact = float(depths[first.at]), first.contact
+    detail = f"{contact.body} touches {contact.other} {depth:.1f} mm after the standoff"
+    return Blocked(depth, detail, ROLL_BODIES.isdisjoint(contact), contact=contact)
+
+
+def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
+    """What keeps every branch from one flange pose (4, 4), in mm: one sentence for people."""
+    place = (
+        f"the flange would stand {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
+    )
+    missing = float(missing_reach_mm(model, T_base_flange)[0])
+    if math.isinf(missing):
+        return f"{place}, its wrist too close to the base's axis for any shoulder angle"
+    if missing > 0.0:
+        return f"{place}, {missing:.1f} mm out of the arm's reach in this direction"
+    solutions = inverse(model, T_base_flange)[0]
+    best = singularity(model, solutions[np.nanargmax(singularity(model, solutions).least())])
+    return f"{place}, too near the {best.nearest} singularity ({best.least():.3f}, at least {MIN_SINGULARITY})"
+
+
+def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
+    """By how much upper arm and forearm are too short (or too long, folded) to reach each flange pose.
+
+    Args:
+        model: The arm.
+        T_base_flange: Shape (n, 4, 4), mm.
+
+    Returns:
+        Shape (n,), mm: the least over all branches; 0 where a solution exists; infinite where no branch can turn its
+        wrist so, because the wrist centre stands inside the cylinder of radius d4 about axis 1.
+    """
+    poses = np.array(T_base_flange, dtype=np.float64, order="C").reshape(-1, 4, 4)
+    missing = np.empty(len(poses))
+    _missing_reach(model.lengths, poses, missing)
+    return missing
+
+
+@allocation_free()
+def _missing_reach(lengths, T, missing):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``missing`` (n,) in mm: how far upper arm and forearm are too short or too long for ``T`` (n, 4, 4)."""
+    upper, fore, d6 = abs(lengths[1]), abs(lengths[2]), lengths[5]
+    for row in range(len(T)):
+        R, p = T[row, :3, :3], T[row, :3, 3]
+        missing[row] = math.inf
+        for side in (1.0, -1.0):
+            q1 = pan_angle(lengths, p[0] - d6 * R[0, 2], p[1] - d6 * R[1, 2], side)
+            if math.isnan(q1):
+                continue
+            for flip in (1.0, -1.0):
+                _, _, _, x, y = wrist_angles(lengths, R, p, math.cos(q1), math.sin(q1), flip)
+                far = math.sqrt(x * x + y * y)
+                missing[row] = min(missing[row], max(far - (upper + fore), abs(upper - fore) - far, 0.0))
+
+
+MARGIN_FRACTION = 0.5
+"""A pose with less than this fraction of the best margin is no goal: a shorter path is not worth a cramped arm."""
+
+NEAREST = 4
+"""Goals kept of each branch: those nearest to home."""
+
+
+def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats) -> list[ReachAnswer]:
+    """The motions that may follow an approach, nearest to home first; empty if the arm does not reach the direction.
+
+    Each answer of :func:`every_reach`, and the same with any joint turned by whole turns, as long as all of the
+    insertion stays within the limits.
+
+    Args:
+        checker: Judges contacts, in the base frame.
+        request: The direction.
+        q_home: Shape (6,), rad.
+
+    Raises:
+        InputError: See :func:`every_reach`.
+    """
+    reached = every_reach(checker, request)
+    least = MARGIN_FRACTION * max((answer.margin for answer in reached), default=0.0)
+    every = [rotated for answer in reached for rotated in _rotated(checker, answer) if rotated.margin >= least]
+    every.sort(key=lambda answer: float(np.linalg.norm(answer.insertion_q[0] - q_home)))
+    kept: dict[int, list[ReachAnswer]] = {}
+    for answer in every:
+        kept.setdefault(answer.branch, []).append(answer)
+    chosen = {id(answer) for branch in kept.values() for answer in branch[:NEAREST]}
+    return [answer for answer in every if id(answer) in chosen]
+
+
+def _rotated(checker: StateChecker, answer: ReachAnswer) -> list[ReachAnswer]:
+    """An answer with every combination of whole turns that its limits allow; the bodies stand where they stood."""
+    motions = [
+        answer.insertion_q + (q - answer.insertion_q[0])
+        for q in wrapped_solutions(checker.model, answer.insertion_q[0])
+    ]
+    inside = [q for q in motions if checker.model.within_limits(q).all()]
+    return [replace(answer, insertion_q=q, margin=reach_margin(checker.model, q)) for q in inside]
+
+
+NEEDLE = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
+STANDOFF_MM = 120.0
+TARGET = np.array([360.0, 20.0, 100.0])
+"""In the middle of the body, mm, base frame."""
+
+OUTWARD = np.array([[0.0, 0.0, 1.0], [-0.3, 0.2, 0.93], [0.9, 0.1, 0.3], [0.3, 0.0, 0.95]])
+"""Two directions that the arm reaches, and two that it does not."""
+
+CORNERS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+"""Of an octahedron, seen from outside counterclockwise."""
+
+
+def small_workcell() -> FastChecker:
+    """A UR3, a body over a table, something else beside it; mm, base frame."""
+    table = Box("table", pose(np.eye(3), TARGET - [0.0, 0.0, 220.0]), (300.0, 300.0, 20.0))
+    body, beside = octahedron(TARGET, 80.0), octahedron(TARGET - [0.0, 200.0, 100.0], 40.0)
+    return FastChecker(ur_model("ur3"), NEEDLE, [table], body, outside=beside, padding_mm=1.0)
+
+
+def ask_arm(checker: FastChecker) -> list[ReachAnswer]:
+    """Of each of the small workcell's directions whether the arm reaches it."""
+    outward = OUTWARD / np.linalg.norm(OUTWARD, axis=1, keepdims=True)
+    return assess_reach_all(checker, [ReachRequest(TARGET, u, NEEDLE.needle_length_mm, STANDOFF_MM) for u in outward])
+
+
+def octahedron(at: Floats, radius_mm: float) -> TriangleMesh:
+    """Six corners so far from a place (3,), mm."""
+    return TriangleMesh(at + radius_mm * CORNERS, FACES)

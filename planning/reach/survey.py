@@ -1,27 +1,31 @@
-"""What kinematics alone says of many directions: every branch and roll."""
+"""What kinematics alone says of many directions: every branch and roll.
+
+What the arm has to reach for one direction, and whether it does.
+
+The path of each branch along the needle, by inverse kinematics.
+
+A straight insertion as states so close to one another that what holds at them holds between them.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Container, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, MAX_JOINT_STEP_RAD_PER_MM, NeedleLine
-from puncture_twin.planning.arm.inverse_kinematics import (
-    EVERY_BRANCH,
-    N_BRANCHES,
-    TURN,
-    fill_branches,
-    wrapped_angle,
-)
-from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, least_term
+from puncture_twin.planning.arm.inverse_kinematics import EVERY_BRANCH, N_BRANCHES, TURN, fill_branches, wrapped_angle
+from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, least_term, link_frames
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
-from puncture_twin.planning.reach.answer import ReachRequest
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.collision.state_checker import Contact, SweptBodies, motion_bounds
 
 MAX_SWEEP_MM = 2.0
 """Between two collision checks no body point moves farther, so that it is never more than half of this from where it
@@ -234,3 +238,196 @@ def _rolled(limits, rolls, full, reached, margins, turns):  # type: ignore[no-un
             margin = min(margin, below / full, above / full)
         if margin >= 0.0:
             margins[i] = margin
+
+
+SAME_UNIT = 1e-9
+"""How far a direction's length may be from 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReachRequest:
+    """One direction to reach along.
+
+    Attributes:
+        target_base: Shape (3,), mm: the lesion, base frame.
+        outward_base: Shape (3,), unit: from the target out of the body, base frame.
+        needle_length_mm: Flange to tip.
+        standoff_mm: Tip to target before the insertion starts.
+
+    Raises:
+        InputError: If something is not finite, the direction not a unit vector, or a length not positive.
+    """
+
+    target_base: Floats
+    outward_base: Floats
+    needle_length_mm: float
+    standoff_mm: float
+
+    def __post_init__(self) -> None:
+        for name in ("target_base", "outward_base"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
+                raise InputError(f"{name} = {array}", where="reach request", allowed="three finite numbers")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if abs(math.hypot(*self.outward_base.tolist()) - 1.0) > SAME_UNIT:
+            raise InputError(f"outward_base = {self.outward_base}", where="reach request", allowed="a unit vector")
+        for name in ("needle_length_mm", "standoff_mm"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise InputError(f"{name} = {getattr(self, name)}", where="reach request", allowed="finite and above 0")
+
+
+@dataclass(frozen=True, eq=False)
+class ReachAnswer:
+    """Whether and how the arm reaches along one direction.
+
+    Attributes:
+        reachable: The verdict.
+        reason: ``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``.
+        depth_mm: How far the needle was inserted from standoff when it was blocked; None for other reasons.
+        detail: One sentence for people: what touched what, or what was missing; empty when reachable.
+        contact: What touched what, where that was the reason.
+        roll: Turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable.
+        branch: Index among the eight branches of ``inverse``; -1 when not reachable.
+        insertion_q: Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable.
+        insertion_depth_mm: Shape (m,), mm inserted from standoff at each row.
+        margin: 0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the
+            three singularity terms. 0 when not reachable.
+    """
+
+    reachable: bool
+    reason: Reason
+    depth_mm: float | None
+    detail: str
+    contact: Contact | None
+    roll: float
+    branch: int
+    insertion_q: Floats
+    insertion_depth_mm: Floats
+    margin: float
+
+    @classmethod
+    def refused(
+        cls, reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None
+    ) -> ReachAnswer:
+        """Of a direction that the arm does not reach, or not to the target."""
+        return cls(False, reason, depth_mm, detail, contact, math.nan, -1, np.empty((0, 6)), np.empty(0), 0.0)
+
+    def __post_init__(self) -> None:
+        self.insertion_q.setflags(write=False)
+        self.insertion_depth_mm.setflags(write=False)
+
+
+def every_branch(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Floats:
+    """Every branch's path along the needle at roll 0. A roll adds to q6 and to nothing else.
+
+    Args:
+        model: The arm.
+        line: The needle's line.
+        distance_mm: Shape (m,): target to flange along the path.
+
+    Returns:
+        Shape (8, m, 6), rad, without jumps of whole turns; NaN from where a branch first does not exist.
+    """
+    q = np.empty((N_BRANCHES, len(distance_mm), 6))
+    _every_branch(model.lengths, *line, distance_mm, q)
+    return q
+
+
+@nb.njit(cache=True)
+def _every_branch(lengths, R, target, outward, distances, q):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``q`` (8, m, 6): every branch at each distance (m,) from the target, without jumps of whole turns.
+
+    NaN from where a branch first does not exist.
+    """
+    p, here = np.empty(3), np.empty((8, 6))
+    for k in range(len(distances)):
+        for i in range(3):
+            p[i] = target[i] + distances[k] * outward[i]
+        fill_branches(lengths, R, p, here, np.int64(EVERY_BRANCH))
+        for branch in range(8):
+            for joint in range(6):
+                angle = here[branch, joint]
+                if k > 0:
+                    before = q[branch, k - 1, joint]
+                    angle = before + wrapped_angle(angle - before)  # NaN stays NaN
+                q[branch, k, joint] = angle
+
+
+@nb.njit(cache=True)
+def fill_branch_path(lengths, R, target, outward, distances, branch, turn, q):  # type: ignore[no-untyped-def]  # numba infers
+    """The path of one branch along the needle, without jumps of whole turns; NaN from where it first does not exist.
+
+    Args:
+        lengths: The arm.
+        R: As in :class:`NeedleLine`.
+        target: As in :class:`NeedleLine`, mm.
+        outward: As in :class:`NeedleLine`.
+        distances: Shape (m,), mm: target to flange along the path.
+        branch: Index among the eight of ``inverse``.
+        turn: Shape (6,), rad: added to every row, such as a roll and whole turns.
+        q: Shape (m, 6), filled, rad.
+    """
+    p, here = np.empty(3), np.empty((8, 6))
+    for k in range(len(distances)):
+        for i in range(3):
+            p[i] = target[i] + distances[k] * outward[i]
+        fill_branches(lengths, R, p, here, np.int64(1) << branch)
+        for joint in range(6):
+            angle = here[branch, joint] + turn[joint]
+            q[k, joint] = angle if k == 0 else q[k - 1, joint] + wrapped_angle(angle - q[k - 1, joint])
+
+
+class Sampled(NamedTuple):
+    """A motion's states and where they are."""
+
+    q: Floats
+    """Shape (m, 6), rad; NaN from where the branch first does not exist."""
+    depths_mm: Floats
+    """Shape (m,), from the standoff, evenly spaced."""
+
+
+def sampled(
+    swept: SweptBodies,
+    line: NeedleLine,
+    branch: int,
+    turn: Floats,
+    lengths_mm: tuple[float, float],
+    samples: int,
+    most_mm: float,
+) -> Sampled:
+    """The motion of one branch along a needle, sampled so that no body moves more than so far from state to state.
+
+    Args:
+        swept: The arm's bodies.
+        line: The needle's line.
+        branch: Index among the eight of ``inverse``.
+        turn: Shape (6,), rad: added to every state.
+        lengths_mm: Flange to tip, and tip to target at the standoff.
+        samples: To begin with, 2 or more.
+        most_mm: What no body's motion exceeds; see :meth:`SweptBodies.bounds_mm`.
+    """
+    bodies = swept.corners, swept.longest_lever_mm
+    return Sampled(*_sampled(swept.model.lengths, *line, branch, turn, lengths_mm, samples, bodies, most_mm))
+
+
+@nb.njit(cache=True)
+def _sampled(  # type: ignore[no-untyped-def]  # numba infers
+    lengths, R, target, outward, branch, turn, lengths_mm, samples, bodies, most_mm
+):
+    """As :func:`sampled`: with as many more samples as the largest motion asks for, until it asks for none."""
+    needle, standoff = lengths_mm
+    while True:
+        step = standoff / (samples - 1)
+        depths, distances = np.empty(samples), np.empty(samples)
+        for k in range(samples):
+            depths[k] = k * step if k < samples - 1 else standoff
+            distances[k] = needle + standoff - depths[k]
+        q, frames, bounds = np.empty((samples, 6)), np.empty((samples, 7, 4, 4)), np.empty((samples - 1, 6))
+        fill_branch_path(lengths, R, target, outward, distances, branch, turn, q)
+        link_frames(lengths, q, frames)
+        motion_bounds(frames, q, bodies[0], bodies[1], bounds)
+        worst = bounds.max()
+        if not worst > most_mm:  # NaN: the branch ends on the way
+            return q, depths
+        samples = math.ceil((samples - 1) * worst / most_mm) + 1

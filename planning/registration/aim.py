@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.arm.error_jacobian import error_jacobian
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.singularity import away_from_singularities
+from puncture_twin.planning.arm.kinematics import away_from_singularities, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case

@@ -6,17 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
-from puncture_twin.planning.arm.error_jacobian import N_PARAMETERS, PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.singularity import farthest_from_singular, singularity
-from puncture_twin.planning.arm.stated_arm import check_arm
+from puncture_twin.planning.arm.kinematics import (
+    N_PARAMETERS,
+    PARAMETERS,
+    check_arm,
+    error_jacobian,
+    farthest_from_singular,
+    singularity,
+)
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ArmUncertainty, ErrorModel
-from puncture_twin.planning.geometry.frames import frame_about
-from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, check_pairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise

@@ -13,8 +13,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.case.tables.registration_section import MarkerSection
-from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
+from puncture_twin.planning.case.tables import MarkerSection
+from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.aim import aim_at, reached_insertion

@@ -18,10 +18,16 @@ from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 from puncture_twin.planning.search.ranking import ranked
-from puncture_twin.planning.search.selection.windows import find_windows
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances
-from puncture_twin.planning.uncertainty.chances import Chances, check_limits, demanding, touch_limit
-from puncture_twin.planning.uncertainty.touch import Proximity, touch_bound
+from puncture_twin.planning.search.windows import find_windows
+from puncture_twin.planning.uncertainty.chance_model import (
+    ChanceModel,
+    Chances,
+    check_limits,
+    demanding,
+    refined_chances,
+    touch_limit,
+)
+from puncture_twin.planning.uncertainty.hit import Proximity, touch_bound
 
 
 def with_chances(

@@ -15,8 +15,8 @@ from puncture_twin.planning.base.findings import Finding
 from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
-from puncture_twin.planning.case.angle_grid import AngleGrid
-from puncture_twin.planning.uncertainty.chances import Chances
+from puncture_twin.planning.case.entry import AngleGrid
+from puncture_twin.planning.uncertainty.chance_model import Chances
 
 ARM_CHECKED = "checked"
 """What ``Candidates.arm_note`` says where a safe candidate is one that the arm can reach and insert along."""
@@ -192,7 +192,7 @@ class Candidates(Columns):
             declares no tissue.
         grid: The regular grid that the rows are; None for any others.
         cone_source: `CONE_OF_GRID` or `CONE_CERTIFIED`; "" where there are no safe cones.
-        findings: What else would be safe (`planning.search.alternatives`).
+        findings: What else would be safe (`planning.search.context`).
     """
 
     theta: Floats

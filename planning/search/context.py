@@ -1,8 +1,11 @@
-"""A case, read and ready to be asked: its structures, its engine, and the arm in its workcell."""
+"""A case, read and ready to be asked: its structures, its engine, and the arm in its workcell.
+
+What else would be safe: with less assumed beyond the image, and with a shorter needle of the catalogue.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib.metadata import version
@@ -13,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
+from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE, beyond_images
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.cache.array_cache import user_cache
@@ -22,28 +26,26 @@ from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.base.progress import Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.case.options import NO_OPTIONS, CaseOptions
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.clearance.cross_check import CrossChecked, cross_check
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine
-from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.collision.surroundings import with_surroundings
-from puncture_twin.planning.collision.workcell import case_checker
+from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, cross_check
+from puncture_twin.planning.collision.workcell import case_checker, with_surroundings
 from puncture_twin.planning.evidence.checks import findings
-from puncture_twin.planning.reach.standoff import own_lengths
+from puncture_twin.planning.reach.standoff import axis_lengths, own_lengths, own_paths
 from puncture_twin.planning.registration.placement import Placement, load_placement
-from puncture_twin.planning.search.alternatives import alternatives
-from puncture_twin.planning.search.arm_reach import ArmReach
-from puncture_twin.planning.search.bedside.entry_facts import EntryFacts, entry_facts
-from puncture_twin.planning.search.bedside.entry_place import Landmark
-from puncture_twin.planning.search.bending.path_layers import check_tissues
+from puncture_twin.planning.search.bedside import EntryFacts, Landmark, entry_facts
+from puncture_twin.planning.search.bending import check_tissues
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
+from puncture_twin.planning.search.constraints import ArmReach
 from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.planning.search.phases.moving_weights import breath_warnings
-from puncture_twin.planning.search.search import search
+from puncture_twin.planning.search.phases import breath_warnings
+from puncture_twin.planning.search.search import organ_candidates, search
 from puncture_twin.planning.search.sides import Side, sides_of
+from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
@@ -243,3 +245,43 @@ def prepare(
         error = None if reach is None or placement is None else pose_error(case, placement.registration)
         chance = chance_model(case, anatomy, measurer, error)
     return CaseContext(case, anatomy, placement, measurer, reach, chance, watcher, stages)
+
+
+def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates) -> Iterator[Finding]:
+    """What else would be safe for the organs; ``found`` are the case's directions, ranked."""
+    more = hangs_on_beyond(case, anatomy, found)
+    if more:
+        said = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
+        yield Finding("hangs_on_beyond_image", Severity.NOTE, said, {"directions": more})
+    if case.needle.lengths_mm:
+        yield _catalogue(case, anatomy, engine, found)
+
+
+def hangs_on_beyond(case: Case, anatomy: Anatomy, found: Candidates) -> int:
+    """How many directions are kept from being safe by that alone by which a body is wider beyond its image."""
+    clearance, named = found.clearance, found.verdict.structure == BEYOND_IMAGE
+    others = ~np.isnan(clearance.margins) & (np.array(clearance.structures) != BEYOND_IMAGE)
+    rows = np.flatnonzero(named & (clearance.distance[:, others] >= clearance.margins[others]).all(axis=1))
+    if not len(rows) or case.ct.beyond_mm == 0.0:
+        return 0
+    narrow = replace(case, ct=replace(case.ct, beyond_mm=0.0))
+    (solid,), outward = beyond_images(narrow, anatomy.skin, anatomy.scan).structures, found.outward_ct[rows]
+    lengths = axis_lengths(case, [solid], own_paths(case, anatomy.skin, outward))
+    axes = FastEngine([solid.mesh]).measure(case.target_ct, outward, lengths, shown=False)
+    return int((axes.distance >= case.needle.radius_mm + solid.margin_mm).sum())
+
+
+def _catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates) -> Finding:
+    """How many directions are safe with each needle, and the shortest that fits the best path of each window."""
+    directions = Directions(found.theta, found.beta, found.outward_ct, found.grid)
+    safe = {
+        length: organ_candidates(replace(case, needle=case.needle.of_length(length)), anatomy, engine, directions).safe
+        for length in sorted(case.needle.lengths_mm)
+    }
+    said = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
+    best = [window.best for window in find_windows(found).windows]
+    shortest = [next((length for length, rows in safe.items() if rows[row]), np.nan) for row in best]
+    fits = ", ".join(f"{length:g} mm" for length in shortest)
+    numbers = {"lengths_mm": list(safe), "safe": [float(rows.sum()) for rows in safe.values()], "shortest_mm": shortest}
+    said += f"; the shortest that fits the best path of each window: {fits or 'none'}"
+    return Finding("needle_catalogue", Severity.NOTE, f"needles, safe for the organs: {said}", numbers)

@@ -14,13 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances
-from puncture_twin.planning.uncertainty.chances import touch_limit
-from puncture_twin.planning.uncertainty.hit import hit_in_ball, hit_in_mesh
-from puncture_twin.planning.uncertainty.lines.line_sampling import Needles
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances, touch_limit
+from puncture_twin.planning.uncertainty.hit import Proximity, hit_in_ball, hit_in_mesh, touch_chance
+from puncture_twin.planning.uncertainty.lines import Needles
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, error_budget
 from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, not_modelled, reading_parts
-from puncture_twin.planning.uncertainty.touch import Proximity, touch_chance
 
 WISHED_HIT = 0.99
 """Chance to hit that is wanted where the case demands none."""

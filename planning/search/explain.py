@@ -16,9 +16,8 @@ from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.reach.standoff import standoffs
-from puncture_twin.planning.search.along_path import Stretch, stretches
-from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
-from puncture_twin.planning.search.bending.insertion import Insertion, insertion_along
+from puncture_twin.planning.search.bedside import EntryFacts
+from puncture_twin.planning.search.bending import Insertion, Stretch, insertion_along, stretches
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.doubt import Doubt
 

@@ -1,20 +1,27 @@
-"""The batch search: a case in, one checked row per direction out."""
+"""The batch search: a case in, one checked row per direction out.
+
+What skin and organs allow: path, clearance and verdict of every direction, without the arm.
+"""
 
 from __future__ import annotations
 
+import numpy as np
+
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
-from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
-from puncture_twin.planning.reach.standoff import own_lengths
-from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
+from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, measure
+from puncture_twin.planning.geometry.containment import crossings, holds
+from puncture_twin.planning.reach.standoff import axis_lengths, own_lengths, own_paths
+from puncture_twin.planning.search.bending import with_bending
 from puncture_twin.planning.search.candidate_chances import with_best_refined, with_chances, with_joint_chances
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
-from puncture_twin.planning.search.ranking import ranked
-from puncture_twin.planning.search.selection.safe_cone import with_grid_cone
+from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
+from puncture_twin.planning.search.constraints import ArmReach, first_broken, with_reach
+from puncture_twin.planning.search.phases import with_breathing, with_breathing_reach
+from puncture_twin.planning.search.ranking import ranked, with_grid_cone
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 
 
@@ -51,3 +58,84 @@ def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, direc
     """How far the needle's axis is from every structure in every direction."""
     outward = directions.outward_ct
     return engine.measure(case.target_ct, outward, own_lengths(case, anatomy, outward))
+
+
+def tissue_crossed(
+    structures: tuple[Structure, ...], target_structure: str, target_ct: Floats, outward_ct: Floats, path_length: Floats
+) -> Floats:
+    """Length of each path, target to skin, inside structures that may be crossed; shape (n,), mm.
+
+    Counted are roles ``traverse`` and ``target``, but not the target's own structure, and only closed surfaces: of an
+    open one the inside is not known. Nested structures count each.
+    """
+    total = np.zeros(len(outward_ct))
+    for structure in structures:
+        crossable = structure.role in {Role.TRAVERSE, Role.TARGET} and structure.name != target_structure
+        if crossable and structure.mesh.closed:
+            total += inside_length(structure, target_ct, outward_ct, path_length)
+    return np.where(np.isnan(path_length), np.nan, total)
+
+
+def inside_length(structure: Structure, target_ct: Floats, outward_ct: Floats, path_length: Floats) -> Floats:
+    """Length of each path inside one closed structure, shape (n,), mm.
+
+    Crossings alternate between leaving and entering, so the length is their alternating sum, closed by the path's
+    end where the path ends inside.
+    """
+    found = crossings(structure.mesh, target_ct, outward_ct)
+    starts_inside = holds(structure.mesh, target_ct)
+    limit = np.nan_to_num(path_length, nan=0.0)
+    number = np.arange(len(found.ray)) - found.first[found.ray]
+    sign = np.where((number % 2 == 0) == starts_inside, 1.0, -1.0)
+    signed = sign * np.minimum(found.depth, limit[found.ray])
+    inside = np.bincount(found.ray, weights=signed, minlength=len(outward_ct))
+    ends_inside = (found.count % 2 == 0) == starts_inside
+    return np.asarray(np.maximum(inside + np.where(ends_inside, limit, 0.0), 0.0))
+
+
+def organ_candidates(
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    directions: Directions,
+    axes: AxisDistances | None = None,
+) -> Candidates:
+    """Check every direction against skin and organs alone, bent and breathing as declared; nothing is ranked yet.
+
+    Args:
+        case: The validated case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
+        directions: What to check.
+        axes: What `organ_distances` says of them; None measures them here.
+    """
+    needle, outward, checked = case.needle, directions.outward_ct, anatomy.checked
+    paths = own_paths(case, anatomy.skin, outward)
+    lengths = axis_lengths(case, checked, paths)
+    clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes)
+    verdicts = first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle)
+    demanding, count = np.array([s.demands_margin for s in checked], bool), len(directions)
+    found = Candidates(
+        theta=directions.theta,
+        beta=directions.beta,
+        outward_ct=outward,
+        verdict=verdicts,
+        path=Path(
+            entry_ct=paths.entry_ct,
+            length=paths.path_length,
+            skin_angle=paths.skin_angle,
+            tissue=tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length),
+        ),
+        clearance=Clearance(
+            structures=tuple(s.name for s in checked),
+            margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
+            distance=clearances.clearance,
+            least=clearances.clearance[:, demanding].min(axis=1, initial=np.inf),
+        ),
+        arm=ArmColumns.unknown(count),
+        ranking=Ranking.none(count),
+        safe_cone=np.full(count, np.nan),
+        grid=directions.grid,
+    )
+    bound = None if case.bending is None else case.bending.bound(needle.longest_path_mm)
+    return with_breathing(case, anatomy, engine, with_bending(anatomy, found, bound), bound)

@@ -12,7 +12,7 @@ from puncture_twin.planning.anatomy.skin_entry import SkinPaths, skin_paths
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, GRID_SLACK, angles, grid
-from puncture_twin.planning.geometry.crossings import crossings
+from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.search.explain import finite

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.search.candidates import ANGLE_DIGITS, Candidates
-from puncture_twin.planning.search.selection.windows import find_windows
-from puncture_twin.planning.uncertainty.chances import Chances
+from puncture_twin.planning.search.windows import find_windows
+from puncture_twin.planning.uncertainty.chance_model import Chances
 
 
 def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:

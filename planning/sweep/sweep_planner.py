@@ -2,35 +2,36 @@
 
 A direction is passed only if the search calls it safe: organs, skin and the arm's straight insertion. The needle stays
 outside the body; arm, holder and needle keep their distance all the way.
+
+A sweep: the needle's axis through one fixed point while its direction changes.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.singularity import away_from_singularities
-from puncture_twin.planning.arm.speed_limits import slowed
+from puncture_twin.planning.arm.kinematics import away_from_singularities, flange_pose, slowed
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import home_configuration
-from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, plan_approach
 from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.motion.path_check import dense_states
-from puncture_twin.planning.reach.answer import ReachRequest
-from puncture_twin.planning.reach.goals import approach_goals
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.reach.reach import approach_goals
 from puncture_twin.planning.reach.standoff import standoffs
+from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.planning.sweep.sweep_plan import SweepPlan
 
 STEP = np.radians(1.0)
 """Between two directions that are checked, at most: half of the search's usual grid."""
@@ -187,3 +188,36 @@ def _why_not(checker: CellChecker, before: Floats, q: Floats, step: float) -> st
     states = dense_states(checker, np.stack([before, q]), RESOLUTION_RAD / FINER)
     contact = checker.first_contact(states, needle_may_touch_patient=False)
     return "" if contact is None else f"{contact.contact.body} touches {contact.contact.other}"
+
+
+@dataclass(frozen=True, eq=False)
+class SweepPlan:
+    """A motion about the virtual TCP (Chen 2019): the point on the needle's axis, a standoff before its tip.
+
+    Attributes:
+        model: The arm.
+        needle_length_mm: Flange to tip.
+        standoff_mm: Tip to virtual TCP.
+        point_base: Shape (3,), mm: where the virtual TCP stays, the target.
+        angles: Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less.
+        wanted: Theta and beta, rad, where it should have ended.
+        approach: From home to the first direction.
+        sweep: Through all of them.
+        stopped: Where and why it ends before; empty where it does not.
+    """
+
+    model: UrModel
+    needle_length_mm: float
+    standoff_mm: float
+    point_base: Floats
+    angles: Floats
+    wanted: tuple[float, float]
+    approach: Trajectory
+    sweep: Trajectory
+    stopped: str
+
+    def off_point_mm(self, T_base_flange: Floats) -> Floats:
+        """How far flange poses (m, 4, 4), mm, leave the virtual TCP from its point, shape (m,)."""
+        reach = self.needle_length_mm + self.standoff_mm
+        virtual = T_base_flange[:, :3, 3] + reach * T_base_flange[:, :3, 2]
+        return np.asarray(np.linalg.norm(virtual - self.point_base, axis=1))

@@ -12,19 +12,24 @@ import numpy as np
 
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.singularity import away_from_singularities
+from puncture_twin.planning.arm.kinematics import away_from_singularities, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.case.bed import bed_frame
+from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.touch.straight_approach import ApproachCheckers, why_not
 from puncture_twin.planning.touch.touch_planner import PLANNED_PADDING_MM, approach_checkers
-from puncture_twin.planning.touch.tour_motions import NoMotionError, Stops, TouchTour, tour_through
+from puncture_twin.planning.touch.tour_motions import (
+    ApproachCheckers,
+    NoMotionError,
+    Stops,
+    TouchTour,
+    tour_through,
+    why_not,
+)
 from puncture_twin.planning.uncertainty.touch_choice import touch_candidates
 
 LEAST_POSES, MOST_POSES = 4, 12

@@ -14,9 +14,8 @@ from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.surroundings import case_boxes
-from puncture_twin.planning.collision.workcell import case_tool, outside_surface
-from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.collision.workcell import case_boxes, case_tool, outside_surface
+from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed
@@ -25,8 +24,15 @@ from puncture_twin.planning.registration.marker_noise import marker_noise, readi
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs
 from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.touch.straight_approach import TIP_MM, ApproachCheckers, why_not
-from puncture_twin.planning.touch.tour_motions import NoMotionError, Stops, TouchPlan, tour_through
+from puncture_twin.planning.touch.tour_motions import (
+    TIP_MM,
+    ApproachCheckers,
+    NoMotionError,
+    Stops,
+    TouchPlan,
+    tour_through,
+    why_not,
+)
 from puncture_twin.planning.uncertainty.pose_error import PoseError, expected_error_mm
 from puncture_twin.planning.uncertainty.touch_choice import Candidates, least_error, touch_candidates
 

@@ -1,24 +1,45 @@
-"""Markers to be touched, and the motions of a tour: from home through all standoffs at least cost, and back."""
+"""Markers to be touched, and the motions of a tour: from home through all standoffs at least cost, and back.
+
+The last stretch to a marker: a straight line along the needle, and whether the arm may take it.
+
+The needle must touch nothing but the marker: with its foremost `TIP_MM` taken off, it keeps its padding from
+the patient all the way, so that no shaft passes through them. Arm and holder keep their distance as everywhere.
+
+The puncture after touches: to where their registration puts the target, in the posture they were chosen for.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.arm.insertion import MAX_JOINT_STEP_RAD_PER_MM
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import flange_pose, slowed
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.collision.workcell import home_configuration
+from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.state_checker import NEEDLE_IN_PATIENT
+from puncture_twin.planning.collision.workcell import case_checker, home_configuration
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.motion.approach import plan_approach
+from puncture_twin.planning.motion.follow import follow_smoothly
+from puncture_twin.planning.motion.path_check import dense_states
 from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.plan.plan import Plan, motion_contact
+from puncture_twin.planning.plan.plan_check import roll_of
+from puncture_twin.planning.reach.standoff import standoffs
+from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.touch.straight_approach import STANDOFF_MM, line_to
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,3 +172,179 @@ def shortest_tour(cost: ArrayLike) -> tuple[int, ...]:
                 best[whole, last] = min((so_far + of[order[-1]][last], (*order, last)) for so_far, order in before)
     whole = (1 << n) - 1
     return min((best[whole, last][0] + of[last][n], best[whole, last][1]) for last in range(n))[1]
+
+
+STANDOFF_MM = 20.0
+"""Where the straight line begins, away from the marker: the needle is clear of the patient there."""
+
+SLOW_MM = 5.0
+"""From here on the tip moves at touching speed."""
+
+PAST_MM = 5.0
+"""So far beyond its believed place a marker is felt for; then the touch is given up."""
+
+TIP_MM = 8.0
+"""Of the needle that may be nearer than its padding to the patient: the marker sits on their skin."""
+
+STEP_MM = 0.5
+"""Between two configurations of the line."""
+
+RESOLUTION_RAD = 0.005
+"""Largest joint distance between two checked states of the line."""
+
+
+@dataclass(frozen=True, eq=False)
+class ApproachCheckers:
+    """Two views of one workcell.
+
+    Attributes:
+        whole: The arm with its needle.
+        blunted: The same with a needle that is `TIP_MM` shorter.
+    """
+
+    whole: CellChecker
+    blunted: CellChecker
+
+
+def line_to(model: UrModel, tip_mm: float, q_touch: Floats, from_mm: float, to_mm: float) -> Floats | None:
+    """Joints along the needle's line through a touch, shape (m, 6), rad; None where the arm cannot follow it.
+
+    Args:
+        model: The arm.
+        tip_mm: Flange to tip.
+        q_touch: Shape (6,), rad, the tip on the marker.
+        from_mm: Where the tip starts, mm before the marker; negative beyond it.
+        to_mm: Where it ends.
+    """
+    count = max(2, int(np.ceil(abs(from_mm - to_mm) / STEP_MM)) + 1)
+    distances = np.linspace(from_mm, to_mm, count)
+    poses = np.tile(flange_pose(model, q_touch), (count, 1, 1))
+    poses[:, :3, 3] -= distances[:, None] * poses[:, :3, 2]
+    every = nearest_within_limits(model, inverse(model, poses), q_touch)
+    away = np.abs(every - q_touch).max(axis=2)
+    q = every[np.arange(count), np.argmin(np.where(np.isnan(away), np.inf, away), axis=1)]
+    step = MAX_JOINT_STEP_RAD_PER_MM * abs(from_mm - to_mm) / (count - 1)
+    follows = not np.isnan(q).any() and bool(np.abs(np.diff(q, axis=0)).max() <= step)
+    return q if follows and _is_near(q, q_touch, distances) else None
+
+
+def _is_near(q: Floats, q_touch: Floats, distances: Floats) -> bool:
+    """Whether the row nearest to the marker is the touch's own branch."""
+    allowed = MAX_JOINT_STEP_RAD_PER_MM * (float(np.abs(distances).min()) + STEP_MM)
+    return bool(np.abs(q[int(np.argmin(np.abs(distances)))] - q_touch).max() <= allowed)
+
+
+def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
+    """What keeps the arm from a straight approach, in words; empty where nothing does.
+
+    Args:
+        checkers: Of the workcell.
+        tip_mm: Flange to tip.
+        q_touch: Shape (6,), rad, the tip on the marker.
+    """
+    whole = checkers.whole
+    if not whole.model.within_limits(q_touch[None])[0]:
+        return "a joint would be beyond its limits"
+    line = line_to(whole.model, tip_mm, q_touch, STANDOFF_MM, -PAST_MM)
+    if line is None:
+        return "the arm cannot follow the straight line to it"
+    standoff = whole.contact(line[0], needle_may_touch_patient=False)
+    if standoff is not None:
+        return f"at the standoff {standoff.body} touches {standoff.other}"
+    found = whole.first_contact(_dense(whole, line), needle_may_touch_patient=True)
+    if found is not None:
+        return f"{found.contact.body} touches {found.contact.other}"
+    before = line_to(whole.model, tip_mm, q_touch, STANDOFF_MM, 0.0)
+    assert before is not None  # a part of the whole line
+    shaft = checkers.blunted.first_contact(_dense(checkers.blunted, before), needle_may_touch_patient=False)
+    if shaft is None:
+        return ""
+    if shaft.contact == NEEDLE_IN_PATIENT:
+        return "the needle's shaft would go through the patient"
+    return f"{shaft.contact.body} touches {shaft.contact.other}"
+
+
+def _dense(checker: CellChecker, line: Floats) -> Floats:
+    return dense_states(checker, line, RESOLUTION_RAD)
+
+
+def registered_joints(
+    model: UrModel, tip_mm: float, q_insertion: Floats, target_ct: Floats, T_base_ct: tuple[Floats, Floats]
+) -> Floats:
+    """The joints that put the needle as planned in the CT, patient and all where a new registration puts them.
+
+    Args:
+        model: The arm.
+        tip_mm: Flange to tip.
+        q_insertion: Shape (6,), rad, the tip on the target as it was planned.
+        target_ct: Shape (3,), mm.
+        T_base_ct: The belief of that plan and the new one, shape (4, 4) each, mm.
+
+    Returns:
+        Shape (6,), rad, in the branch nearest to the plan's.
+
+    Raises:
+        NoAnswerError: The arm does not reach there.
+    """
+    believed, registered = T_base_ct
+    T = flange_pose(model, q_insertion)
+    T[:3, :3] = registered[:3, :3] @ believed[:3, :3].T @ T[:3, :3]
+    T[:3, 3] = apply(registered, target_ct) - tip_mm * T[:3, 2]
+    every = nearest_within_limits(model, inverse(model, T)[0], q_insertion)
+    away = np.abs(every - q_insertion).max(axis=1)
+    if np.isnan(away).all():
+        raise NoAnswerError("the arm does not reach the target where the touches put it")
+    return np.asarray(every[int(np.nanargmin(away))])
+
+
+def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats, registration: Registration) -> Plan:
+    """Plan the puncture along a direction by a new registration, free of contact where that puts the patient.
+
+    Args:
+        context: The case; what it believes of patient and arm is what the touches were planned by.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q_insertion: Shape (6,), rad, the tip on the target as the touches were planned for.
+        registration: Of the touches.
+
+    Raises:
+        NoAnswerError: The arm does not reach there, or not without contact.
+    """
+    case, T = context.case, registration.T_base_ct
+    assert context.placement is not None
+    checker, speeds = case_checker(case, context.anatomy, T), case.robot.speeds
+    model, tip_mm, believed = checker.model, case.needle.length_mm, context.placement.T_base_ct
+    q = registered_joints(model, tip_mm, q_insertion, case.target_ct, (believed, T))
+    paths = skin_paths(context.anatomy.skin, case.target_ct, outward_ct[None], tip_mm)
+    standoff = float(standoffs(case.needle, paths.path_length[0], paths.skin_angle[0]))
+    line = line_to(model, tip_mm, q, standoff, 0.0)
+    if line is None:
+        raise NoAnswerError("the arm cannot follow the needle's line to the target where the touches put it")
+    approach = plan_approach(
+        checker, home_configuration(case), line[0], seed=case.rehearsal.seed, speeds=speeds
+    ).trajectory
+    theta, beta = angles(case.T_ct_entry[:3, :3].T @ outward_ct)
+    depths = np.linspace(0.0, standoff, len(line))
+    plan = Plan(
+        case_name=case.name,
+        inputs=case.inputs,
+        seed=case.rehearsal.seed,
+        model=case.robot.model,
+        T_base_ct=T,
+        expected_target_error_mm=float(registration.expected_tre_mm(case.target_ct[None])[0]),
+        theta=float(theta),
+        beta=float(beta),
+        entry_ct=paths.entry_ct[0],
+        target_ct=case.target_ct,
+        outward_ct=outward_ct,
+        roll=0.0,
+        standoff_mm=standoff,
+        needle_length_mm=tip_mm,
+        approach=approach,
+        insertion=follow_smoothly(slowed(model, speeds), line, depths, max_tip_speed_mm_s=speeds.insertion_speed_mm_s),
+        clearance_mm={},
+        speeds=speeds,
+    )
+    touched = motion_contact(plan, checker)
+    if touched is not None:
+        raise NoAnswerError(touched)
+    return replace(plan, roll=roll_of(plan))

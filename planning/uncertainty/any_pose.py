@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri, fdtri
 
-from puncture_twin.planning.arm.error_jacobian import PARAMETERS
+from puncture_twin.planning.arm.kinematics import PARAMETERS
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 

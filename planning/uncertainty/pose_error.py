@@ -16,8 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
-from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case

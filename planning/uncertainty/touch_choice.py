@@ -12,14 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.inverse_kinematics import branch_of, inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.singularity import singularity
+from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.registration.marker_noise import LEAST_SINGULARITY
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 

@@ -12,7 +12,7 @@ from puncture_twin.planning.anatomy.beyond_image import OUTLINE_MM, REACH_MM, US
 from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
 from puncture_twin.planning.case.settings import CtSettings
 from puncture_twin.planning.geometry.containment import Side, side_of
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation
 
 SIZE = np.array([300.0, 240.0, 180.0])
 HEAD, LEFT = (2, 1), (0, 1)

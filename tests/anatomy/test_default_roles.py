@@ -14,8 +14,7 @@ from puncture_twin.planning.anatomy.default_roles import (
 )
 from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case_file import CaseFile
-from puncture_twin.planning.formats.labels.naming import RuleKind, select
-from puncture_twin.planning.formats.labels.totalsegmentator import V1, V2
+from puncture_twin.planning.formats.labels.naming import V1, V2, RuleKind, select
 
 
 @pytest.mark.parametrize("region", ["abdomen", "brain", "head"])

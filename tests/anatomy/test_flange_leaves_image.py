@@ -19,7 +19,7 @@ from puncture_twin.planning.certify.certificate import read_certificate, write_c
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 
 DEG = np.pi / 180.0
 LENGTH = 210.0

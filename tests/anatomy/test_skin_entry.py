@@ -8,7 +8,7 @@ import trimesh
 
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh
 from puncture_twin.planning.anatomy.skin_entry import skin_paths
-from puncture_twin.planning.geometry.crossings import NUDGE, Crossings
+from puncture_twin.planning.geometry.containment import NUDGE, Crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 UP = np.array([[0.0, 0.0, 1.0]])
@@ -61,7 +61,7 @@ def test_the_second_look_is_a_nudge_aside_and_only_for_rays_that_need_it(monkeyp
         way = (-1) ** (np.arange(len(ray)) - first[ray])
         return Crossings(ray, 10.0 + np.arange(len(ray)), 0 * ray, way, count, first)
 
-    monkeypatch.setattr("puncture_twin.planning.geometry.crossings.crossings", crossings)
+    monkeypatch.setattr("puncture_twin.planning.geometry.containment.crossings", crossings)
     box = trimesh.creation.box([100, 100, 100])
     skin = skin_from_mesh(TriangleMesh(box.vertices, box.faces))
     directions = np.array([[0.0, 0, 1], [0.6, 0.8, 0.0], [1, 0, 0], np.array([-1, 1, 1]) / np.sqrt(3)])
@@ -78,7 +78,7 @@ def test_the_second_look_is_a_nudge_aside_and_only_for_rays_that_need_it(monkeyp
 
 def test_crossings_that_add_up_are_not_asked_again(monkeypatch, box):
     """One look suffices where every ray leaves the body an odd number of times; an open skin is never asked twice."""
-    module = importlib.import_module("puncture_twin.planning.geometry.crossings")
+    module = importlib.import_module("puncture_twin.planning.geometry.containment")
     looks, plain = [], module.crossings
     monkeypatch.setattr(module, "crossings", lambda *a, **k: looks.append(1) or plain(*a, **k))
     mesh = box([100, 100, 100])

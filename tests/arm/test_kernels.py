@@ -13,13 +13,11 @@ from puncture_twin.planning.arm.inverse_kinematics import (
     nearest_within_limits,
     wrap_to_pi,
 )
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.singularity import singularity
+from puncture_twin.planning.arm.kinematics import flange_pose, singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
-from puncture_twin.planning.collision.sweep import SweptBodies
-from puncture_twin.planning.reach.branch_paths import every_branch, fill_branch_path
-from puncture_twin.planning.reach.survey import survey
+from puncture_twin.planning.collision.state_checker import SweptBodies
+from puncture_twin.planning.reach.survey import every_branch, fill_branch_path, survey
 
 DEPTHS = np.linspace(0.0, 120.0, 61)
 DISTANCES = 320.0 - DEPTHS

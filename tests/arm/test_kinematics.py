@@ -9,16 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
 
-from puncture_twin.planning.arm.inverse_kinematics import (
-    inverse,
-    nearest_within_limits,
-    wrap_to_pi,
-    wrapped_solutions,
-)
-from puncture_twin.planning.arm.kinematics import flange_pose, jacobian, link_poses
-from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual_links
-from puncture_twin.planning.arm.model_urdf import model_urdf
-from puncture_twin.planning.arm.singularity import singularity
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits, wrap_to_pi, wrapped_solutions
+from puncture_twin.planning.arm.kinematics import flange_pose, jacobian, link_poses, singularity
+from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, model_urdf, visual_links
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
 

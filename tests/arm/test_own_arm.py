@@ -14,8 +14,7 @@ from own_arms import LENGTHS, LINKS, beside, origin, placed, shipped_as_own, slo
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
-from puncture_twin.planning.arm.links import collision_links
-from puncture_twin.planning.arm.model_urdf import own_arm
+from puncture_twin.planning.arm.links import collision_links, own_arm
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.arm.urdf.lengths import StatedLimits

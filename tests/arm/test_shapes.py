@@ -10,8 +10,7 @@ import pytest
 
 from puncture_twin import meshes
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import LINK_NAMES, visual_links
-from puncture_twin.planning.arm.model_urdf import model_urdf
+from puncture_twin.planning.arm.links import LINK_NAMES, model_urdf, visual_links
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 

@@ -15,26 +15,19 @@ from puncture_twin.planning.anatomy import surfaces
 from puncture_twin.planning.base.cache import array_cache as cache_module
 from puncture_twin.planning.base.cache.array_cache import LIBRARIES, Cache, user_cache
 from puncture_twin.planning.base.cache.entry_file import packed
-from puncture_twin.planning.base.cache.source_stamp import (
-    IMPORTED,
-    NAME,
-    PROJECT,
-    closure,
-    source_stamp,
-    sources_with,
-)
+from puncture_twin.planning.base.cache.source_stamp import IMPORTED, NAME, PROJECT, closure, source_stamp, sources_with
 from puncture_twin.planning.base.errors import CacheWarning, InputError
 
 BY = "puncture_twin.planning.anatomy.surfaces"
 MAKERS = (
     "puncture_twin.planning.anatomy.surfaces",
     "puncture_twin.planning.anatomy.scan",
-    "puncture_twin.planning.formats.meshes.mesh_warnings",
-    "puncture_twin.planning.clearance.block_orders",
-    "puncture_twin.planning.collision.packed.hulls",
-    "puncture_twin.planning.collision.packed.skin",
-    "puncture_twin.planning.collision.never_touching",
-    "puncture_twin.twin.report.scene.lighter_mesh",
+    "puncture_twin.planning.formats.meshes.mesh_files",
+    "puncture_twin.planning.clearance.fast_engine",
+    "puncture_twin.planning.collision.packed",
+    "puncture_twin.planning.collision.packed",
+    "puncture_twin.planning.collision.proofs",
+    "puncture_twin.twin.report.page.page_scene",
 )
 """Every module whose results are kept."""
 

@@ -14,7 +14,7 @@ from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.labels.naming import names_for
-from puncture_twin.planning.formats.points.point_files import read_points
+from puncture_twin.planning.formats.points import read_points
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.table import to_table, write_table
 

@@ -21,7 +21,7 @@ from puncture_twin.planning.base.cache.kernel_cache import host_features
 
 DRAW = """
 import numba, numpy as np
-from puncture_twin.twin.report.canvas.canvas import Canvas
+from puncture_twin.twin.report.canvas import Canvas
 canvas = Canvas(8, 8)
 canvas.fill(np.array([(1.0, 1.0), (6.0, 1.0), (1.0, 6.0)]), (0, 0, 0))
 print(canvas.pixels.sum(), numba.core.config.CPU_NAME)

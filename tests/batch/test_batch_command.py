@@ -11,8 +11,8 @@ import pytest
 from cohort_world import merged, run_here, write_cohort, write_patient
 from places import ROOT
 
-from puncture_twin.planning.batch.part import slurm_part
-from puncture_twin.planning.batch.result import WORK_PREFIX
+from puncture_twin.planning.batch.plan import WORK_PREFIX
+from puncture_twin.planning.batch.run import slurm_part
 from puncture_twin.run_twin import main
 
 
@@ -113,7 +113,7 @@ def test_a_full_disk_is_one_line_and_the_merged_set_stays(planned, tmp_path, mon
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("puncture_twin.twin.jobs.batch.merge_job.write_dataset", full)
+    monkeypatch.setattr("puncture_twin.twin.jobs.batch.jobs.write_dataset", full)
     assert "cannot be written (No space left on device)" in said(capfd, 2, "batch", "merge", "--out", planned).err
     assert {path: path.read_bytes() for path in planned.rglob("*") if path.is_file()} == before
 

@@ -6,7 +6,7 @@ import pytest
 from cohort_world import plan_of, write_patient
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.batch.cohort.read_cohort import read_cohort
+from puncture_twin.planning.batch.cohort import read_cohort
 
 
 def stated(cohort):

@@ -3,7 +3,7 @@
 import pytest
 from page_browser import chromium, opened, serious_findings
 
-from puncture_twin.planning.batch.case_row import SCHEMA
+from puncture_twin.planning.batch.merge import SCHEMA
 from puncture_twin.twin.jobs.batch.page import write_cohort_page
 
 HITS = [0.5, 1.0, None, 1e-9, 0.93]

@@ -13,9 +13,8 @@ from places import ROOT, TESTS
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Silent
-from puncture_twin.planning.batch.dask_workers import on_scheduler
 from puncture_twin.planning.batch.plan import read_plan_table
-from puncture_twin.planning.batch.run import Request, run_cohort
+from puncture_twin.planning.batch.run import Request, on_scheduler, run_cohort
 from puncture_twin.planning.batch.workers import Limits
 from puncture_twin.run_twin import main
 
@@ -94,7 +93,7 @@ def test_no_scheduler_is_one_line(tmp_path, monkeypatch, capfd):
     write_cohort(tmp_path / "c", 2)
     out = tmp_path / "out"
     assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(out), "--no-arm"]) == 0
-    monkeypatch.setattr("puncture_twin.planning.batch.dask_workers.CONNECT_S", 0.5)
+    monkeypatch.setattr("puncture_twin.planning.batch.run.CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
         with pytest.raises(InputError, match="no scheduler answers there"):
             run_cohort(out, Request(), Silent(), on_scheduler(address))

@@ -14,8 +14,7 @@ import pytest
 from cohort_world import run_here, write_patient
 from kill_world import start
 
-from puncture_twin.planning.batch.plan import read_plan_table
-from puncture_twin.planning.batch.result import WORK_PREFIX, read_row
+from puncture_twin.planning.batch.plan import WORK_PREFIX, read_plan_table, read_row
 from puncture_twin.run_twin import main
 
 KILLS = int(os.environ.get("BATCH_KILLS", "5"))

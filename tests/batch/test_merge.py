@@ -9,9 +9,8 @@ import pytest
 from cohort_world import merged, plan_of, run_here, tiny_text, write_cohort, write_patient
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.batch.compare import compare, read_cases
-from puncture_twin.planning.batch.merge import union_schema
-from puncture_twin.planning.batch.state import cohort_state
+from puncture_twin.planning.batch.merge import compare, read_cases, union_schema
+from puncture_twin.planning.batch.run import cohort_state
 from puncture_twin.run_twin import main
 
 AORTA = '[[structure]]\nname = "aorta"\nmesh = "rib.stl"\nunit = "mm"\nrole = "avoid"\nmargin_mm = 1.0\n'

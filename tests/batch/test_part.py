@@ -9,7 +9,7 @@ import typer
 from places import ROOT
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.batch.part import Part, parse_part, slurm_part
+from puncture_twin.planning.batch.run import Part, parse_part, slurm_part
 from puncture_twin.run_twin import app
 
 

@@ -7,7 +7,7 @@ import pytest
 from cohort_world import fail, full, plan_of, task_of, write_patient
 
 from puncture_twin.planning.base.output.manifest import problems
-from puncture_twin.planning.batch.result import commit, discard, is_final, new_draft, read_row, write_row
+from puncture_twin.planning.batch.plan import commit, discard, is_final, new_draft, read_row, write_row
 from puncture_twin.planning.batch.run_case import STALE, run_case
 from puncture_twin.planning.search.context import prepare
 

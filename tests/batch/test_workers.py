@@ -6,9 +6,8 @@ from cohort_world import merged, timings, write_cohort, write_patient
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Silent
-from puncture_twin.planning.batch.part import Part
 from puncture_twin.planning.batch.plan import read_plan_table
-from puncture_twin.planning.batch.run import Request, run_cohort, running
+from puncture_twin.planning.batch.run import Part, Request, run_cohort, running
 from puncture_twin.planning.batch.workers import NO_LIMITS, Limits
 from puncture_twin.run_twin import main
 

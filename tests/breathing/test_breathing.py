@@ -5,8 +5,7 @@ import pytest
 from case_world import ORGAN, SKIN, case_text, structure, write_balls
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.breathing.lujan import fraction_within, positions
+from puncture_twin.planning.breathing.breathing import Breathing, fraction_within, positions
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.labels.naming import ByName
 

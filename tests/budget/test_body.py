@@ -13,13 +13,12 @@ from places import ROOT
 from typer.testing import CliRunner
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.breathing.lujan import fraction_within, mean_square_within
+from puncture_twin.planning.breathing.breathing import Breathing, fraction_within, mean_square_within
 from puncture_twin.planning.budget.chain import Breath, chain_of, other_gauges
 from puncture_twin.planning.budget.what_if import changes, source_costs
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.labels.naming import ByName
-from puncture_twin.planning.needle.shaft import GAUGES, Shaft
+from puncture_twin.planning.needle.deflection import GAUGES, Shaft
 from puncture_twin.planning.registration.aim import reached_insertion
 from puncture_twin.planning.registration.marker_noise import reading_noise
 from puncture_twin.planning.registration.placement import load_placement

@@ -8,7 +8,7 @@ import puncture_twin.planning.case.entry
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import view_frame
 from puncture_twin.planning.case.entry import angles, direction, entry_frame, grid, needle_pose, outward
-from puncture_twin.planning.case.tables.search_section import EntryAxes
+from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.spaces import Space
 
 polar = st.one_of(st.floats(0, np.pi), st.sampled_from([0.0, 1e-12, 1e-8, np.pi / 2, np.pi - 1e-8, np.pi]))

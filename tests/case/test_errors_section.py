@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.errors import Cells, error_model
-from puncture_twin.planning.case.tables.errors_section import ErrorsSection, RehearsalSection
+from puncture_twin.planning.case.tables import ErrorsSection, RehearsalSection
 from puncture_twin.planning.geometry.spaces import Space
 
 

@@ -15,7 +15,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.errors import error_model
-from puncture_twin.planning.case.tables.errors_section import ErrorsSection
+from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.mount import mount_pose
-from puncture_twin.planning.case.tables.robot_section import MountSection
+from puncture_twin.planning.case.settings import mount_pose
+from puncture_twin.planning.case.tables import MountSection
 from puncture_twin.planning.geometry.spaces import Space
 
 

@@ -13,7 +13,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.options import case_options
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.collision.workcell import home_configuration
-from puncture_twin.planning.plan.arm_document import arm_document, read_arm, same_arm
+from puncture_twin.planning.plan.plan_check import arm_document, read_arm, same_arm
 
 ROBOT = '\n[robot]\nurdf = "arm/toy.urdf"\n'
 

@@ -10,10 +10,10 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.named_files import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.case.whole_case import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
 from puncture_twin.planning.evidence.coverage import ignored_organs
-from puncture_twin.planning.formats.labels.totalsegmentator import V2
+from puncture_twin.planning.formats.labels.naming import V2
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import BAD_INPUT, OK

@@ -3,7 +3,7 @@
 import pytest
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits
+from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
 

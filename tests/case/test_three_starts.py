@@ -11,7 +11,7 @@ from case_world import changed
 from places import REAL_CT, ROOT
 
 from puncture_twin.meshes import folder as meshes_folder
-from puncture_twin.planning.formats.labels.totalsegmentator import V1
+from puncture_twin.planning.formats.labels.naming import V1
 from puncture_twin.run_twin import main
 
 needs_ct = pytest.mark.skipif(not REAL_CT.is_dir(), reason=f"the real CT is not at {REAL_CT}")

@@ -19,7 +19,7 @@ from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.entry import Directions, angles, entry_frame, outward
-from puncture_twin.planning.case.tables.search_section import EntryAxes
+from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
 from puncture_twin.planning.certify.certificate import read_certificate, write_certificate
 from puncture_twin.planning.certify.checker import _apart, _Cell, verify
@@ -32,7 +32,7 @@ from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import BOX_FACES, TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import OK
 

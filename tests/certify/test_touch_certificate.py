@@ -10,7 +10,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.certify.certificate import SAFE, parse_certificate, write_certificate
+from puncture_twin.planning.certify.certificate import PROVED_SAFE, parse_certificate, write_certificate
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.search.context import prepare
@@ -33,7 +33,7 @@ def certified():
 
 def inside(certificate, rng):
     """Directions (n, 3), CT, anywhere in the safe cells."""
-    cells = certificate.leaves.take(certificate.verdict == SAFE)
+    cells = certificate.leaves.take(certificate.verdict == PROVED_SAFE)
     rows = rng.integers(0, len(cells), DRAWN)
     theta, beta = (rng.uniform(r[rows, 0], r[rows, 1]) for r in (cells.theta, cells.beta))
     local = np.column_stack([np.sin(theta) * np.cos(beta), np.sin(theta) * np.sin(beta), np.cos(theta)])
@@ -70,7 +70,7 @@ def test_the_search_finds_every_certified_direction_safe(certified, rng):
     theta, beta, _ = inside(found, rng)
     assert (found.question.margins >= plain.question.margins).all()
     assert (found.question.margins > plain.question.margins).any()
-    assert 0 < found.areas[SAFE] < plain.areas[SAFE]
+    assert 0 < found.areas[PROVED_SAFE] < plain.areas[PROVED_SAFE]
     assert "R" not in set(plain.at(theta, beta))
 
 
@@ -103,7 +103,7 @@ def carton():
 def test_nothing_is_proven_where_the_error_is_too_large(carton):
     """No safe cell, and the certificate says to what chance."""
     found = certify(carton.case, carton.anatomy, size=np.radians(8.0), touch=0.5, error=carton.pose_error)
-    assert found.areas[SAFE] == 0 and found.summary()["touch"] == 0.5
+    assert found.areas[PROVED_SAFE] == 0 and found.summary()["touch"] == 0.5
 
 
 @pytest.mark.parametrize("name", ["certified", "carton"])

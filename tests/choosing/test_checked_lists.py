@@ -10,7 +10,7 @@ import pytest
 
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.choosing.row_by_row import COLUMNS
+from puncture_twin.twin.jobs.choosing.list_job import COLUMNS
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, OK
 from tests.case_world import write_case
 

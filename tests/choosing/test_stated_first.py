@@ -6,10 +6,10 @@ import pytest
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.output.manifest import read_manifest
 from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.search.choice import Choice
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.twin.jobs.patient import main_job
-from puncture_twin.twin.jobs.patient.slicer_job import export_to_slicer
+from puncture_twin.twin.jobs.patient.export_jobs import export_to_slicer
 from tests.case_world import write_case
 
 CHANGES = (("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'),)

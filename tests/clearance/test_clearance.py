@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.clearance.engine import measure
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 150.0

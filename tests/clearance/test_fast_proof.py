@@ -9,11 +9,9 @@ from oracles import segment_mesh_distance
 from places import DATA
 
 from puncture_twin import meshes
-from puncture_twin.planning.clearance.direction_tiles import bundle
-from puncture_twin.planning.clearance.engine import AxisDistances
-from puncture_twin.planning.clearance.fast_engine import PIECE_TRIANGLES, WORTH_THREADS, FastEngine
+from puncture_twin.planning.clearance.engine import NEAR_THRESHOLD_MM, ROUNDING_MM, AxisDistances, too_near
+from puncture_twin.planning.clearance.fast_engine import PIECE_TRIANGLES, WORTH_THREADS, FastEngine, bundle
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.clearance.measure import NEAR_THRESHOLD_MM, ROUNDING_MM, too_near
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 210.0

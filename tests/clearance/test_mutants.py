@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from places import ROOT
 
-import puncture_twin.planning.reach.skin_gap
+import puncture_twin.planning.reach.standoff
 from puncture_twin.planning.case.settings import Needle
-from puncture_twin.planning.reach.skin_gap import skin_gaps
+from puncture_twin.planning.reach.standoff import skin_gaps
 
 sys.path.insert(0, str(ROOT))
 
@@ -19,8 +19,8 @@ from benchmarks.mutant_patch import mutated
 from benchmarks.mutants import KERNELS, PLAIN
 from benchmarks.mutation import mutants
 
-SOURCE = inspect.getsource(puncture_twin.planning.reach.skin_gap)
-FILE = str(puncture_twin.planning.reach.skin_gap.__file__)
+SOURCE = inspect.getsource(puncture_twin.planning.reach.standoff)
+FILE = str(puncture_twin.planning.reach.standoff.__file__)
 NEEDLE = Needle(200.0, 150.0, 1.2, None, 10.0, 30.0)
 
 CHANGES = (
@@ -65,17 +65,17 @@ def test_a_fault_acts_where_the_function_was_imported_and_is_gone_afterwards():
     """Every mutant of a module changes what it changes for all who hold its functions; then all is as before."""
     angles = np.radians([0.0, 30.0, 45.0, 60.0, 89.99, 90.0])
     before, caught, loaded = skin_gaps(NEEDLE, angles), 0, 0
-    constants = puncture_twin.planning.reach.skin_gap.MAX_GAP_MM, puncture_twin.planning.reach.skin_gap.UNEVEN_SKIN_MM
+    constants = puncture_twin.planning.reach.standoff.MAX_GAP_MM, puncture_twin.planning.reach.standoff.UNEVEN_SKIN_MM
     for mutant in mutants(SOURCE, FILE):
-        with mutated(puncture_twin.planning.reach.skin_gap, mutant.code):
+        with mutated(puncture_twin.planning.reach.standoff, mutant.code):
             loaded += 1
             try:
                 caught += not np.array_equal(skin_gaps(NEEDLE, angles), before, equal_nan=True)
             except (TypeError, ValueError):
                 caught += 1
         assert constants == (
-            puncture_twin.planning.reach.skin_gap.MAX_GAP_MM,
-            puncture_twin.planning.reach.skin_gap.UNEVEN_SKIN_MM,
+            puncture_twin.planning.reach.standoff.MAX_GAP_MM,
+            puncture_twin.planning.reach.standoff.UNEVEN_SKIN_MM,
         )
     np.testing.assert_array_equal(skin_gaps(NEEDLE, angles), before)
     assert loaded >= 10 and caught >= 6
@@ -86,7 +86,7 @@ def test_what_a_mutant_raises_when_it_is_loaded_leaves_the_module_alone():
     before = skin_gaps(NEEDLE, 0.7)
     with (
         pytest.raises(ZeroDivisionError),
-        mutated(puncture_twin.planning.reach.skin_gap, compile("1 / 0", FILE, "exec")),
+        mutated(puncture_twin.planning.reach.standoff, compile("1 / 0", FILE, "exec")),
     ):
         pass
     assert skin_gaps(NEEDLE, 0.7) == before

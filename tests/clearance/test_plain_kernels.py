@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from oracles import ray_crossings, segment_triangle_distance
 
+from puncture_twin.planning.clearance.fast_engine import placed_surface
 from puncture_twin.planning.clearance.kernels.blocks import pack
 from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
 from puncture_twin.planning.clearance.kernels.side_by_side import (
@@ -17,8 +18,7 @@ from puncture_twin.planning.clearance.kernels.side_by_side import (
     measure_beside,
     measure_other,
 )
-from puncture_twin.planning.clearance.placed_surface import placed_surface
-from puncture_twin.planning.geometry.crossings import crossings
+from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 40.0

@@ -14,14 +14,12 @@ from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual
 from puncture_twin.planning.arm.tool import HOLDER_ROOT_MM, Box, Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, UrModel, ur_model
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.bodies.body import NEVER_TESTED
-from puncture_twin.planning.collision.bodies.shapes import convex, surface, touch
+from puncture_twin.planning.collision.bodies import NEVER_TESTED, convex, surface, touch
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.state_checker import Contact
-from puncture_twin.planning.collision.sweep import SweptBodies
+from puncture_twin.planning.collision.state_checker import Contact, SweptBodies
+from puncture_twin.planning.geometry.containment import winding_number, winding_numbers
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
-from puncture_twin.planning.geometry.winding import winding_number, winding_numbers
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

@@ -20,26 +20,21 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.prisms import prism
-from puncture_twin.planning.collision.bodies.shapes import convex, surface
-from puncture_twin.planning.collision.bodies.sphere_tree import halves, sphere_tree
+from puncture_twin.planning.collision.bodies import arm_bodies, convex, halves, prism, sphere_tree, surface
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING, hull_gap
 from puncture_twin.planning.collision.kernels.proofs import SKIN
 from puncture_twin.planning.collision.kernels.surfaces import ROUGH, STACK, skin_gap, to_surface
-from puncture_twin.planning.collision.packed.hulls import coarse_hull, inscribed_prism, neighbours
-from puncture_twin.planning.collision.packed.skin import TriangleTree
-from puncture_twin.planning.collision.surroundings import case_boxes
-from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
+from puncture_twin.planning.collision.packed import TriangleTree, coarse_hull, inscribed_prism, neighbours
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_boxes, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import to_triangle
-from puncture_twin.planning.reach.answer import ReachAnswer
 from puncture_twin.planning.reach.reach import assess_reach_all
-from puncture_twin.planning.search.arm_reach import reach_request
+from puncture_twin.planning.reach.survey import ReachAnswer
+from puncture_twin.planning.search.constraints import reach_request
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

@@ -9,8 +9,8 @@ from case_world import write_case
 from puncture_twin.planning.arm.tool import SIDES, gantry_boxes
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.settings import Gantry
-from puncture_twin.planning.collision.bodies.shapes import surface
-from puncture_twin.planning.collision.surroundings import gantry_in_patient_mm
+from puncture_twin.planning.collision.bodies import surface
+from puncture_twin.planning.collision.workcell import gantry_in_patient_mm
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import prepare
 

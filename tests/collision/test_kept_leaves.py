@@ -11,8 +11,8 @@ import trimesh
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.base.cache.entry_file import packed, unpacked
 from puncture_twin.planning.base.errors import CacheWarning
-from puncture_twin.planning.collision.packed import skin as module
-from puncture_twin.planning.collision.packed.skin import TriangleTree
+from puncture_twin.planning.collision import packed as module
+from puncture_twin.planning.collision.packed import TriangleTree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 

@@ -15,17 +15,12 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.body import BODY_NAMES
-from puncture_twin.planning.collision.bodies.shapes import surface, touch
-from puncture_twin.planning.collision.bodies.solid import Solid
+from puncture_twin.planning.collision.bodies import BODY_NAMES, LooseParts, Solid, arm_bodies, surface, touch
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.loose_parts import LooseParts
 from puncture_twin.planning.collision.patient import PART_TRIANGLES, FclSkin
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 
 
 def ball(subdivisions: int) -> TriangleMesh:

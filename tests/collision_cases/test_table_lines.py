@@ -4,7 +4,7 @@ import tomllib
 
 import pytest
 
-from puncture_twin.planning.collision_cases.table_lines import line_of, table_lines
+from puncture_twin.planning.collision_cases.checks_file import line_of, table_lines
 
 TEXT = '''case = "x" # [[check]]
 [[check]]

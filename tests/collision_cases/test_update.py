@@ -8,8 +8,7 @@ from hypothesis import given, strategies as st
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision_cases.finding import NewNumber
-from puncture_twin.planning.collision_cases.rewrite import Change, rewrite
+from puncture_twin.planning.collision_cases.session import Change, NewNumber, rewrite
 from puncture_twin.planning.search.context import prepare
 
 pytest_plugins = ["pytester"]

@@ -15,8 +15,7 @@ from puncture_twin.planning.evidence.edges import (
     shifts,
 )
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.findings import Severity
 from puncture_twin.planning.evidence.edges import edge_image
 from puncture_twin.planning.evidence.label_placement import REFUSING_Z, WARNING_Z, assess, slip_of
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.search.context import prepare
 
 

@@ -15,27 +15,30 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.insertion import needle_lines
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
-from puncture_twin.planning.arm.speed_limits import SpeedLimits
+from puncture_twin.planning.arm.kinematics import SpeedLimits, flange_pose, jacobian
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import JOINT_NAMES, UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.export.corners import corner_rows, rests_at
 from puncture_twin.planning.export.exporter import FORMATS, blend_radii_mm, csv_text, export_plan, read_csv
-from puncture_twin.planning.export.limits import check_trajectory
-from puncture_twin.planning.export.motion import check_sampled
-from puncture_twin.planning.export.program import program_of, waypoint_rows
+from puncture_twin.planning.export.program import (
+    PLAIN,
+    check_sampled,
+    check_trajectory,
+    corner_rows,
+    program_of,
+    rests_at,
+    waypoint_rows,
+)
 from puncture_twin.planning.export.program_check import check_program
 from puncture_twin.planning.export.ros2 import read_ros2, ros2_text, velocities
-from puncture_twin.planning.export.text import PLAIN
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
 from puncture_twin.planning.motion.follow import follow, follow_smoothly
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
-from puncture_twin.planning.reach.branch_paths import every_branch
+from puncture_twin.planning.reach.survey import every_branch
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

@@ -16,14 +16,20 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.model_urdf import T_BASE_URDFBASE
+from puncture_twin.planning.arm.links import T_BASE_URDFBASE
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import JOINT_NAMES, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.settings import Gantry, Obstacle
-from puncture_twin.planning.export.moveit.messages import BOX, CYLINDER
-from puncture_twin.planning.export.moveit.moveit_files import SENDER_TEXT, check_goals, goal_messages, scene_message
-from puncture_twin.planning.export.moveit.urdf import urdf_with_needle
+from puncture_twin.planning.export.moveit import (
+    BOX,
+    CYLINDER,
+    SENDER_TEXT,
+    check_goals,
+    goal_messages,
+    scene_message,
+    urdf_with_needle,
+)
 from puncture_twin.planning.export.ros2 import ros2_text
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.run_twin import main

@@ -12,19 +12,17 @@ from export.slicer_facts import MARKUP, POINT, SCHEMA, check_attributes, check_p
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.export.slicer.entry_area import entry_area
+from puncture_twin.planning.export.slicer import entry_area
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
-from puncture_twin.planning.formats.points.point_files import read_points
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation, left_jacobian
-from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.formats.points import read_points
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose
+from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.choice import BEST, Choice
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.selection.choice import BEST, Choice
-from puncture_twin.planning.search.selection.windows import find_windows
+from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.patient.slicer_job import export_to_slicer
+from puncture_twin.twin.jobs.patient.export_jobs import export_to_slicer
 
 TURN = np.array([0.4, -1.1, 2.0])
 T_BASE_CT = pose(exp_rotation(TURN), left_jacobian(TURN) @ [310.0, -120.0, 240.0])

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE, guard_points, guard_transform
 from puncture_twin.planning.formats.mesh_guard import MAX_DIAGONAL_MM, MIN_DIAGONAL_MM, guard_mesh
-from puncture_twin.planning.geometry.spaces import Space, parse_space, to_lps
-from puncture_twin.planning.geometry.units import Unit, parse_unit
+from puncture_twin.planning.geometry.spaces import Space, Unit, parse_space, parse_unit, to_lps
 
 SQUARE = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [10.0, 10.0, 0.0], [0.0, 10.0, 0.0]]
 TWO = [[0, 1, 2], [0, 2, 3]]

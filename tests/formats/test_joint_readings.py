@@ -6,17 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.stated_arm import check_arm, check_flanges
+from puncture_twin.planning.arm.kinematics import check_arm, check_flanges, flange_pose
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.tables.robot_section import RobotSection
-from puncture_twin.planning.formats.joint_readings import (
-    JOINTS_RAD,
-    joint_readings,
-    parse_joint_recording,
-)
-from puncture_twin.planning.formats.points.point_files import parse_points
+from puncture_twin.planning.case.tables import RobotSection
+from puncture_twin.planning.formats.points import JOINTS_RAD, joint_readings, parse_joint_recording, parse_points
 
 START = np.array([20.0, -100.0, -95.0, -75.0, 90.0, 10.0])
 POSES = START + 8.0 * np.random.default_rng(0).normal(size=(9, 6))

@@ -20,11 +20,9 @@ from slicer_files import vtk_model
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
-from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
-from puncture_twin.planning.formats.meshes.mesh_warnings import kept_mesh_warnings, mesh_warnings
+from puncture_twin.planning.formats.meshes.mesh_files import kept_mesh_warnings, mesh_warnings, read_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, Up
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
 BALL = trimesh.creation.icosphere(1, 30.0)
 BALL.apply_translation([5.0, -7.0, 11.0])

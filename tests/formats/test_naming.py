@@ -13,8 +13,7 @@ from places import REAL_CT
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
-from puncture_twin.planning.formats.labels.naming import LabelRule, RuleKind, names_for, select
-from puncture_twin.planning.formats.labels.totalsegmentator import V1, V2
+from puncture_twin.planning.formats.labels.naming import V1, V2, LabelRule, RuleKind, names_for, select
 
 REAL = REAL_CT
 NAMES = {1: "liver", 2: "rib_left_7", 3: "rib_left_8", 4: "lung_lower_lobe_left", 5: "aorta"}

@@ -5,8 +5,8 @@ import pytest
 from places import REAL_CT
 
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of
+from puncture_twin.planning.formats.labels.naming import V1, V2
 from puncture_twin.planning.formats.labels.numbering import likely_numbering
-from puncture_twin.planning.formats.labels.totalsegmentator import V1, V2
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
 PLACES = {

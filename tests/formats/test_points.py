@@ -11,9 +11,8 @@ from places import DATA
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import guard_points
-from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points, write_points
-from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.formats.points import NamedPoints, read_points, write_points
+from puncture_twin.planning.geometry.spaces import Space, Unit
 
 CHEN_2019 = DATA / "chen2019"
 CSV = "name,x_mm,y_mm,z_mm\nA,10,20,147\nB,110,120.5,-1e2\n"

@@ -28,8 +28,8 @@ from puncture_twin.planning.export.exporter import csv_text
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import write_plan
-from puncture_twin.planning.reach.answer import ReachRequest
 from puncture_twin.planning.reach.reach import assess_reach_all
+from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.placement import load_placement
 
 REGISTRATION = registration_section()

@@ -7,8 +7,8 @@ import numpy as np
 from fuzz.output_sets import rewritten_set, whole_set
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.anatomy.beyond_labels import BEYOND_LABELS
+from puncture_twin.planning.case.named_files import SCHEMA_ONE_NOTE
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.case.whole_case import SCHEMA_ONE_NOTE
 from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.checks_file import read_checks
 from puncture_twin.planning.export.exporter import read_csv
@@ -19,12 +19,10 @@ from puncture_twin.planning.formats.dicom.structure_set import parse_structure_s
 from puncture_twin.planning.formats.itk_transform import parse_transform
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
 from puncture_twin.planning.formats.labels.naming import names_for
-from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
-from puncture_twin.planning.formats.meshes.mesh_warnings import mesh_warnings
-from puncture_twin.planning.formats.points.point_files import read_points
+from puncture_twin.planning.formats.meshes.mesh_files import mesh_warnings, read_mesh
+from puncture_twin.planning.formats.points import read_points
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
-from puncture_twin.planning.geometry.spaces import Space, Up
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case

@@ -6,10 +6,17 @@ import trimesh
 from oracles import ray_crossings
 
 from puncture_twin.planning.case.entry import grid
-from puncture_twin.planning.geometry.containment import Side, holds, inside_each, side_of
-from puncture_twin.planning.geometry.crossings import crossings, first_crossing, settled_crossings
+from puncture_twin.planning.geometry.containment import (
+    Side,
+    crossings,
+    first_crossing,
+    holds,
+    inside_each,
+    settled_crossings,
+    side_of,
+    winding_number,
+)
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.winding import winding_number
 
 FULL = grid((0, np.pi), (0, 2 * np.pi), np.radians(7.3), np.eye(3)).outward_ct
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.geometry import frames, rigid, rotations
+from puncture_twin.planning.geometry import rigid, rigid as frames, rigid as rotations
 
 SEED = 20260122
 ANGLES = (0.0, 1e-12, 1e-8, 0.99e-6, 1.01e-6, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-8)

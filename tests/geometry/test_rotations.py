@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.geometry.rotations import SERIES_BELOW, about_fixed_axes, exp_rotation, rotation_angle
+from puncture_twin.planning.geometry.rigid import SERIES_BELOW, about_fixed_axes, exp_rotation, rotation_angle
 
 SIZES = (1e-12, 1e-5, SERIES_BELOW, 0.1, 1.0, 30.0)
 """Of rotation vectors, rad: from nothing to several turns, about the border of the series among them."""
@@ -59,7 +59,7 @@ def test_the_angle_of_a_rotation_is_found_again(angle: float) -> None:
 def test_scipy_is_not_loaded_for_them() -> None:
     """A new process computes both and has no module of scipy's spatial room."""
     program = (
-        "import sys; from puncture_twin.planning.geometry.rotations import about_fixed_axes, exp_rotation;"
+        "import sys; from puncture_twin.planning.geometry.rigid import about_fixed_axes, exp_rotation;"
         "exp_rotation([0.1, 0.2, 0.3]); about_fixed_axes([0.1, 0.2, 0.3]);"
         "sys.exit(any(name.startswith('scipy') for name in sys.modules))"
     )

@@ -18,8 +18,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.checks_file import read_checks
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
-from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.run_twin import main
 

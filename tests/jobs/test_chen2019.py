@@ -5,7 +5,7 @@ import csv
 import places
 import pytest
 
-from puncture_twin.twin.experiment import chen2019_tables
+from puncture_twin.twin.experiment import chen2019 as chen2019_tables
 from puncture_twin.twin.jobs.papers import chen2019
 
 DATA = places.DATA / "chen2019"

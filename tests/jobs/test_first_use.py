@@ -6,7 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from puncture_twin.planning.reach.small_workcell import ask_arm, small_workcell
+from puncture_twin.planning.reach.reach import ask_arm, small_workcell
 from puncture_twin.twin.jobs import first_use
 
 

@@ -13,8 +13,7 @@ from llvmlite.binding import ffi, parse_assembly
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.jobs.exit_codes import INTERRUPTED, exit_code_of
-from puncture_twin.twin.jobs.interrupt import ended_by_ctrl_c, insistent_ctrl_c
-from puncture_twin.twin.jobs.terminal import print_answer
+from puncture_twin.twin.jobs.terminal import ended_by_ctrl_c, insistent_ctrl_c, print_answer
 
 
 @pytest.fixture(autouse=True)

@@ -20,8 +20,8 @@ from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
-from puncture_twin.planning.reach.answer import ReachRequest
 from puncture_twin.planning.reach.reach import assess_reach_all
+from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.jobs.robot import mirror
 

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.formats.points.point_files import read_points
+from puncture_twin.planning.formats.points import read_points
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.experiment.scan_job import Control, control_summary
-from puncture_twin.twin.jobs.experiment.scan_text import _needle_lines
+from puncture_twin.twin.jobs.experiment.scan_job import Control, _needle_lines, control_summary
 from puncture_twin.twin.plant.scanner.case_scene import TrueRod
 
 CARTON = folder() / "carton" / "case_m.toml"

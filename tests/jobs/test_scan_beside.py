@@ -15,7 +15,7 @@ from benchmarks.beside.scene import Asked, judged
 from puncture_twin.meshes import folder
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.run_twin import main
-from puncture_twin.twin.plant.beside.beside import Beside
+from puncture_twin.twin.plant.outside_objects import Beside
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from tools.phantoms import __main__ as phantoms
 

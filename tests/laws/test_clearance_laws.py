@@ -6,9 +6,9 @@ from oracles import PlainEngine, ray_crossings, segment_mesh_distance
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.clearance.engine import measure
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 150.0

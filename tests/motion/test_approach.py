@@ -10,8 +10,15 @@ import trimesh
 from hypothesis import given, settings, strategies as st
 from kept_checkers import built
 
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.speed_limits import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed, tip_rates, tip_speeds
+from puncture_twin.planning.arm.kinematics import (
+    DEFAULT_SPEEDS,
+    SpeedLimits,
+    TipLimit,
+    flange_pose,
+    slowed,
+    tip_rates,
+    tip_speeds,
+)
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
@@ -20,7 +27,17 @@ from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, Approach, plan_approach
-from puncture_twin.planning.motion.follow import MAX_JERK, follow, follow_smoothly, rounded
+from puncture_twin.planning.motion.follow import (
+    LENGTH_SLACK,
+    MAX_JERK,
+    Rates,
+    follow,
+    follow_smoothly,
+    reachable_speed,
+    rounded,
+    speed_change_length,
+    time_law,
+)
 from puncture_twin.planning.motion.path_check import (
     CLEARANCE_STEP_MM,
     MAX_SWEEP_MM,
@@ -29,7 +46,6 @@ from puncture_twin.planning.motion.path_check import (
     path_length,
 )
 from puncture_twin.planning.motion.rrt_connect import STALLED, Limits, connect
-from puncture_twin.planning.motion.timing import LENGTH_SLACK, Rates, reachable_speed, speed_change_length, time_law
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 
 UR3 = ur_model("ur3")

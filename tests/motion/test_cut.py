@@ -9,11 +9,11 @@ from kept_checkers import built
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
+from puncture_twin.planning.collision.bodies import arm_bodies
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.motion.approach import plan_approach
-from puncture_twin.planning.motion.cut import UPPER_ARM, UPPER_ARM_FRAME, Cut
+from puncture_twin.planning.motion.shortest import UPPER_ARM, UPPER_ARM_FRAME, Cut
 
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
 FREE = np.array([0.9, -1.9, 1.6, -1.2, -1.5, 0.3])

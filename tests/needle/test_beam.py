@@ -4,10 +4,18 @@ import numpy as np
 import pytest
 
 from benchmarks.experiment.tissue import beyond, in_every_order, proven
-from puncture_twin.planning.needle.bevel_path import Beam, bevel_path, step_for
-from puncture_twin.planning.needle.deflection import ALLOWANCE, MOST_SLENDER, deflection_bound, stiffest_resolved
-from puncture_twin.planning.needle.shaft import GAUGES, Shaft
-from puncture_twin.planning.needle.tissue import Tissue
+from puncture_twin.planning.needle.deflection import (
+    ALLOWANCE,
+    GAUGES,
+    MOST_SLENDER,
+    Beam,
+    Shaft,
+    Tissue,
+    bevel_path,
+    deflection_bound,
+    step_for,
+    stiffest_resolved,
+)
 
 SOLID_18 = Shaft(200.0, 1.27)
 TUBE_18 = Shaft(150.0, *GAUGES[18])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from puncture_twin.planning.needle.deflection import Layer, Tissue
 from puncture_twin.planning.needle.insertion_force import insertion_force
-from puncture_twin.planning.needle.tissue import Layer, Tissue
 
 SKIN = Tissue(0.1, cutting_n=0.6, friction_n_mm=0.01, capsule_n=4.0, capsule_mm=5.0)
 FAT = Tissue(0.02, cutting_n=0.3, friction_n_mm=0.005)

@@ -21,32 +21,38 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.processes import map_all
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.case.bed import bed_frame
-from puncture_twin.planning.case.mount import mount_pose
+from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.case.options import CaseOptions
 from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.arm_spheres import (
     ArmSpheres,
+    Boxes,
+    SkinField,
     Surroundings,
     base_is_clear,
     clear_branches,
     skin_distance,
 )
-from puncture_twin.planning.place.directions import WantedDirections, ring_weights
 from puncture_twin.planning.place.estimate import Estimator, insertion_branches
-from puncture_twin.planning.place.evaluate import PlacementCheck
-from puncture_twin.planning.place.mounts import Region, Site, mount_lines, mount_section, regions
-from puncture_twin.planning.place.needle_start import needle_can_start
-from puncture_twin.planning.place.obstacle_field import Boxes, SkinField
-from puncture_twin.planning.place.search import search_placements
+from puncture_twin.planning.place.mounts import (
+    Region,
+    Site,
+    WantedDirections,
+    mount_lines,
+    mount_section,
+    regions,
+    ring_weights,
+)
+from puncture_twin.planning.place.search import PlacementCheck, needle_can_start, search_placements
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
+from puncture_twin.planning.search.constraints import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.twin.jobs.patient.place_text import needle_line
+from puncture_twin.planning.search.search import organ_candidates
+from puncture_twin.twin.jobs.patient.place_job import needle_line
 
 UR3 = ur_model("ur3")
 TOOL = Tool(200.0, 150.0, 1.2, 30.0)

@@ -8,12 +8,11 @@ import pytest
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.speed_limits import SpeedLimits, tip_speeds
+from puncture_twin.planning.arm.kinematics import SpeedLimits, flange_pose, tip_speeds
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.plan.motion import motion_contact
+from puncture_twin.planning.plan.plan import motion_contact
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
 from puncture_twin.planning.plan.planner import make_plan
 from puncture_twin.planning.plan.recheck import _check_limits, check_plan, with_case_warnings

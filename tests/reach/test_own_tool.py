@@ -16,14 +16,13 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.shapes import touch
+from puncture_twin.planning.collision.bodies import arm_bodies, touch
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.arm_spheres import ArmSpheres
-from puncture_twin.planning.reach.answer import ReachRequest
 from puncture_twin.planning.reach.reach import assess_reach_all
+from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.twin.world.arm import load_arm
 from puncture_twin.twin.world.client import physics_client
 

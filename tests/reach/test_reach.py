@@ -11,22 +11,18 @@ import trimesh
 from benchmarks.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
 from puncture_twin.planning.arm.insertion import flange_poses, needle_lines, reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
+from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, flange_pose, link_poses, singularity
 from puncture_twin.planning.arm.links import collision_links
-from puncture_twin.planning.arm.singularity import MIN_SINGULARITY, singularity
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.sweep import SweptBodies
+from puncture_twin.planning.collision.state_checker import SweptBodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.reach.answer import ReachRequest
-from puncture_twin.planning.reach.branch_paths import every_branch, fill_branch_path
 from puncture_twin.planning.reach.reach import assess_reach_all
-from puncture_twin.planning.reach.sampling import sampled
-from puncture_twin.planning.reach.survey import MAX_SWEEP_MM
+from puncture_twin.planning.reach.survey import MAX_SWEEP_MM, ReachRequest, every_branch, fill_branch_path, sampled
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)

@@ -18,12 +18,19 @@ from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.place.directions import wanted_directions
-from puncture_twin.planning.place.needle_start import needle_can_start
-from puncture_twin.planning.reach.skin_gap import MAX_GAP_MM, UNEVEN_SKIN_MM, skin_gaps
-from puncture_twin.planning.reach.standoff import axis_lengths, farthest_flange, standoffs, waiting_flange
+from puncture_twin.planning.place.mounts import wanted_directions
+from puncture_twin.planning.place.search import needle_can_start
+from puncture_twin.planning.reach.standoff import (
+    MAX_GAP_MM,
+    UNEVEN_SKIN_MM,
+    axis_lengths,
+    farthest_flange,
+    skin_gaps,
+    standoffs,
+    waiting_flange,
+)
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 
 DEG = np.pi / 180.0
 

@@ -8,7 +8,7 @@ import pytest
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.reach.unreachable import missing_reach_mm
+from puncture_twin.planning.reach.reach import missing_reach_mm
 
 
 def test_reach_is_missing_exactly_where_no_solution_exists() -> None:

@@ -10,12 +10,11 @@ from scipy.optimize import least_squares
 from scipy.special import chdtri
 from uncertainty_world import NO_ARM, declared, world
 
-from puncture_twin.planning.arm.error_jacobian import error_jacobian
+from puncture_twin.planning.arm.kinematics import error_jacobian
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose
 from puncture_twin.planning.registration.aim import aim_at
 from puncture_twin.planning.registration.aim_correction import aimed, aimed_fit
 from puncture_twin.planning.registration.fits.least_squares import differenced_map, fit_rigid

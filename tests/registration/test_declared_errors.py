@@ -5,8 +5,7 @@ import pytest
 from scipy.special import chdtri
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.fits.least_squares import (
     design,
     differenced_map,

@@ -5,13 +5,12 @@ import pytest
 import scipy.stats
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.fits.distortion import DOUBTED, KINDS
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.twin.experiment.chen2019_tables import TABLE_1, TABLE_4
+from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_4
 
 TARGET = np.array(TABLE_1["M"], float)
 MARKERS = np.array([TABLE_1[name] for name in "ABCDE"], float)

@@ -6,8 +6,7 @@ from scipy.optimize import least_squares
 from uncertainty_world import declared, world
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose
 from puncture_twin.planning.registration.fits.least_squares import fit_joint, fit_rigid, fit_triad, fit_weighted
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise

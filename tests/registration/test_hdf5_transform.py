@@ -13,8 +13,7 @@ from registration.test_stated_transform import FLIP, POINTS, T_BASE_CT, slicer_f
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.formats.itk_hdf5 import HEAP_HEAD_BYTES
-from puncture_twin.planning.formats.itk_transform import parse_transform
+from puncture_twin.planning.formats.itk_transform import HEAP_HEAD_BYTES, parse_transform
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.run_twin import main
@@ -256,7 +255,7 @@ WITHOUT = """
 import sys
 sys.modules["h5py"] = None  # as if it were not installed
 from pathlib import Path
-from puncture_twin.planning.formats.itk_hdf5 import HEAP_HEAD_BYTES
+from puncture_twin.planning.formats.itk_transform import HEAP_HEAD_BYTES
 from puncture_twin.planning.formats.itk_transform import parse_transform
 parse_transform(b"x", Path("a.h5"))
 """

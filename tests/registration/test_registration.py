@@ -6,14 +6,14 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.conditioning import conditioning, leverage
 from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.twin.experiment.chen2019_tables import TABLE_1, TABLE_2, TABLE_4
+from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2, TABLE_4
 
 TARGET = np.array([50.0, 130.0, 63.0])
 MARKERS = np.array([TABLE_1[name] for name in "ABCE"], dtype=float)

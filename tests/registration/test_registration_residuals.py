@@ -12,7 +12,7 @@ from puncture_twin.planning.registration.fits.marker_ambiguity import rigid_rss
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residual_test import DOUBT, MIN_FLE_MM, ResidualTest
-from puncture_twin.twin.experiment.chen2019_tables import TABLE_1, TABLE_2
+from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2
 
 TARGET = np.array([50.0, 130.0, 63.0])
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [20, 150, 147], [-40, 30, 60], [90, -60, 10]])

@@ -8,8 +8,7 @@ from case_world import CASE, MARKERS, changed, registration_section, write_case
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.geometry.rigid import apply, inverse, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation, left_jacobian
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, left_jacobian, pose
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
 from puncture_twin.planning.registration.checks.marker_list import Surroundings
 from puncture_twin.planning.registration.placement import load_placement

@@ -3,7 +3,7 @@
 import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.singularity import singularity
+from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.registration.marker_noise import touching_configuration, touching_poses
 

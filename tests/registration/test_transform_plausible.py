@@ -9,9 +9,8 @@ from case_world import CASE, changed, points_file, registration_section, write_c
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.case.tables.registration_section import other_readings
-from puncture_twin.planning.geometry.rigid import apply, inverse, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.case.tables import other_readings
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
 from puncture_twin.planning.registration.checks.marker_list import Surroundings
 from puncture_twin.planning.registration.checks.stated_transform import check_transform, markers_beside

@@ -12,12 +12,10 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case import Case, view_frame
-from puncture_twin.planning.case.case_volumes import CaseVolumes
+from puncture_twin.planning.case.named_files import CaseVolumes
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.settings import Needle, RobotSettings, SearchSettings
-from puncture_twin.planning.case.tables.errors_section import RehearsalSection
-from puncture_twin.planning.case.tables.registration_section import MarkerSection
-from puncture_twin.planning.case.tables.search_section import RankingSection
+from puncture_twin.planning.case.tables import MarkerSection, RankingSection, RehearsalSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.conditioning import leverage

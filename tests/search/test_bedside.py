@@ -8,8 +8,7 @@ from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.search.bedside.entry_facts import needle_planes
-from puncture_twin.planning.search.bedside.entry_place import Landmark, entry_place
+from puncture_twin.planning.search.bedside import Landmark, entry_place, needle_planes
 from puncture_twin.planning.search.context import prepare
 from tests.case_world import write_case
 

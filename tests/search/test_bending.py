@@ -13,9 +13,9 @@ from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.search.bending.path_layers import path_layers
+from puncture_twin.planning.search.bending import path_layers
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
+from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.planning.search.table import to_table
 
 NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.27\n"

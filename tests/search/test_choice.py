@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.selection.choice import (
+from puncture_twin.planning.search.choice import (
     BEST,
     Choice,
     choose,
@@ -17,7 +16,8 @@ from puncture_twin.planning.search.selection.choice import (
     parse_choice,
     with_file_read,
 )
-from puncture_twin.planning.search.selection.windows import find_windows
+from puncture_twin.planning.search.context import prepare
+from puncture_twin.planning.search.windows import find_windows
 from tests.case_world import write_case
 
 CHANGES = (('space = "LPS"', 'space = "RAS"'), ("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'))

@@ -11,8 +11,8 @@ from puncture_twin.planning.anatomy.skin_entry import skin_paths
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle, SearchSettings
+from puncture_twin.planning.clearance.engine import measure
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.clearance.measure import measure
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.constraints import first_broken
 

@@ -12,10 +12,9 @@ from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.doubt import WISHED_HIT, chance_text, goals_of, shrinkable
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
-from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball
-from puncture_twin.planning.uncertainty.lines.line_sampling import Needles
+from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, proximity
+from puncture_twin.planning.uncertainty.lines import Needles
 from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, reading_parts
-from puncture_twin.planning.uncertainty.touch import proximity
 
 KEYS = {"ct_in_plane_mm": 0.3, "ct_slice_mm": 1.2, "bed_axis": (1.0, 0.0, 0.0), "touch_mm": 0.5, "tip_offset_mm": 0.2}
 

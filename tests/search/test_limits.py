@@ -13,10 +13,9 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.search import candidate_chances
 from puncture_twin.planning.search.candidate_chances import limited
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.selection.windows import find_windows
-from puncture_twin.planning.uncertainty.chance_model import keeps_limits, refined_chances
-from puncture_twin.planning.uncertainty.chances import Chances
-from puncture_twin.planning.uncertainty.touch import proximity, touch_bound, touch_chance
+from puncture_twin.planning.search.windows import find_windows
+from puncture_twin.planning.uncertainty.chance_model import Chances, keeps_limits, refined_chances
+from puncture_twin.planning.uncertainty.hit import proximity, touch_bound, touch_chance
 
 LIMITS = "min_hit = 0.999\nmax_touch = 0.0001"
 NO_READING = (

@@ -14,14 +14,13 @@ from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.collision.surroundings import with_surroundings
-from puncture_twin.planning.collision.workcell import case_checker
+from puncture_twin.planning.collision.workcell import case_checker, with_surroundings
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.search.arm_reach import ArmReach, with_reach
+from puncture_twin.planning.search.constraints import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import organ_candidates
-from puncture_twin.planning.search.phases.arm_phases import with_breathing_reach
+from puncture_twin.planning.search.phases import with_breathing_reach
+from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.planning.search.table import to_table
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.patient.main_job import search_case

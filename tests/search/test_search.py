@@ -13,12 +13,12 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.entry import outward
-from puncture_twin.planning.case.tables.search_section import RankingSection
-from puncture_twin.planning.clearance.cross_check import CrossCheckError
+from puncture_twin.planning.case.tables import RankingSection
+from puncture_twin.planning.clearance.fcl_engine import CrossCheckError
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.organs import inside_length, organ_candidates
 from puncture_twin.planning.search.ranking import pareto_front, rank, ranked
+from puncture_twin.planning.search.search import inside_length, organ_candidates
 from puncture_twin.planning.search.table import write_table
 from tests.carton_truth import carton_field
 

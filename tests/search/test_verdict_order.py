@@ -9,7 +9,7 @@ from puncture_twin.planning.anatomy.skin_entry import SkinPaths
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle
-from puncture_twin.planning.clearance.measure import Clearances
+from puncture_twin.planning.clearance.engine import Clearances
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.constraints import closest_miss, first_broken, worst_violation
 

@@ -9,10 +9,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from puncture_twin.planning.case.angle_grid import AngleGrid
-from puncture_twin.planning.case.entry import outward
-from puncture_twin.planning.search.selection.safe_cone import grid_cone, with_grid_cone
-from puncture_twin.planning.search.selection.windows import SQUARE_DEGREES, _connected, find_windows
+from puncture_twin.planning.case.entry import AngleGrid, outward
+from puncture_twin.planning.search.ranking import grid_cone, with_grid_cone
+from puncture_twin.planning.search.windows import SQUARE_DEGREES, _connected, find_windows
 from tests import report_world as world
 
 

@@ -6,12 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.stated_arm import check_recording
+from puncture_twin.planning.arm.kinematics import check_recording, flange_pose
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.formats.joint_readings import parse_joint_recording
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.formats.points import parse_joint_recording
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording

@@ -15,12 +15,11 @@ from puncture_twin.planning.base.cache.array_cache import NO_CACHE
 from puncture_twin.planning.base.progress import unnamed
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.dicom.ct_series import read_series
-from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.init.finder import Wanted, find
 from puncture_twin.planning.init.segmentation import Place
 from puncture_twin.planning.init.start import Request, start_case
-from puncture_twin.twin.plant.scanner.nifti_writer import write_nifti
+from puncture_twin.twin.plant.scanner.writers import write_nifti
 from slips.kinds import RIGHT, SILENT, WARNED, Answer, Kind, answer
 
 ORGANS = ("liver", "colon", "portal_vein", "kidney_left", "aorta")

@@ -15,10 +15,9 @@ from puncture_twin.planning.evidence.checks import findings
 from puncture_twin.planning.evidence.edges import axis_slips, edge_image, least_shift_mm
 from puncture_twin.planning.evidence.label_placement import LEAST_SLIP, WARNING_Z, assess
 from puncture_twin.planning.geometry.mesh import spread_on
-from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.plant.scanner.nifti_writer import write_nifti
+from puncture_twin.twin.plant.scanner.writers import write_nifti
 from slips.kinds import REFUSED, RIGHT, SILENT, TOLD, WARNED, Answer, Kind, answer
 
 PHANTOMS = dict(phantoms())

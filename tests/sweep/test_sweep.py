@@ -11,12 +11,12 @@ from places import ROOT
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.settings import Obstacle
-from puncture_twin.planning.case.tables.errors_section import RehearsalSection
+from puncture_twin.planning.case.tables import RehearsalSection
+from puncture_twin.planning.search.choice import Choice
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.selection.choice import Choice
 from puncture_twin.planning.sweep.sweep_planner import plan_sweep
 from puncture_twin.twin.jobs.experiment.sweep_job import parse_angles, sweep_case, sweep_text
-from puncture_twin.twin.rehearsal.executed import execute_sweep
+from puncture_twin.twin.rehearsal.rehearsal import execute_sweep
 
 CASE = ROOT / "meshes" / "carton" / "case_m.toml"
 START, END = np.radians([22.0, 212.0]), np.radians([30.0, 222.0])

@@ -10,15 +10,13 @@ import trimesh
 
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.singularity import farthest_from_singular
+from puncture_twin.planning.arm.kinematics import farthest_from_singular, flange_pose
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.touch.straight_approach import TIP_MM, ApproachCheckers, line_to, why_not
-from puncture_twin.planning.touch.tour_motions import shortest_tour
+from puncture_twin.planning.touch.tour_motions import TIP_MM, ApproachCheckers, line_to, shortest_tour, why_not
 
 UR3, TIP = ur_model("ur3"), 210.0
 HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.arm.error_jacobian import FREE_D, N_PARAMETERS, error_jacobian
+from puncture_twin.planning.arm.kinematics import FREE_D, N_PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
-from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation
 from puncture_twin.twin.plant.true_needle import driven_onto, true_needle
 
 STEP = 1e-5

@@ -7,14 +7,13 @@ from oracles import measure_displaced
 from scipy.special import ndtr, stdtr
 from scipy.stats import chi2
 
-from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.engine import normals_of
+from puncture_twin.planning.clearance.fast_engine import FastEngine, near_faces
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.clearance.near_faces import near_faces
-from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.uncertainty.lines.line_sampling import Needles, Surroundings, refined
-from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.uncertainty.hit import proximity, touch_chance
+from puncture_twin.planning.uncertainty.lines import Needles, Surroundings, refined
 
 LENGTH, RADIUS = 150.0, 0.6
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,8 +7,7 @@ import pytest
 from scipy.special import chdtri
 from uncertainty_world import NO_ARM, SLICES, declared, world
 
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.conditioning import leverage
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register

@@ -5,13 +5,13 @@ import pytest
 import trimesh
 from scipy.special import ndtr
 
+from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
-from puncture_twin.planning.clearance.normals import normals_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.search.candidate_chances import joint_touch_chance
-from puncture_twin.planning.uncertainty.touch import proximity, touch_chance
+from puncture_twin.planning.uncertainty.hit import proximity, touch_chance
 
 LENGTH, RADIUS = 150.0, 0.6
 UP = np.array([0.0, 0.0, 1.0])

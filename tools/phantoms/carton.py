@@ -15,7 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.experiment.chen2019_tables import TABLE_1, TABLE_2, TABLE_4
+from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2, TABLE_4
 
 __all__ = [
     "LESIONS_CT_MM",

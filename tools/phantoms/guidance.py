@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import error_model
-from puncture_twin.planning.case.tables.errors_section import ErrorsSection
+from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.marker_noise import reading_noise

@@ -13,7 +13,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.plant.scanner.solids import Solid
+from puncture_twin.twin.plant.scanner.image import Solid
 from tools.phantoms import torso
 from tools.phantoms.ct_image import AIR_HU, Grid, ScannedPart
 from tools.phantoms.implicit import Field, capsule, ellipsoid, offset, within

@@ -1,4 +1,7 @@
-"""How a command ends: what it found, its exit code, and one line for what went wrong."""
+"""How a command ends: what it found, its exit code, and one line for what went wrong.
+
+What a wrong command line may say instead.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,12 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Mapping
+from enum import Enum
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import typer
-from typer._click.exceptions import ClickException  # typer carries its own click and re-exports no base class
+from typer._click.exceptions import ClickException
 
 from puncture_twin.planning.base.errors import (
     MOST_WHAT,
@@ -20,9 +24,14 @@ from puncture_twin.planning.base.errors import (
     PlanningError,
     one_line,
 )
-from puncture_twin.twin.jobs.interrupt import insistent_ctrl_c
-from puncture_twin.twin.jobs.terminal import flush_output, leave_unread, print_answer, reader_is_gone, refusal_of
-from puncture_twin.twin.jobs.usage import allowed_text
+from puncture_twin.twin.jobs.terminal import (
+    flush_output,
+    insistent_ctrl_c,
+    leave_unread,
+    print_answer,
+    reader_is_gone,
+    refusal_of,
+)
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 130, 141
 """The last two as the shell gives them for a program that Ctrl-C, or a closed pipe, has ended."""
@@ -207,3 +216,26 @@ def _notes(usual: Callable[..., None], print_line: PrintLine) -> Callable[..., N
             print_line(f"note: {message}")
 
     return show
+
+
+NUMBERS = {int: "a whole number", float: "a number"}
+
+
+def allowed_text(error: ClickException) -> str:
+    """The values of the option whose value is wrong; where they cannot be listed, the help that has them."""
+    option = getattr(error, "param", None)
+    descriptor = getattr(option, "type_descriptor", None)  # typer's own: what is not there is not told
+    kind = getattr(descriptor, "annotation", None)
+    kind = next(iter(get_args(kind)), kind)  # of a list its members
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return ", ".join(str(one.value) for one in kind)
+    if kind in NUMBERS and type(error).__name__ == "BadParameter":
+        return NUMBERS[kind] + _range(option)
+    context = getattr(error, "ctx", None)
+    command = "" if context is None else context.command_path.removeprefix(context.find_root().command_path).strip()
+    return f"see {command} --help" if command else "see --help"
+
+
+def _range(option: Any) -> str:
+    bounds = (("from", getattr(option, "min", None)), ("to", getattr(option, "max", None)))
+    return "".join(f" {word} {bound:g}" for word, bound in bounds if bound is not None)

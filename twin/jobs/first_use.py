@@ -51,7 +51,7 @@ def use_once() -> None:
     import numpy as np
 
     from puncture_twin.planning.motion.approach import plan_approach
-    from puncture_twin.planning.reach.small_workcell import ask_arm, small_workcell
+    from puncture_twin.planning.reach.reach import ask_arm, small_workcell
 
     gc.set_threshold(LATER_EVERY)
     checker = small_workcell()
@@ -66,12 +66,11 @@ def _err_once() -> None:
     import numpy as np
 
     from puncture_twin.planning.base.arrays import read_only
+    from puncture_twin.planning.clearance.fast_engine import near_faces
     from puncture_twin.planning.clearance.kernels.blocks import pack
-    from puncture_twin.planning.clearance.near_faces import near_faces
-    from puncture_twin.planning.reach.small_workcell import TARGET, octahedron
+    from puncture_twin.planning.reach.reach import TARGET, octahedron
     from puncture_twin.planning.uncertainty.hit import hit_in_mesh, target_rays
-    from puncture_twin.planning.uncertainty.lines.line_sampling import line_chance
-    from puncture_twin.planning.uncertainty.lines.needle_doubt import needle_doubt
+    from puncture_twin.planning.uncertainty.lines import line_chance, needle_doubt
 
     target, up, cov = read_only(TARGET), np.array([0.0, 0.0, 1.0]), np.diag([1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4])
     hit_in_mesh(target_rays(octahedron(target, 5.0), target), cov[None, :3, :3])
@@ -85,12 +84,11 @@ def draw_once() -> None:
     """A body in another that is see-through, and one that moves; a map, a line and an area."""
     import numpy as np
 
-    from puncture_twin.planning.reach.small_workcell import TARGET, octahedron
-    from puncture_twin.twin.report.canvas.canvas import Canvas
+    from puncture_twin.planning.reach.reach import TARGET, octahedron
+    from puncture_twin.twin.report.canvas import Canvas
     from puncture_twin.twin.report.map_view import MapCells, MapView
     from puncture_twin.twin.report.raster.camera import ViewCamera
-    from puncture_twin.twin.report.raster.moving import MovingPicture
-    from puncture_twin.twin.report.raster.render import Layer, Surface
+    from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
 
     body, shell = (octahedron(TARGET, radius_mm) for radius_mm in (40.0, 80.0))
     opaque, glass = Layer([Surface(body, (200, 130, 100))]), Layer([Surface(shell, (230, 200, 180), alpha=0.3)])

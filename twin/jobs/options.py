@@ -71,7 +71,7 @@ def with_choice(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def chosen(**values: Any) -> None:
-        from puncture_twin.planning.search.selection.choice import parse_choice
+        from puncture_twin.planning.search.choice import parse_choice
 
         choice = parse_choice(*(values.pop(name) for name in CHOICE_OPTIONS))
         command(**values, choice=choice)

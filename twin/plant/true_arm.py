@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.error_jacobian import ErringArm
+from puncture_twin.planning.arm.kinematics import ErringArm
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 

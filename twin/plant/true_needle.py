@@ -1,15 +1,36 @@
-"""Where the needle truly is, for many arms at once, each with errors of its own."""
+"""Where the needle truly is, for many arms at once, each with errors of its own.
+
+The tissue on a needle's way, as the arm feels it: it presses along the shaft, and to the side of the bevel.
+
+Along the shaft: capsules, cutting and friction over depth (`planning.needle.insertion_force`). A capsule pushes out
+whatever the tip does; friction and cutting work against the motion. At rest friction holds what it is pulled with:
+Dahl's solid friction, elastic up to a shift (Dahl 1968, "A solid friction model"), in place of a sign of the speed.
+
+Across it: the beam in its foundation says what its holder bears, a force and a moment (`planning.needle.beam`). The
+simulated needle is rigid, so both act on it as two forces, at the tip and where the shaft is held.
+
+How hard tissue pressed on a needle, as a person is told.
+
+What is true when markers are touched: where patient and markers are, and what is wrong with the arm.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.error_jacobian import FREE_D, N_PARAMETERS, PARAMETERS, dh_step, error_jacobian
+from puncture_twin.planning.arm.kinematics import FREE_D, N_PARAMETERS, PARAMETERS, dh_step, error_jacobian, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation
+from puncture_twin.planning.registration.marker_noise import parameter_variances
+from puncture_twin.planning.search.bending import Insertion
+from puncture_twin.planning.touch.tour_motions import Touch
+from puncture_twin.twin.world.client import to_m, to_mm
+from puncture_twin.twin.world.control import Push, Tip
 
 NEWTON_STEPS = 4
 """Of a tip moved onto a point: errors of an arm are millimetres, and each step squares what is left of them."""
@@ -63,3 +84,180 @@ def driven_onto(model: UrModel, points_base: Floats, q_start: Floats, eta: Float
         missing = points_base - true_needle(model, q, eta, tip_mm).tip_base
         q += (back @ missing[..., None])[..., 0]
     return q
+
+
+SHIFT_MM = 0.1
+"""By which friction gives way elastically before it slides: the samples of the force are as far apart."""
+
+
+class StraightPath(NamedTuple):
+    """Along which a needle is pushed in: its entry (3,), mm, and its unit direction inward (3,), base frame."""
+
+    entry_base: Floats
+    into_base: Floats
+
+
+class TrueTissue:
+    """Presses on a needle while it goes in; it keeps how deep the tip has been, and where friction holds it.
+
+    Args:
+        insertion: What the needle passes, from the skin on.
+        path: Where.
+        side: Whereto the bevel points about the needle's z, rad.
+        shaft_mm: From the holder to the tip.
+    """
+
+    def __init__(self, insertion: Insertion, path: StraightPath, side: float, shaft_mm: float) -> None:
+        self._force, self._bent = insertion.force, insertion.path
+        self._path, self._side, self._shaft_mm = path, np.array([np.cos(side), np.sin(side), 0.0]), shaft_mm
+        self._deepest, self._held, self._felt = 0.0, 0.0, Felt(0.0, 0.0)
+
+    @property
+    def felt(self) -> Felt:
+        """The greatest so far."""
+        return self._felt
+
+    def __call__(self, tip: Tip) -> tuple[Push, ...]:
+        """What presses on the needle now."""
+        R, at_m = tip.R_base_tip[0], tip.position_m[0]
+        depth = float((to_mm(at_m) - self._path.entry_base) @ self._path.into_base)
+        along = self._along(depth)
+        at_tip, at_holder = self._across(depth)
+        self._felt = Felt(max(self._felt.along_n, along), max(self._felt.across_n, abs(at_tip + at_holder)))
+        holder_m = at_m - to_m(self._shaft_mm) * R[:, 2]
+        side = R @ self._side
+        return Push(at_tip * side - along * self._path.into_base, at_m), Push(at_holder * side, holder_m)
+
+    def _along(self, depth: float) -> float:
+        """N, against the way in."""
+        if depth <= 0.0:
+            self._held = 0.0
+            return 0.0
+        self._deepest = max(self._deepest, depth)
+        stretch = float(np.clip(depth - self._held, -SHIFT_MM, SHIFT_MM))
+        self._held = depth - stretch
+        capsule, cutting, friction = (
+            float(np.interp(self._deepest, self._force.depth_mm, term))
+            for term in (self._force.capsule_n, self._force.cutting_n, self._force.friction_n)
+        )
+        return capsule + friction * stretch / SHIFT_MM + cutting * max(stretch, 0.0) / SHIFT_MM
+
+    def _across(self, depth: float) -> tuple[float, float]:
+        """N, to the bevel's side, at the tip and at the holder: together the force and the moment of the beam."""
+        force, moment = (
+            float(np.interp(max(depth, 0.0), self._bent.depth_mm, term))
+            for term in (self._bent.holder_n, self._bent.holder_n_mm)
+        )
+        at_tip = moment / self._shaft_mm
+        return at_tip, force - at_tip
+
+
+class Felt(NamedTuple):
+    """The greatest forces of one insertion, N: along the needle, and across it as its holder bears them."""
+
+    along_n: float
+    across_n: float
+
+    @property
+    def text(self) -> str:
+        """For a person."""
+        if self.along_n == self.across_n == 0.0:
+            return "the tissue did not push: the needle met none"
+        return f"the tissue pushed with up to {self.along_n:.2f} N along the needle, {self.across_n:.2f} N across it"
+
+
+NOT_FELT = "no force of tissue: the case declares none ([tissue])"
+"""Of an insertion through tissue that nobody described."""
+
+
+@dataclass(frozen=True, eq=False)
+class TouchTruth:
+    """One draw of the declared errors.
+
+    Attributes:
+        seed: Of it.
+        T_base_ct: Shape (4, 4), mm: where the patient truly lies.
+        eta: Shape (28,): what is wrong with the arm's parameters, mm and rad.
+        aim_ct: Marker to shape (3,), mm: where the tip comes to on the marker, its touch noise included.
+        arrival: Marker to shape (6,), rad: true joints minus what the encoders say there.
+    """
+
+    seed: int
+    T_base_ct: Floats
+    eta: Floats
+    aim_ct: dict[str, Floats]
+    arrival: dict[str, Floats]
+
+    def q_contact(self, model: UrModel, tip_mm: float, touch: Touch) -> Floats:
+        """What the encoders say, shape (6,), rad, when the true tip is on the marker, the needle as planned."""
+        there = apply(self.T_base_ct, self.aim_ct[touch.name])
+        q_true = driven_onto(model, there[None], touch.q_touch[None], self.eta[None], tip_mm)[0]
+        return np.asarray(q_true - self.arrival[touch.name])
+
+
+def draw_touch_truth(
+    T_base_ct: Floats, names: tuple[str, ...], points_ct: Floats, errors: ErrorModel, seed: int
+) -> TouchTruth:
+    """Draw where everything truly is.
+
+    Args:
+        T_base_ct: Shape (4, 4), mm: where the patient lies.
+        names: The N markers.
+        points_ct: Shape (N, 3), mm, as read.
+        errors: As declared.
+        seed: Of all draws.
+    """
+    rng = np.random.default_rng(seed)
+    eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
+    values, axes = np.linalg.eigh(errors.marker_cov_ct)
+    read = rng.normal(size=points_ct.shape) * np.sqrt(np.maximum(values, 0.0)) @ axes.T
+    aim = points_ct - read + rng.normal(0.0, errors.touch_mm, points_ct.shape)
+    arrival = rng.normal(size=(len(names), 6)) * errors.arm.repeatability
+    return TouchTruth(seed, T_base_ct, eta, dict(zip(names, aim, strict=True)), dict(zip(names, arrival, strict=True)))
+
+
+def draw_pivot_truth(
+    T_base_ct: Floats, names: tuple[str, ...], place_base: Floats, errors: ErrorModel, seed: int
+) -> TouchTruth:
+    """Draw what is wrong with an arm that sets its tip onto one place n times; the patient lies as believed.
+
+    Args:
+        T_base_ct: Shape (4, 4), mm.
+        names: Of the touches.
+        place_base: Shape (3,), mm.
+        errors: As declared.
+        seed: Of all draws.
+    """
+    rng = np.random.default_rng(seed)
+    eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
+    aim_base = place_base + rng.normal(0.0, errors.touch_mm, (len(names), 3))
+    aim = apply(np.linalg.inv(T_base_ct), aim_base)
+    arrival = rng.normal(size=(len(names), 6)) * errors.arm.repeatability
+    return TouchTruth(seed, T_base_ct, eta, dict(zip(names, aim, strict=True)), dict(zip(names, arrival, strict=True)))
+
+
+class AtTarget(NamedTuple):
+    """What is true when the needle arrives: joints minus encoders, (6,), rad; and where the target is, (3,), mm."""
+
+    arrival: Floats
+    target_ct: Floats
+
+
+def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget:
+    """The joints drifted since the touches and arrive with their own error; the target was read with one.
+
+    Args:
+        target_ct: Shape (3,), mm, as read.
+        errors: As declared.
+        seed: Of the truth.
+    """
+    rng = np.random.default_rng([seed, 2])
+    arrival = rng.normal(size=6) * np.hypot(errors.arm.repeatability, errors.arm.drift)
+    values, axes = np.linalg.eigh(errors.target_cov_ct)
+    return AtTarget(arrival, target_ct + axes @ (rng.normal(size=3) * np.sqrt(np.maximum(values, 0.0))))
+
+
+def nominal_tip(model: UrModel, tip_mm: float, q: Floats) -> Floats:
+    """Where the controller says that the tip is, shape (3,), mm, at encoders (6,), rad."""
+    T = flange_pose(model, q)
+    return np.asarray(T[:3, 3] + tip_mm * T[:3, 2])

@@ -11,8 +11,8 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.tables.registration_section import MarkerSection
-from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
+from puncture_twin.planning.case.tables import MarkerSection
+from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad

@@ -14,7 +14,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.clearance.normals import normals_of
+from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
@@ -22,8 +22,7 @@ from puncture_twin.planning.registration.marker_noise import reading_noise, touc
 from puncture_twin.planning.registration.residual_test import INTERVAL, NoiseTest
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
-from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, refined_chances
-from puncture_twin.planning.uncertainty.chances import demanding
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled

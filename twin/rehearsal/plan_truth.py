@@ -7,6 +7,11 @@ ends at the room's own place, and turned as there:
     T_base_ct_true = T_base_tip T_ct_tip^-1,   T_base_tip as planned, T_ct_tip as the room found it
 
 That holds at the target; on the way the arm's own errors would differ a little from those at its end.
+
+Punctures in the simulator whose truth something else has drawn: touches of the same erring arm, or rooms.
+
+The simulated arm is the nominal one. What its lengths and the needle err by at the target becomes a part of where the
+patient lies, as in `plan_truth`; the error of the joints on arrival stays one of joints.
 """
 
 from __future__ import annotations
@@ -18,14 +23,16 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.pose_error import pose_error
-from puncture_twin.twin.plant.true_needle import TrueNeedle
+from puncture_twin.twin.plant.true_needle import AtTarget, TouchTruth, TrueNeedle, true_needle
 from puncture_twin.twin.plant.truth import Truth, draw_truth
-from puncture_twin.twin.rehearsal.distribution import Distribution, bend_along, rehearse_rooms
-from puncture_twin.twin.rehearsal.result import PredictedScale, RoomScale, Scale
+from puncture_twin.twin.rehearsal.distribution import Distribution, PhysicsRooms, bend_along, rehearse_rooms
+from puncture_twin.twin.rehearsal.rehearsal import rehearse
+from puncture_twin.twin.rehearsal.result import PredictedScale, Rehearsal, RoomScale, Scale
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, bent
 
 TRIED = 16
@@ -132,3 +139,48 @@ def standing_scale(context: CaseContext, q_insertion: Floats, found: Distributio
     outward_ct = -error.fit.R_base_ct.T @ flange_pose(error.model, q_insertion)[:3, 2]
     cov = replace(error, bend=bend_along(context, outward_ct)).tip_covariance(q_insertion[None])
     return PredictedScale(cov, error.freedom)
+
+
+def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Rehearsal:
+    """Execute the puncture of touches where everything truly is. The same arguments give the same numbers.
+
+    Args:
+        context: The case.
+        plan: By the registration of the touches.
+        truth: That the touches met.
+        at_target: What is true on arrival.
+    """
+    met = bent_truth(context, plan, puncture_truth(plan, truth, at_target))
+    return rehearse(plan, context.case, context.anatomy, met)
+
+
+def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
+    """The truth of touches for a simulated arm that is nominal but for its joints; arguments as above."""
+    model, q = plan.model, plan.insertion.q[-1] + at_target.arrival
+    nominal = np.array(flange_pose(model, q))
+    nominal[:3, 3] += plan.needle_length_mm * nominal[:3, 2]
+    needle = true_needle(model, q, truth.eta, plan.needle_length_mm)
+    T_base_ct = nominal @ np.linalg.inv(pose(needle.R_base_needle, needle.tip_base)) @ truth.T_base_ct
+    source = f"that of the touches, drawn with seed {truth.seed}"
+    return Truth(T_base_ct, at_target.arrival, truth.seed, source, at_target.target_ct)
+
+
+def physics_rooms(context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count) -> PhysicsRooms:
+    """Run some of the rooms, spread evenly over the order of their tip errors, in the simulator.
+
+    Args:
+        context: The plan's case.
+        plan: What is executed.
+        found: The rooms; the arm reached the pose in one at least.
+        count: How many.
+        progress: Called with rooms done and all of them.
+    """
+    rows = spread_rows(found, count)
+    apart, contacts = np.empty(len(rows)), 0
+    for number, row in enumerate(rows.tolist()):
+        truth = drawn_truth(found.puncture, found.rooms, row, found.seed, "a room")
+        done = rehearse(plan, context.case, context.anatomy, truth)
+        apart[number] = np.linalg.norm(done.tip_true_ct[-1] - found.rooms.tip_ct[row])
+        contacts += bool(done.contacts)
+        progress(number + 1, len(rows))
+    return PhysicsRooms(apart, contacts)

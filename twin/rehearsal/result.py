@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
-from puncture_twin.twin.plant.felt import NOT_FELT, Felt
+from puncture_twin.twin.plant.true_needle import NOT_FELT, Felt
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.aim_correction import aimed_fit
 from puncture_twin.planning.registration.fits.least_squares import (

@@ -17,35 +17,41 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.case.bed import bed_frame
-from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.case import Case, bed_frame
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.surroundings import case_boxes
-from puncture_twin.planning.collision.workcell import case_tool, patient_surface
-from puncture_twin.planning.geometry.frames import frame_about
-from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.collision.workcell import case_boxes, case_tool, patient_surface
+from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.planning.touch.straight_approach import (
+from puncture_twin.planning.touch.tour_motions import (
     PAST_MM,
     SLOW_MM,
     STANDOFF_MM,
     ApproachCheckers,
+    Touch,
+    TouchTour,
     line_to,
     why_not,
 )
-from puncture_twin.planning.touch.tour_motions import Touch, TouchTour
-from puncture_twin.twin.plant.touch_truth import TouchTruth, nominal_tip
-from puncture_twin.twin.world.bodies import load_box, remove, soften
-from puncture_twin.twin.world.contacts import touches
-from puncture_twin.twin.world.control.gains import Stiffness, allowed_step
-from puncture_twin.twin.world.control.impedance import Impedance
-from puncture_twin.twin.world.control.reference import reference_of
-from puncture_twin.twin.world.control.rigid_model import RigidModel, rigid_model
-from puncture_twin.twin.world.control.run import Controller, Measured, Motors, Run, Surroundings, run
-from puncture_twin.twin.world.control.tip import tips
-from puncture_twin.twin.world.units import to_m
-from puncture_twin.twin.world.workcell import SimulatedWorkcell, open_workcell
+from puncture_twin.twin.plant.true_needle import TouchTruth, nominal_tip
+from puncture_twin.twin.world.client import to_m
+from puncture_twin.twin.world.control import (
+    Controller,
+    Impedance,
+    Measured,
+    Motors,
+    RigidModel,
+    Run,
+    Stiffness,
+    Surroundings,
+    allowed_step,
+    reference_of,
+    rigid_model,
+    run,
+    tips,
+)
+from puncture_twin.twin.world.execution import touches
+from puncture_twin.twin.world.workcell import SimulatedWorkcell, load_box, open_workcell, remove, soften
 
 TOUCH_SPEED_MM_S = 2.0
 """Of the last millimetres."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from PIL import ImageDraw
 
 from puncture_twin.planning.base.reasons import Rgb
-from puncture_twin.twin.report.canvas.fonts import Anchor, Face, font
+from puncture_twin.twin.report.canvas import Anchor, Face, font
 from puncture_twin.twin.report.map_view import body_directions
 from puncture_twin.twin.report.raster.camera import ViewCamera
 

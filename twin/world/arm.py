@@ -10,15 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.links import LINK_NAMES
-from puncture_twin.planning.arm.model_urdf import model_urdf
+from puncture_twin.planning.arm.links import LINK_NAMES, model_urdf
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE, ArmUrdf
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.world.arm_file import write_arm_urdf
-from puncture_twin.twin.world.engine import pybullet
-from puncture_twin.twin.world.units import pose_to_m, pose_to_mm
+from puncture_twin.twin.world.client import pose_to_m, pose_to_mm, pybullet
 
 POSITION_GAIN = 0.1
 """Fraction of a joint's position error that its motor takes back per step, Bullet's default: an error falls to 1/e

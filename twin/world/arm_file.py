@@ -11,14 +11,13 @@ import numpy as np
 import trimesh
 
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import collision_links
-from puncture_twin.planning.arm.model_urdf import address_file, model_urdf
+from puncture_twin.planning.arm.links import address_file, collision_links, model_urdf
 from puncture_twin.planning.arm.tool import Tool, ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.mesh import joined
-from puncture_twin.twin.world.units import to_m, write_obj
+from puncture_twin.twin.world.client import to_m, write_obj
 
 HOLDER_DENSITY_KG_M3 = 1200.0
 """A printed holder, solid ABS or similar."""

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.twin.world.engine import pybullet
-from puncture_twin.twin.world.units import to_m
+from puncture_twin.twin.world.client import pybullet, to_m
 
 FIELD_OF_VIEW_DEG = 45.0
 NEAR_M = 0.05

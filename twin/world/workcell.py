@@ -1,15 +1,20 @@
 """The whole workcell: the arm with its needle, the patient at their true place, and the boxes around them.
 
 The world frame is the controller's base frame.
+
+What else stands in the workcell: the patient's skin, boxes, and surfaces that are only seen.
 """
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 
+import fast_simplification
 import numpy as np
 
 from puncture_twin.planning.arm.tool import Box, Tool
@@ -18,8 +23,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.arm import Arm, load_arm
-from puncture_twin.twin.world.bodies import let_pass, load_box, load_surface
-from puncture_twin.twin.world.client import physics_client
+from puncture_twin.twin.world.client import physics_client, pose_to_m, pybullet, to_m, write_obj
 
 
 @dataclass(frozen=True)
@@ -70,3 +74,102 @@ def open_workcell(
         for box in boxes:
             names[load_box(client, np.asarray(box.size_mm), box.T_base_box)] = box.name
         yield SimulatedWorkcell(client, arm, MappingProxyType(names))
+
+
+Rgba = tuple[float, float, float, float]
+
+MAX_PHYSICS_FACES = 20_000
+"""Surfaces with more triangles are thinned for physics and pictures; verdicts come from FCL on the full ones."""
+
+SKIN_RGBA: Rgba = (0.93, 0.78, 0.68, 1.0)
+BOX_RGBA: Rgba = (0.60, 0.63, 0.67, 1.0)
+
+CONTACT_MARGIN_M = 0.0
+"""Bullet grows concave shapes by this; contact shall begin at the surface itself."""
+
+CONTACT_DAMPING_NS_M = 100.0
+"""Of bodies that yield."""
+
+
+def load_surface(
+    client: int,
+    mesh: TriangleMesh,
+    T_world_mesh: Floats,
+    *,
+    solid: bool,
+    max_faces: int = MAX_PHYSICS_FACES,
+) -> int:
+    """A surface that does not move: triangle by triangle, hollows included.
+
+    Args:
+        client: Physics client id.
+        mesh: The surface, mm; thinned to ``max_faces``.
+        T_world_mesh: Its pose, shape (4, 4), mm.
+        solid: Whether bodies collide with it, or it is only seen.
+        max_faces: How many triangles physics and pictures bear.
+
+    Returns:
+        Body id.
+    """
+    position, quaternion = pose_to_m(T_world_mesh)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "surface.obj"
+        write_obj(thinned(mesh, max_faces), path)
+        collision = -1
+        if solid:
+            collision = pybullet.createCollisionShape(
+                pybullet.GEOM_MESH,
+                fileName=str(path),
+                flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
+                physicsClientId=client,
+            )
+        visual = pybullet.createVisualShape(
+            pybullet.GEOM_MESH, fileName=str(path), rgbaColor=SKIN_RGBA, physicsClientId=client
+        )
+        body = pybullet.createMultiBody(0.0, collision, visual, position, quaternion, physicsClientId=client)
+    if solid:
+        pybullet.changeDynamics(body, -1, collisionMargin=CONTACT_MARGIN_M, physicsClientId=client)
+    return int(body)
+
+
+def load_box(client: int, size_mm: Floats, T_world_box: Floats) -> int:
+    """A box that does not move; size (3,) along its axes, its pose at its centre. Returns the body id."""
+    half = to_m(size_mm / 2).tolist()
+    collision = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
+    visual = pybullet.createVisualShape(pybullet.GEOM_BOX, halfExtents=half, rgbaColor=BOX_RGBA, physicsClientId=client)
+    position, quaternion = pose_to_m(T_world_box)
+    return int(pybullet.createMultiBody(0.0, collision, visual, position, quaternion, physicsClientId=client))
+
+
+def load_ball(client: int, center_mm: Floats, radius_mm: float, rgba: Rgba) -> int:
+    """A ball that is only seen; its centre (3,), world frame. Returns the body id."""
+    visual = pybullet.createVisualShape(
+        pybullet.GEOM_SPHERE, radius=float(to_m(radius_mm)), rgbaColor=rgba, physicsClientId=client
+    )
+    return int(pybullet.createMultiBody(0.0, -1, visual, to_m(center_mm).tolist(), physicsClientId=client))
+
+
+def remove(client: int, body: int) -> None:
+    """Take a body out of the world."""
+    pybullet.removeBody(body, physicsClientId=client)
+
+
+def soften(client: int, body: int, stiffness_n_m: float) -> None:
+    """Let a body that stands still yield in contact like a spring, N/m, lightly damped."""
+    soft = {"contactStiffness": stiffness_n_m, "contactDamping": CONTACT_DAMPING_NS_M}
+    pybullet.changeDynamics(body, -1, **soft, physicsClientId=client)
+
+
+def let_pass(client: int, body: int, link: int, other: int) -> None:
+    """Let one link go through another body (its base) without contact: the needle through the skin."""
+    pybullet.setCollisionFilterPair(body, other, link, -1, 0, physicsClientId=client)
+
+
+def thinned(mesh: TriangleMesh, max_faces: int = MAX_PHYSICS_FACES) -> TriangleMesh:
+    """The mesh itself where it is small, else a decimated one of about ``max_faces`` triangles."""
+    if len(mesh.faces) <= max_faces:
+        return mesh
+    vertices, faces = fast_simplification.simplify(
+        np.array(mesh.vertices), np.array(mesh.faces), target_count=max_faces
+    )
+    return TriangleMesh(vertices, faces)

@@ -13,15 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.urdf.chain import ArmChain, arm_chain
 from puncture_twin.planning.arm.urdf.document import UrdfDocument, UrdfShape, parse_urdf
-from puncture_twin.planning.arm.urdf.lengths import ur_lengths
+from puncture_twin.planning.arm.urdf.lengths import ArmChain, arm_chain, ur_lengths
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, parse_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space, Up
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
 ROUND_SIDES = 48
 """Of the prism about a cylinder: up to 0.2 % wider than it is (0.1 mm at a radius of 50 mm)."""

@@ -1,40 +1,41 @@
+# mypy: disable-error-code="no-untyped-def"
 """Compiled check of one straight joint segment: what surely touches, what is surely clear, and what is left to ask.
 
-It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.halving`, of those that it calls and of
+It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.segments`, of those that it calls and of
 :mod:`puncture_twin.planning.arm.kinematics`.
-"""
 
-# mypy: disable-error-code="no-untyped-def"
-# numba infers the types
+Compiled halving of a segment for all checks together: each part keeps those that no middle of a part has cleared.
+
+It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.proofs` and of those that they call.
+
+What compiled checks of a segment share: the segment, its answer, and the room to work in.
+"""
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 
+from puncture_twin.planning.arm.kinematics import link_frames
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
-from puncture_twin.planning.collision.kernels.halving import divide, left_of
 from puncture_twin.planning.collision.kernels.hulls import TOUCHING
 from puncture_twin.planning.collision.kernels.proofs import (
     BOX,
     MIN_GAP_MM,
     PAIR,
     SKIN,
+    Movers,
+    ProofScene,
+    ProofScratch,
     near_gap,
     paths_about,
     place_sphere,
     place_spheres,
+    scratch,
     sphere_gap,
-)
-from puncture_twin.planning.collision.kernels.segment_parts import (
-    ANSWERED,
-    CHECK,
-    CLEAR,
-    CONTACT,
-    NOT_FINITE,
-    QUERIES,
-    STATUS,
-    Segment,
-    place_arm,
 )
 
 KEPT = 0.8
@@ -161,3 +162,189 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
             within = part / parts, (part + 1) / parts
             if _prove(scene, movers, segment, room.lists[here, row], within, fine_mm, room, answer):
                 return
+
+
+LIKELY = 0.6
+"""Two hulls are seldom farther apart than their spheres and this much of the radii: beyond it a closer look at a part
+is left for when the part is halved."""
+
+
+@allocation_free()
+def _found(at, gap, kept_mm, fraction, answered, answer):
+    """Whether a bound at a state, which is too small to tell the check clear there, ends the search.
+
+    It does where the check surely finds something or keeps less than it is to, and where it has to be queried and was
+    not yet.
+    """
+    answer.status[CHECK] = at
+    if gap == TOUCHING or kept_mm > 0.0:
+        answer.status[STATUS] = CONTACT
+        return True
+    answer.status[ANSWERED] += 1
+    if answer.status[ANSWERED] <= answered:
+        return False
+    answer.status[STATUS], answer.status[QUERIES] = QUERY, 1
+    answer.fractions[0], answer.checks[0] = fraction, at
+    return True
+
+
+@allocation_free()
+def left_of(scene, movers, segment, part, span, into, room, answered, answer):
+    """Which checks the middle of a part of the segment does not clear all over the part.
+
+    Each is looked at in the middle as it is. How far spheres and bodies are from one another clears the part where the
+    bodies cannot come as far within it (after Schwarzer, Saha and Latombe 2005, "Adaptive dynamic collision checking
+    for single and multiple articulated robots in complex environments").
+
+    Args:
+        scene: See :class:`ProofScene`.
+        movers: See :class:`Movers`.
+        segment: See :class:`Segment`.
+        part: Its middle and half its width, fractions of the segment.
+        span: Which list of ``room.lists``, and from where to where, holds the checks that are to be cleared.
+        into: Where in the other list the rest goes.
+        room: See :class:`Room`.
+        answered: See :func:`check_segment`.
+        answer: Likewise.
+
+    Returns:
+        Where in the other list the rest ends; -1 where the search has ended.
+    """
+    checks, radii, T_box_base, halves = scene.checks, scene.hulls.radii, scene.T_box_base, scene.halves
+    work, paths, known, spheres, frames = room.work, room.paths, room.known, room.work.spheres, segment.frames[0]
+    of_check, centres, reaches, mover_frames = movers.of_check, movers.centres, movers.radii, movers.frames
+    source, target, kept_mm = room.lists[span[0]], room.lists[1 - span[0]], room.kept
+    place_arm(segment, part[0])
+    place_spheres(scene.hulls, frames, spheres)
+    known[:] = False
+    for row in range(span[1], span[2]):
+        at = source[row]
+        mover, kind, first, second = of_check[at], checks[at, 0], checks[at, 1], checks[at, 2]
+        if not known[mover]:
+            known[mover] = True
+            paths_about(
+                frames, mover_frames[mover], centres[mover], reaches[mover], segment.turns, part[1], paths[mover]
+            )
+        kept = kept_mm[at] + MIN_GAP_MM
+        needed, gap, most = paths[mover, checks[at, 3]] + kept, 0.0, math.inf
+        if kind != SKIN:
+            gap = sphere_gap(kind == BOX, first, second, spheres, radii, T_box_base, halves)
+            if gap > needed:
+                continue
+            most = gap + LIKELY * (radii[second] + (radii[first] if kind == PAIR else 0.0))
+        if gap <= kept or most >= needed:
+            wanted = needed if most >= needed else kept
+            gap = near_gap(scene, work, at, frames, wanted, wanted + MIN_GAP_MM, wanted)
+            if gap > needed:
+                continue
+            if gap <= kept < wanted and gap != TOUCHING:
+                gap = near_gap(scene, work, at, frames, kept, kept + MIN_GAP_MM, kept)
+            if gap <= kept and _found(at, gap, kept_mm[at], part[0], answered, answer):
+                return -1
+        target[into] = at
+        into += 1
+    return into
+
+
+@allocation_free()
+def divide(scene, movers, segment, halvings, order, room, answered, answer):
+    """Halve the segment, and leave of each part the checks that neither its middle nor that of a larger part clears.
+
+    All parts of one size come before the next, so that what touches is found soon.
+
+    Returns:
+        How many parts there are, and which list of ``room`` holds the checks left in each; (0, 0) for none, and
+        (-1, 0) where the search has ended.
+    """
+    lists, spans, parts, here = room.lists, room.spans, 1, np.int64(0)
+    for row in range(len(order)):
+        lists[0, row] = order[row]
+    spans[0, 0, 0], spans[0, 0, 1] = 0, len(order)
+    for _ in range(halvings + 1):
+        top, half = np.int64(0), 0.5 / parts
+        for part in range(parts):
+            begin = top
+            if spans[here, part, 0] < spans[here, part, 1]:
+                middle, span = half * (2 * part + 1), (here, spans[here, part, 0], spans[here, part, 1])
+                top = left_of(scene, movers, segment, (middle, half), span, top, room, answered, answer)
+            if top < 0:
+                return -1, 0
+            for side in range(2):
+                spans[1 - here, 2 * part + side, 0], spans[1 - here, 2 * part + side, 1] = begin, top
+        parts, here = 2 * parts, 1 - here
+        if top == 0:
+            return 0, 0
+    return parts, here
+
+
+CLEAR, CONTACT, QUERY, NOT_FINITE = 0, 1, 2, 3
+"""What a segment came to: proven but for the queries, a contact, a query to be made at once, no numbers."""
+
+STATUS, CHECK, ANSWERED, QUERIES = 0, 1, 2, 3
+"""The entries of an answer's status: one of the above; the check that touches; how many queries were, or are to be,
+answered at once; how many there are now."""
+
+HALVINGS = 6
+"""Of a segment for all checks together; each check that is left goes on alone."""
+
+PARTS = 256
+"""Space for parts of a segment that wait: one more for each halving, and 64 of them leave nothing of a segment."""
+
+
+class Answer(NamedTuple):
+    """What a segment came to, filled by :func:`segments.check_segment`."""
+
+    status: Ints
+    """Shape (4,)."""
+    fractions: Floats
+    """Shape (q,): of each query, the fraction of the segment at which its state is."""
+    checks: Ints
+    """Shape (q,): the checks that are queried."""
+
+
+class Segment(NamedTuple):
+    """A segment, and the arm at one state of it."""
+
+    lengths: Floats
+    start: Floats
+    step: Floats
+    turns: Floats
+    """Shape (6,), rad: how far each joint turns."""
+    q: Floats
+    """Shape (1, 6): scratch."""
+    frames: Floats
+    """Shape (1, 7, 4, 4), mm: filled by :func:`place_arm`."""
+
+
+class Room(NamedTuple):
+    """Where a segment is checked: see :func:`segment_room`. Nothing in it outlasts the segment."""
+
+    work: ProofScratch
+    kept: Floats
+    """Shape (k,), mm: what each check is to keep."""
+    lists: Ints
+    """Shape (2, n): lists of checks, those that are left before and after a halving."""
+    spans: Ints
+    """Shape (2, p, 2): where in them each part's begins and ends."""
+    paths: Floats
+    """Shape (m, 7), mm: of each mover, see :func:`paths_about`."""
+    known: Bools
+    """Shape (m,): of which movers."""
+    parts: Floats
+    """Shape (``PARTS``, 2): parts of a segment that wait."""
+
+
+def segment_room(scene: ProofScene, movers: Movers) -> Room:
+    """Room for the checks of a cell."""
+    checks, count = len(scene.checks), len(movers.frames)
+    lists, spans = np.empty((2, checks << HALVINGS), np.int64), np.empty((2, 2 << HALVINGS, 2), np.int64)
+    work, paths = scratch(checks, len(scene.hulls.radii)), np.empty((count, 7))
+    return Room(work, np.zeros(checks), lists, spans, paths, np.zeros(count, np.bool_), np.empty((PARTS, 2)))
+
+
+@allocation_free()
+def place_arm(segment, fraction):
+    """Put the arm at a fraction of the segment."""
+    for joint in range(6):
+        segment.q[0, joint] = segment.start[joint] + fraction * segment.step[joint]
+    link_frames(segment.lengths, segment.q, segment.frames)

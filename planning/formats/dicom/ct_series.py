@@ -17,8 +17,15 @@ from puncture_twin.planning.base.input_file import read_input
 from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, text
 from puncture_twin.planning.formats.dicom.pixels import PixelLayout, pixel_layout, stored_values
 from puncture_twin.planning.formats.dicom.recognise import choose_series, described
-from puncture_twin.planning.formats.dicom.slices import Slice, slices_of
-from puncture_twin.planning.formats.dicom.stack import Stack, StraightGrid, moved, stack_of, straight_grid
+from puncture_twin.planning.formats.dicom.slices import (
+    Slice,
+    Stack,
+    StraightGrid,
+    moved,
+    slices_of,
+    stack_of,
+    straight_grid,
+)
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, check_affine, check_shape
 from puncture_twin.planning.formats.volumes.volume_source import Content

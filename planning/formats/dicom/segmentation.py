@@ -32,8 +32,15 @@ from puncture_twin.planning.formats.dicom.named_masks import (
     unique_names,
 )
 from puncture_twin.planning.formats.dicom.pixels import check_length, sizes
-from puncture_twin.planning.formats.dicom.slices import Groups, Plane, frame_groups, plane_of
-from puncture_twin.planning.formats.dicom.stack import AXES_TOLERANCE, PLACE_TOLERANCE, SPACING_TOLERANCE
+from puncture_twin.planning.formats.dicom.slices import (
+    AXES_TOLERANCE,
+    PLACE_TOLERANCE,
+    SPACING_TOLERANCE,
+    Groups,
+    Plane,
+    frame_groups,
+    plane_of,
+)
 from puncture_twin.planning.formats.dicom.storage import PLAIN, SEGMENTATION
 from puncture_twin.planning.formats.volumes.volume_header import MAX_SPACING_MM, MIN_SPACING_MM, VolumeGrid, check_shape
 from puncture_twin.planning.formats.volumes.volume_source import Content

@@ -2,13 +2,21 @@
 
 A classic file holds one slice; an enhanced one holds many, each with functional groups of its own or shared by all
 (DICOM PS3.3, C.7.6.16). Here both are the same.
+
+Slices in the order in which they lie, and whether they make one regular stack.
+
+Order and steps come from each slice's own position and orientation. Names, instance numbers and slice locations are
+not looked at: they are often wrong, and nothing in the patient depends on them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 from puncture_twin.planning.base.arrays import Floats
@@ -184,3 +192,196 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
 
 def _types(item: Dataset, label: str) -> tuple[str, ...]:
     return texts(item, "FrameType", where=label)
+
+
+AXES_TOLERANCE = 1e-3
+"""By which the axes of two slices may differ: 0.25 mm at the corner of a slice, below a pixel; cosines are rounded."""
+PLACE_TOLERANCE_MM = 0.1
+"""By which a slice may lie off its place in the stack: positions that are rounded to a tenth are within 0.05."""
+PLACE_TOLERANCE = 0.1
+"""The same as a fraction of the step, where that is less."""
+SPACING_TOLERANCE = 1e-4
+"""By which the pixels of two slices may differ in size, as a fraction."""
+ONE_PLACE_MM = 1e-3
+"""No two slices of any scanner are so near."""
+SHOWN = 4
+"""Slices that a message names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Slices at even steps.
+
+    Attributes:
+        slices: In the order in which they lie along the normal.
+        plane: The first one's.
+        step_ct: Shape (3,), from each slice to the next, LPS mm.
+    """
+
+    slices: tuple[Slice, ...]
+    plane: Plane
+    step_ct: Floats
+
+    @property
+    def T_ct_index(self) -> Floats:  # noqa: N802  a frame's name
+        """Shape (4, 4), maps (column, row, slice) to LPS mm; sheared where the gantry was tilted."""
+        T = np.eye(4)
+        T[:3, :2] = self.plane.axes_ct * self.plane.spacing_mm
+        T[:3, 2] = self.step_ct
+        T[:3, 3] = self.plane.origin_ct
+        return T
+
+
+def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
+    """The stack that slices make.
+
+    Raises:
+        InputError: Fewer than two, other orientations or pixel sizes, several at one place, a step that is missing,
+            or uneven steps; the slices are named.
+    """
+    if len(slices) < 2:
+        raise InputError(f"{len(slices)} slice", where=where, allowed="a series of at least 2 slices")
+    first = slices[0]
+    for other in slices[1:]:
+        _check_alike(first, other, where)
+    normal = first.plane.normal_ct
+    ordered = sorted(slices, key=lambda one: float(one.plane.origin_ct @ normal))
+    origins = np.array([one.plane.origin_ct for one in ordered])
+    steps = np.diff(origins @ normal)
+    _check_one_place(ordered, steps, where)
+    step = float(np.median(steps))
+    _check_steps(ordered, steps, step, where)
+    step_ct = (origins[-1] - origins[0]) / (len(ordered) - 1)
+    off = np.linalg.norm(origins - origins[0] - np.arange(len(ordered))[:, None] * step_ct, axis=1)
+    worst = int(np.argmax(off))
+    if off[worst] > _tolerance(step):
+        what = f"{ordered[worst].label} lies {off[worst]:.2f} mm off the line of the others"
+        raise InputError(what, where=where, allowed=f"slices along one straight line, to {_tolerance(step):.2g} mm")
+    return Stack(tuple(ordered), ordered[0].plane, step_ct)
+
+
+def _check_alike(first: Slice, other: Slice, where: Path) -> None:
+    difference = float(np.abs(first.plane.axes_ct - other.plane.axes_ct).max())
+    if difference > AXES_TOLERANCE:
+        angle = np.degrees(np.arccos(np.clip(first.plane.normal_ct @ other.plane.normal_ct, -1.0, 1.0)))
+        what = f"{first.label} and {other.label} have other orientations (normals {angle:.1f} degrees apart)"
+        raise InputError(what, where=where, allowed="slices of one orientation")
+    ratios = np.array(first.plane.spacing_mm) / other.plane.spacing_mm
+    if np.abs(ratios - 1.0).max() > SPACING_TOLERANCE:
+        what = f"{first.label} and {other.label} have pixels of other sizes"
+        raise InputError(
+            f"{what}: {first.plane.spacing_mm} and {other.plane.spacing_mm} mm", where=where, allowed="one"
+        )
+
+
+def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> None:
+    """Two slices nearer than a tenth of the usual step lie at one place; a gap makes others no nearer."""
+    apart = steps[steps >= ONE_PLACE_MM]
+    near = steps < (max(ONE_PLACE_MM, PLACE_TOLERANCE * float(np.quantile(apart, 0.75))) if len(apart) else np.inf)
+    if not near.any():
+        return
+    named = [f"{ordered[k].label} and {ordered[k + 1].label}" for k in np.flatnonzero(near).tolist()]
+    more = f" and {len(named) - SHOWN} pairs more" if len(named) > SHOWN else ""
+    what = f"several slices at one place: {'; '.join(named[:SHOWN])}{more}"
+    raise InputError(what, where=where, allowed="one slice at each place (one time point, no copies)")
+
+
+def _check_steps(ordered: Sequence[Slice], steps: Floats, step: float, where: Path) -> None:
+    wrong = np.flatnonzero(np.abs(steps - step) > _tolerance(step))
+    if not len(wrong):
+        return
+    at = int(wrong[0])
+    between = f"between {ordered[at].label} and {ordered[at + 1].label}"
+    times = steps[at] / step
+    if round(times) >= 2 and abs(times - round(times)) * step <= _tolerance(step):
+        missing = round(times) - 1
+        what = f"{missing} slice{' is' if missing == 1 else 's are'} missing {between}: {steps[at]:.4g} mm apart"
+    else:
+        what = f"uneven steps: {steps[at]:.4g} mm {between}"
+    more = f", and at {len(wrong) - 1} places more" if len(wrong) > 1 else ""
+    allowed = f"even steps; the usual one here is {step:.4g} mm (resample the series, or export it again)"
+    raise InputError(f"{what}{more}", where=where, allowed=allowed)
+
+
+def _tolerance(step: float) -> float:
+    return min(PLACE_TOLERANCE_MM, PLACE_TOLERANCE * step)
+
+
+NO_TILT_MM = 0.05
+"""Of shift from the first slice to the last: less is the rounding of positions."""
+MAX_TILT_DEG = 45.0
+"""Gantries tilt to 30 degrees; beyond, the slices are no stack."""
+WHOLE_PIXEL = 1e-6
+"""Of a pixel: a shift so near to a whole number of pixels needs no interpolation."""
+
+
+@dataclass(frozen=True, eq=False)
+class StraightGrid:
+    """The grid with right angles that holds every slice of a stack.
+
+    Attributes:
+        shape: Voxels along columns, rows and slices.
+        T_ct_index: Shape (4, 4), maps them to LPS mm.
+        shifts: Shape (n, 2), where pixel (0, 0) of each slice lies in the grid, along columns and rows, in pixels.
+        tilt_deg: Between the slices' normal and the way from one to the next.
+    """
+
+    shape: tuple[int, int, int]
+    T_ct_index: Floats
+    shifts: Floats
+    tilt_deg: float
+
+
+def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> StraightGrid:
+    """The grid of a stack; its own one where it was not tilted.
+
+    Raises:
+        InputError: The slices lie side by side rather than one behind the other.
+    """
+    plane, count = stack.plane, len(stack.slices)
+    along = float(stack.step_ct @ plane.normal_ct)
+    sideways_mm = plane.axes_ct.T @ stack.step_ct
+    tilt = float(np.degrees(np.arctan2(np.linalg.norm(sideways_mm), along)))
+    if tilt > MAX_TILT_DEG:
+        what = f"the slices' normal and the way from slice to slice are {tilt:.0f} degrees apart"
+        raise InputError(what, where=where, allowed=f"a tilt of at most {MAX_TILT_DEG:g} degrees")
+    if np.linalg.norm(sideways_mm) * (count - 1) <= NO_TILT_MM:
+        sideways_mm = np.zeros(2)
+        tilt = 0.0
+    shifts = np.arange(count)[:, None] * (sideways_mm / plane.spacing_mm)
+    low, high = np.floor(shifts.min(axis=0) + WHOLE_PIXEL), np.ceil(shifts.max(axis=0) - WHOLE_PIXEL)
+    T = stack.T_ct_index
+    T[:3, 2] = along * plane.normal_ct
+    T[:3, 3] += T[:3, :2] @ low
+    size = (high - low).astype(int) + (columns, rows)
+    return StraightGrid((int(size[0]), int(size[1]), count), T, shifts - low, tilt)
+
+
+def moved(image: NDArray[np.float32], shift: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """An image in a larger one, NaN where it says nothing.
+
+    Args:
+        image: Shape (columns, rows), NaN where nothing was measured.
+        shift: Where its pixel (0, 0) lies in the larger one, along each axis; 0 or more.
+        shape: Of the larger one.
+    """
+    for axis in (0, 1):
+        image = _moved(image, float(shift[axis]), shape[axis], axis)
+    return image
+
+
+def _moved(image: NDArray[np.float32], shift: float, size: int, axis: int) -> NDArray[np.float32]:
+    near = int(np.floor(shift + WHOLE_PIXEL))
+    part = shift - near
+    if part <= WHOLE_PIXEL:
+        return _placed(image, near, size, axis)
+    return np.float32(1.0 - part) * _placed(image, near, size, axis) + np.float32(part) * _placed(
+        image, near + 1, size, axis
+    )
+
+
+def _placed(image: NDArray[np.float32], at: int, size: int, axis: int) -> NDArray[np.float32]:
+    after = size - at - image.shape[axis]
+    pads = [(0, 0), (0, 0)]
+    pads[axis] = (at, after)
+    return np.pad(image, pads, constant_values=np.nan)

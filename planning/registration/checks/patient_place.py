@@ -8,10 +8,9 @@ import fcl
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.bed import up_axis
-from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.case import Case, up_axis
 from puncture_twin.planning.case.settings import Obstacle
-from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.collision.bodies import surface, touch
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply

@@ -14,12 +14,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.tables.registration_section import (
-    NO_RESIDUALS,
-    MarkerSection,
-    RegistrationSection,
-    other_readings,
-)
+from puncture_twin.planning.case.tables import NO_RESIDUALS, MarkerSection, RegistrationSection, other_readings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.checks.base_place import base_place

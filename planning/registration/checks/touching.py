@@ -10,8 +10,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Obstacle
-from puncture_twin.planning.geometry.containment import Side, side_of
-from puncture_twin.planning.geometry.crossings import crossings
+from puncture_twin.planning.geometry.containment import Side, crossings, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 

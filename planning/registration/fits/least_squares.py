@@ -12,9 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.frames import frame_of_points
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation, skew
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_of_points, log_rotation, pose, skew
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 
 NUDGE_MM = 1e-4

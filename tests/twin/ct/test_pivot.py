@@ -7,13 +7,12 @@ import pytest
 from places import ROOT
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.arm.error_jacobian import ErringArm
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.kinematics import ErringArm, flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.formats.points.point_files import NamedPoints, write_points
+from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.twin.guidance.ct.pivot import check_one_place, pivot_calibration
 from puncture_twin.twin.jobs.experiment.pivot_job import PivotRun, pivot_case, pivot_text
 

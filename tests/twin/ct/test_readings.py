@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.twin.guidance.ct.markers import find_markers, read_lesion
 from puncture_twin.twin.guidance.ct.needle import find_needle, needle_error
-from puncture_twin.twin.plant.scanner.image import ScanSettings, scan_solids
-from puncture_twin.twin.plant.scanner.solids import Solid, ball, box, rod
+from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, box, rod, scan_solids
 
 BLOCK = Solid("block", box(np.zeros(3), np.array([90.0, 60.0, 130.0])), 20.0)
 PIXEL = 0.7

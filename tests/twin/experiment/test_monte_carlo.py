@@ -8,11 +8,23 @@ from typer.testing import CliRunner
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.run_twin import app
-from puncture_twin.twin.experiment.declarations import AS_FOUND, AS_STATED, Declaration
-from puncture_twin.twin.experiment.monte_carlo import paper_strains, run_draws
-from puncture_twin.twin.experiment.printed import READ, SETUPS, measured, printed_errors, rows_of
-from puncture_twin.twin.experiment.residuals import POINTS, STRAINS, chi_squared, rigid_residuals
-from puncture_twin.twin.experiment.skew import find_skew
+from puncture_twin.twin.experiment.chen2019 import (
+    AS_FOUND,
+    AS_STATED,
+    POINTS,
+    READ,
+    SETUPS,
+    STRAINS,
+    Declaration,
+    chi_squared,
+    find_skew,
+    measured,
+    paper_strains,
+    printed_errors,
+    rigid_residuals,
+    rows_of,
+    run_draws,
+)
 
 PRINTED = {
     "L by A-B-C, setup 1": 2.99,

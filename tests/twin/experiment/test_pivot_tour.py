@@ -11,17 +11,15 @@ import pytest
 from places import ROOT
 from typer.testing import CliRunner
 
-from puncture_twin.planning.arm.error_jacobian import PARAMETERS
-from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.kinematics import PARAMETERS, flange_pose
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.touch.pivot_planner import plan_pivot, spread_poses
 from puncture_twin.run_twin import app
-from puncture_twin.twin.jobs.experiment import pivot_tour as module
-from puncture_twin.twin.jobs.experiment.pivot_job import calibrated, pivot_case
-from puncture_twin.twin.jobs.experiment.pivot_tour import pivot_tour, pivot_tour_text
-from puncture_twin.twin.plant.touch_truth import draw_pivot_truth
+from puncture_twin.twin.jobs.experiment import pivot_job as module
+from puncture_twin.twin.jobs.experiment.pivot_job import calibrated, pivot_case, pivot_tour, pivot_tour_text
+from puncture_twin.twin.plant.true_needle import draw_pivot_truth
 
 CASE = ROOT / "meshes" / "carton" / "case_m.toml"
 

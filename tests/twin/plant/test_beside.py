@@ -7,9 +7,7 @@ from scipy.spatial import cKDTree
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.jobs.experiment.scan_beside import parse_beside
-from puncture_twin.twin.plant.beside.beside import Beside, lay_beside
-from puncture_twin.twin.plant.beside.outline import Outline
-from puncture_twin.twin.plant.beside.tubes import drawn, tube
+from puncture_twin.twin.plant.outside_objects import Beside, Outline, drawn, lay_beside, tube
 from tools.phantoms.drawn.trunk import draw_trunk
 
 SEEDS = range(4)

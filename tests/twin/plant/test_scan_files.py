@@ -12,12 +12,9 @@ import SimpleITK as sitk  # noqa: N813
 from puncture_twin.planning.formats.dicom.ct_series import parse_series
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.twin.plant.scanner.dicom_writer import write_series
-from puncture_twin.twin.plant.scanner.image import ScanSettings, scan_solids
-from puncture_twin.twin.plant.scanner.nifti_writer import write_nifti
-from puncture_twin.twin.plant.scanner.solids import Solid, ball
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
+from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, scan_solids
+from puncture_twin.twin.plant.scanner.writers import write_nifti, write_series
 
 PLACES = {"left": (30.0, 5.0, 2.0), "back": (-4.0, 22.0, 8.0), "head": (6.0, -3.0, 26.0)}
 """Three balls, mm LPS, no two of which a mirror or a swap of axes exchanges."""

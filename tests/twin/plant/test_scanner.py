@@ -14,14 +14,20 @@ from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
+from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.twin.plant.scanner.case_scene import scan_frame
 from puncture_twin.twin.plant.scanner.coverage import cut_solids
-from puncture_twin.twin.plant.scanner.image import HIGHEST_HU, ScanSettings, scan_solids
-from puncture_twin.twin.plant.scanner.solids import Solid, ball, box, check_closed, rod
+from puncture_twin.twin.plant.scanner.image import (
+    HIGHEST_HU,
+    ScanSettings,
+    Solid,
+    ball,
+    box,
+    check_closed,
+    rod,
+    scan_solids,
+)
 
 STILL = ScanSettings(noise_hu=0.0, blur_mm=1e-3)
 

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.needle.bevel_path import bevel_path
+from puncture_twin.planning.needle.deflection import Layer, Shaft, Tissue, bevel_path
 from puncture_twin.planning.needle.insertion_force import insertion_force
-from puncture_twin.planning.needle.shaft import Shaft
-from puncture_twin.planning.needle.tissue import Layer, Tissue
-from puncture_twin.planning.search.bending.insertion import Insertion
-from puncture_twin.twin.plant.true_tissue import SHIFT_MM, StraightPath, TrueTissue
-from puncture_twin.twin.world.control.tip import Tip
+from puncture_twin.planning.search.bending import Insertion
+from puncture_twin.twin.plant.true_needle import SHIFT_MM, StraightPath, TrueTissue
+from puncture_twin.twin.world.control import Tip
 
 SHAFT = Shaft(150.0, 1.27, 0.84)
 LAYERS = (Layer(0.0, 8.0, Tissue(0.1, 0.6, 0.01, 4.0, 5.0)), Layer(8.0, 60.0, Tissue(0.1, 0.9, 0.02, 2.0, 3.0)))
@@ -87,7 +85,7 @@ def test_across_it_is_what_the_beams_clamp_bears():
 
 def test_the_beams_clamp_bears_what_presses_on_it():
     """A cantilever's load and its moment; in a foundation the sum of what each length of it presses, by quadrature."""
-    from puncture_twin.planning.needle.bevel_path import Beam
+    from puncture_twin.planning.needle.deflection import Beam
 
     loaded = Beam(SHAFT.bending_stiffness, 1.0, 150).bent(np.zeros(150), np.zeros(151), tip_load=0.3)
     assert loaded.clamp_force == pytest.approx(0.3) and loaded.clamp_moment == pytest.approx(0.3 * 150)

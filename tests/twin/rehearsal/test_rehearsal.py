@@ -18,20 +18,16 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.bed import bed_frame
-from puncture_twin.planning.case.case import Case, view_frame
-from puncture_twin.planning.case.case_volumes import CaseVolumes
+from puncture_twin.planning.case.case import Case, bed_frame, view_frame
+from puncture_twin.planning.case.named_files import CaseVolumes
 from puncture_twin.planning.case.settings import Needle, Obstacle, RobotSettings, SearchSettings
-from puncture_twin.planning.case.tables.errors_section import RehearsalSection
-from puncture_twin.planning.case.tables.search_section import RankingSection
+from puncture_twin.planning.case.tables import RankingSection, RehearsalSection
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.planning.needle.deflection import Bending
-from puncture_twin.planning.needle.shaft import Shaft
-from puncture_twin.planning.needle.tissue import Tissue
+from puncture_twin.planning.needle.deflection import Bending, Shaft, Tissue
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.marker_noise import reading_noise, touching_configuration
 from puncture_twin.twin.plant.truth import Truth

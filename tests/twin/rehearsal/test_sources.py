@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from uncertainty_world import ball
 
-from puncture_twin.planning.case.tables.errors_section import ErrorsSection
+from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.rehearsal.distribution import rehearse_rooms
 

@@ -13,29 +13,28 @@ import pytest
 from places import ROOT
 from typer.testing import CliRunner
 
-from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
-from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
+from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose, link_poses
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.collision.workcell import home_configuration
-from puncture_twin.planning.formats.points.point_files import NamedPoints, read_points
+from puncture_twin.planning.formats.points import NamedPoints, read_points
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan_check import check_angles, check_geometry
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.search.choice import Choice
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.selection.choice import Choice
-from puncture_twin.planning.touch.straight_approach import line_to, plan_puncture
 from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers, plan_touches, registered
+from puncture_twin.planning.touch.tour_motions import line_to, plan_puncture
 from puncture_twin.run_twin import app
 from puncture_twin.twin.jobs.experiment import touch_job
 from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
-from puncture_twin.twin.plant.touch_truth import TouchTruth, nominal_tip
+from puncture_twin.twin.plant.true_needle import TouchTruth, nominal_tip
 from puncture_twin.twin.rehearsal import touching
-from puncture_twin.twin.rehearsal.in_physics import rehearse_touched
+from puncture_twin.twin.rehearsal.plan_truth import rehearse_touched
 from puncture_twin.twin.rehearsal.touching import Touched, TouchReading, execute_touches
-from puncture_twin.twin.world.engine import pybullet
+from puncture_twin.twin.world.client import pybullet
 from puncture_twin.twin.world.workcell import open_workcell
 
 CASE = ROOT / "meshes" / "carton" / "case_m.toml"

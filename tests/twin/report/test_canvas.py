@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, strategies as st
 
-from puncture_twin.twin.report.canvas.canvas import Canvas, Halo, Words, circle, dashed, rounded, star
-from puncture_twin.twin.report.canvas.ticks import ticks
+from puncture_twin.twin.report.canvas import Canvas, Halo, Words, circle, dashed, rounded, star, ticks
 
 ANGLES = st.floats(0, 2 * np.pi)
 

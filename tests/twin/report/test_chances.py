@@ -9,8 +9,9 @@ import report_world as world
 from PIL import Image
 
 from puncture_twin.planning.search.doubt import Doubt, Goal, Remedy
-from puncture_twin.planning.uncertainty.chances import Chances
+from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
+from puncture_twin.twin.report.error_pictures import draw_rooms_picture, needle_frame
 from puncture_twin.twin.report.map.chance_layer import chance_raster, touch_nothing
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import map_raster
@@ -18,7 +19,6 @@ from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Uncertainty, write_page
 from puncture_twin.twin.report.page.page_chances import rooms_section
 from puncture_twin.twin.report.page.page_map import map_data
-from puncture_twin.twin.report.rooms_picture import draw_rooms_picture, needle_frame
 
 BUDGET = ErrorBudget(1.0, 0.8, 0.6, np.array([1.9, 1.5, 1.2]), {"touch": 0.75, "ct_slice": 0.25})
 DOUBT = Doubt(

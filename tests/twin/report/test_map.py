@@ -8,12 +8,19 @@ import report_world as world
 from PIL import Image
 
 from puncture_twin.planning.base.reasons import REASON_TEXT, UNSEEN_AIR_TEXT, Reason
+from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.planning.search.selection.choice import best_pick
-from puncture_twin.twin.report.canvas.canvas import Canvas
-from puncture_twin.twin.report.map.front import MOST_DOTS, shown_front
+from puncture_twin.twin.report.canvas import Canvas
 from puncture_twin.twin.report.map.map_picture import draw_map
-from puncture_twin.twin.report.map.map_raster import HATCH, HATCH_AIR, HATCH_NOT_SEARCHED, map_raster, row_colours
+from puncture_twin.twin.report.map.map_raster import (
+    HATCH,
+    HATCH_AIR,
+    HATCH_NOT_SEARCHED,
+    MOST_DOTS,
+    map_raster,
+    row_colours,
+    shown_front,
+)
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.numbers import ReasonCount, reason_counts
 from puncture_twin.twin.report.page.page_map import map_data

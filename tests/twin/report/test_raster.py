@@ -16,11 +16,18 @@ from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
 from puncture_twin.twin.report.map_view import MapCells, map_view
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.compositing import SAMPLES, compose
-from puncture_twin.twin.report.raster.moving import MovingPicture
-from puncture_twin.twin.report.raster.outwards import faces_outwards
-from puncture_twin.twin.report.raster.render import Layer, Surface, View, opaque_shot, picture, posed, shells_of
+from puncture_twin.twin.report.raster.render import (
+    Layer,
+    MovingPicture,
+    Surface,
+    View,
+    opaque_shot,
+    picture,
+    posed,
+    shells_of,
+)
 from puncture_twin.twin.report.raster.shading import corner_normals
-from puncture_twin.twin.report.scene.scene_parts import SceneBody
+from puncture_twin.twin.report.scene.scene_parts import SceneBody, faces_outwards
 from puncture_twin.twin.report.scene.scene_picture import render_bodies
 
 SIZE = 90, 120

@@ -20,27 +20,24 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.reasons import REASON_COLOURS
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
-from puncture_twin.planning.case.tables.search_section import EntryAxes
+from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.place.directions import ring_weights
-from puncture_twin.planning.search.selection.choice import Pick, best_pick
+from puncture_twin.planning.place.mounts import ring_weights
+from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate
-from puncture_twin.twin.report.map.map_layout import disc_pixels
 from puncture_twin.twin.report.map.map_picture import draw_map
-from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
+from puncture_twin.twin.report.map.map_raster import HATCH, disc_pixels, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
 from puncture_twin.twin.report.numbers import reason_counts
-from puncture_twin.twin.report.page import page_slices
-from puncture_twin.twin.report.page.page import write_page
+from puncture_twin.twin.report.page import page as page_slices, page_scene as lighter_mesh
+from puncture_twin.twin.report.page.page import slices_data, write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
-from puncture_twin.twin.report.page.page_slices import slices_data
 from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.compositing import RasterShot, Shells, compose
-from puncture_twin.twin.report.raster.moving import MovingPicture
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, shells_of
-from puncture_twin.twin.report.scene import film, film_file, lighter_mesh, scene_picture
+from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface, opaque_shot, shells_of
+from puncture_twin.twin.report.scene import film, film_file, scene_picture
 from puncture_twin.twin.report.scene.film import draw_film
 from puncture_twin.twin.report.scene.film_text import model_note
 from puncture_twin.twin.report.scene.scene_parts import SceneBody, needle_bodies, patient

@@ -5,8 +5,7 @@ import pytest
 import trimesh
 
 from puncture_twin.planning.geometry.mesh import box
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation, pose
 from puncture_twin.twin.report.scene.shapes import ball, bar, revolved, ring
 
 T = pose(exp_rotation(np.array([0.3, -1.1, 0.7])), np.array([40.0, -7.0, 12.0]))

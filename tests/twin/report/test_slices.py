@@ -10,13 +10,11 @@ from hypothesis import given, strategies as st
 from PIL import Image
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.selection.choice import Pick
-from puncture_twin.twin.report.slices.cuts import capsule, ellipse, outline
-from puncture_twin.twin.report.slices.panel import PIXELS, draw_panel
-from puncture_twin.twin.report.slices.planes import letters, needle_planes
+from puncture_twin.planning.search.choice import Pick
+from puncture_twin.twin.report.slices.panel import KNOTS_HU, PIXELS, TONES, draw_panel, grey_table, stored
+from puncture_twin.twin.report.slices.planes import capsule, ellipse, letters, needle_planes, outline
 from puncture_twin.twin.report.slices.sheet import NO_CT, draw_slices, write_sheet
 from puncture_twin.twin.report.slices.subject import Subject
-from puncture_twin.twin.report.slices.tones import KNOTS_HU, TONES, stored, table
 
 UNITS = st.tuples(*[st.floats(-1, 1) for _ in range(3)]).filter(lambda v: np.linalg.norm(v) > 0.1)
 CYAN = np.array([0, 229, 255])
@@ -104,7 +102,7 @@ def test_the_region_is_cut_on_its_surface(direction, seed):
 def test_stored_bytes_give_every_window(name):
     """What a page makes of the stored bytes differs from the window itself by what a byte holds, at most."""
     hu = np.linspace(KNOTS_HU[0], KNOTS_HU[-1], 5000)
-    shown = np.array(table(TONES[name]))[stored(hu)]
+    shown = np.array(grey_table(TONES[name]))[stored(hu)]
     step = np.diff(np.interp(np.arange(256), [0, 48, 96, 152, 208, 255], KNOTS_HU)).max() / TONES[name].width
     assert np.abs(shown - TONES[name].grey(hu) / 255).max() < step / 2 + 0.004
 

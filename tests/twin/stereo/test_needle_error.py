@@ -9,10 +9,9 @@ from servo_world import CASE, HELD, NoContacts, simulate
 
 from benchmarks.servo_rooms import DOUBTED, drawn_from, room_outcome, told_of_pixels
 from benchmarks.servo_variants import pixel_detector, varied
-from puncture_twin.planning.geometry.rotations import log_rotation
-from puncture_twin.twin.guidance.stereo.joint.erring_rod import N_ROD, rod_poses
+from puncture_twin.planning.geometry.rigid import log_rotation
+from puncture_twin.twin.guidance.stereo.joint.joint_model import N_ROD, adjust, rod_poses
 from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_error, servoed_error
-from puncture_twin.twin.guidance.stereo.joint.optimum import adjust
 from puncture_twin.twin.guidance.stereo.session import run_session
 
 ROOMS, FEW_ROOMS = 120, 16

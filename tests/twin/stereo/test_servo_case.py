@@ -7,11 +7,11 @@ from benchmarks.servo_variants import varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.containment import winding_number
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.winding import winding_number
-from puncture_twin.twin.guidance.stereo.poses import configurations, path_upward
 from puncture_twin.twin.guidance.stereo.robot_calibration import carried_rod, grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
+from puncture_twin.twin.guidance.stereo.servo_law import configurations, path_upward
 from puncture_twin.twin.guidance.stereo.servo_loop import path_contact
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, head_pose, workcell_checker
 from tools.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM, head_field, head_targets

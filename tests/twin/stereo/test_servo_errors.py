@@ -7,7 +7,7 @@ from servo_world import CASE
 from benchmarks.servo_variants import varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rotations import log_rotation
+from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrorsSection, declared_errors
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.stereo_room import draw_workcell, planned_cameras

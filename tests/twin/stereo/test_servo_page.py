@@ -17,7 +17,7 @@ from puncture_twin.twin.guidance.stereo.experiment import (
     needle_statistics,
     statistics,
 )
-from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome
+from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleOutcome
 from puncture_twin.twin.jobs.servo.facts import paper_facts, servo_facts
 from puncture_twin.twin.jobs.servo.page import write_servo_page
 from puncture_twin.twin.jobs.servo.text import servo_text

@@ -16,8 +16,7 @@ from puncture_twin.twin.guidance.stereo.cameras.bundle import (
 )
 from puncture_twin.twin.guidance.stereo.cameras.calibration import calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import looking_at, stereo_pair
-from puncture_twin.twin.guidance.stereo.cameras.dlt import decompose, fit_matrix
-from puncture_twin.twin.guidance.stereo.cameras.triangulation import triangulate
+from puncture_twin.twin.guidance.stereo.cameras.triangulation import decompose, fit_matrix, triangulate
 
 GRID = np.stack(np.meshgrid([-80.0, 0, 80], [-60.0, 60], [-60.0, 60], indexing="ij"), -1).reshape(-1, 3)
 SIZE = (1280, 960)

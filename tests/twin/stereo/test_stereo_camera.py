@@ -8,8 +8,16 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, looking_at, stereo_pair, tangent_axes
-from puncture_twin.twin.guidance.stereo.cameras.lens import distort, distortion_slope, fold, undistort
+from puncture_twin.twin.guidance.stereo.cameras.camera import (
+    Camera,
+    distort,
+    distortion_slope,
+    fold,
+    looking_at,
+    stereo_pair,
+    tangent_axes,
+    undistort,
+)
 from puncture_twin.twin.guidance.stereo.cameras.triangulation import triangulate
 
 LENS = (-0.3, 0.1, 1e-3, -2e-3)

@@ -10,7 +10,7 @@ import places
 import pytest
 from planar import calibrate_planar
 
-from puncture_twin.twin.guidance.stereo.cameras.dlt import fit_matrix, project, reconstruct
+from puncture_twin.twin.guidance.stereo.cameras.triangulation import fit_matrix, project, reconstruct
 
 DATA = places.DATA
 CUBE = DATA / "dlt_cube_kwon_duarte" / "dlt_cube.json"

@@ -8,7 +8,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.conditioning import leverage
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
-from puncture_twin.twin.guidance.stereo.mapping import SeenMarkers, map_head
+from puncture_twin.twin.guidance.stereo.servo_law import SeenMarkers, map_head
 
 NAMES = ("M1", "M2", "M3", "M4", "M5")
 MARKERS = np.array([[-40.0, -80, 26], [40, -80, 26], [-76, 5, 26], [76, 5, 26], [0, -101, -12]])

@@ -6,8 +6,7 @@ from servo_world import CASE, HELD, IMAGE_MM, simulate
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.stereo.joint.joint_model import JointModel, first_unknowns
-from puncture_twin.twin.guidance.stereo.joint.optimum import adjust, bound
+from puncture_twin.twin.guidance.stereo.joint.joint_model import JointModel, adjust, bound, first_unknowns
 from puncture_twin.twin.guidance.stereo.servo_law import ball_base
 
 TARGET = CASE.targets.points[1]

@@ -6,21 +6,29 @@ from scipy.optimize import least_squares
 from selfcal_world import as_estimate
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rotations import log_rotation
+from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_form
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import direction_from_plane, mean_direction
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS, SCALE, T_X, W_X, W_Y, active_columns
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, covariances
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
+    N_PARAMETERS,
+    SCALE,
+    T_X,
+    W_X,
+    W_Y,
+    active_columns,
+    closed_form,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
+    direction_from_plane,
     direction_residuals,
     directions_image,
     linearised_direction,
     linearised_tip,
+    mean_direction,
     tip_residuals,
 )
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, covariances
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, PoseRanges, simulate_recording, with_noise
 
 ALL = active_columns(tip=True, scale=False, direction=False)

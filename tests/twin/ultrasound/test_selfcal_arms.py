@@ -10,20 +10,20 @@ from selfcal_world import as_estimate
 from benchmarks.selfcal_rooms import Kind, outcome, recorded, room_of
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rotations import log_rotation
+from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import arm_errors, corrected, without_play
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import PLAY_SIGN, calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
+    direction_residuals,
+    directions_image,
+    tip_residuals,
+)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import found_spreads
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, flange_slopes, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Whitening, weighed
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
-    direction_residuals,
-    directions_image,
-    tip_residuals,
-)
 from puncture_twin.twin.guidance.ultrasound.pose_choice import drawing
 from puncture_twin.twin.guidance.ultrasound.puncture import aim
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording

@@ -5,10 +5,10 @@ import pytest
 from selfcal_world import DEGENERATE, as_estimate, cured, degenerate_set
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import (
     LEAST_RATIO,
     Degenerate,
@@ -16,7 +16,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import (
     scaled_jacobian,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.simulate import (
     SPEC_NOISE,
     PoseRanges,

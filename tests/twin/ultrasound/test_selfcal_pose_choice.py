@@ -9,7 +9,7 @@ from selfcal_world import as_estimate
 from benchmarks.selfcal_rooms import DIRECTION_RAD, IMAGE_MM, compared, recorded, room_of
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import N_PARAMETERS
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import N_PARAMETERS
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
 from puncture_twin.twin.guidance.ultrasound.pose_choice import choose_poses, drawing as belief_of, expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.simulate import (

@@ -7,8 +7,8 @@ from selfcal_world import as_estimate
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import SHAFT_BIAS, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 
 RUNS = 30
@@ -49,7 +49,7 @@ def test_the_prediction_is_the_mean_over_the_needles_orientations(rng):
     recording, _ = simulate_recording(rng, 20)
     found = calibrate(recording, noise=SPEC_NOISE, direction=False)
     A, p = recording.A[4], np.array([7.0, 33.0])
-    from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import linearised_tip
 
     squared = []
     for M in found.orientations:

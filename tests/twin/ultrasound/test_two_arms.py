@@ -9,9 +9,10 @@ import pytest
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.collision.bodies.shapes import surface, touch
+from puncture_twin.planning.collision.bodies import surface, touch
+from puncture_twin.planning.geometry.containment import winding_number
 from puncture_twin.planning.geometry.mesh import box
-from puncture_twin.planning.geometry.winding import winding_number
+from puncture_twin.twin.guidance.ultrasound.acquisition import jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.pose_choice import (
     choose_poses,
@@ -22,7 +23,6 @@ from puncture_twin.twin.guidance.ultrasound.pose_choice import (
     find_candidates,
 )
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import jog_into_slice
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.two_arms import (
     BetweenArms,

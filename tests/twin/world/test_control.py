@@ -17,13 +17,19 @@ from benchmarks.experiment.workbench import (
     true_tip,
 )
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.twin.world.client import STANDARD_GRAVITY_MM_S2
-from puncture_twin.twin.world.control.gains import STEPS_S, Stiffness, allowed_step, damping, stability_ratio
-from puncture_twin.twin.world.control.impedance import rotation_error
-from puncture_twin.twin.world.control.insertion import Admittance, VirtualMass
-from puncture_twin.twin.world.control.tip import tips
-from puncture_twin.twin.world.engine import pybullet
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.twin.world.client import STANDARD_GRAVITY_MM_S2, pybullet
+from puncture_twin.twin.world.control import (
+    STEPS_S,
+    Admittance,
+    Stiffness,
+    VirtualMass,
+    allowed_step,
+    damping,
+    rotation_error,
+    stability_ratio,
+    tips,
+)
 
 UR3, TIP_M, WALL_N_M = workbench.UR3, workbench.TIP_M, 1e5
 SIDE = np.array([1.0, 0.0, 0.0])

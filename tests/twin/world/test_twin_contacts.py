@@ -20,9 +20,8 @@ from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.collision_cases.checks_file import read_checks
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.twin.world.bodies import load_surface, remove
-from puncture_twin.twin.world.client import physics_client
-from puncture_twin.twin.world.units import pose_to_m, to_m, to_mm
+from puncture_twin.twin.world.client import physics_client, pose_to_m, to_m, to_mm
+from puncture_twin.twin.world.workcell import load_surface, remove
 
 CARDS = TESTS / "collision"
 

@@ -16,17 +16,22 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision.bodies.body import BODY_NAMES
+from puncture_twin.planning.collision.bodies import BODY_NAMES
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.arm import load_arm
-from puncture_twin.twin.world.bodies import load_box, load_surface, thinned
 from puncture_twin.twin.world.cameras import SimulatedCamera, picture
-from puncture_twin.twin.world.client import STANDARD_GRAVITY_MM_S2, physics_client, step
-from puncture_twin.twin.world.contacts import touches
-from puncture_twin.twin.world.engine import pybullet
-from puncture_twin.twin.world.execution import execute
-from puncture_twin.twin.world.units import pose_to_m, pose_to_mm, to_m, to_mm
-from puncture_twin.twin.world.workcell import open_workcell
+from puncture_twin.twin.world.client import (
+    STANDARD_GRAVITY_MM_S2,
+    physics_client,
+    pose_to_m,
+    pose_to_mm,
+    pybullet,
+    step,
+    to_m,
+    to_mm,
+)
+from puncture_twin.twin.world.execution import execute, touches
+from puncture_twin.twin.world.workcell import load_box, load_surface, open_workcell, thinned
 
 REPO = ROOT
 TOOL = Tool(210.0, 150.0, 1.2, 30.0)

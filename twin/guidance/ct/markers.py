@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space

@@ -17,7 +17,7 @@ from itertools import combinations
 
 import numpy as np
 
-from puncture_twin.planning.arm.error_jacobian import PARAMETERS
+from puncture_twin.planning.arm.kinematics import PARAMETERS
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError

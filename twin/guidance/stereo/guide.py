@@ -11,12 +11,10 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.stereo.detection import Detections, Detector, LocatedPair, Search, in_space, look_at
-from puncture_twin.twin.guidance.stereo.joint.joint_model import Guess, Observed, Unknowns
+from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, Unknowns, adjust
 from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, open_loop_error, servoed_error
-from puncture_twin.twin.guidance.stereo.joint.optimum import Adjusted, adjust
-from puncture_twin.twin.guidance.stereo.mapping import Mapping
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, carried_rod
-from puncture_twin.twin.guidance.stereo.servo_law import ball_base
+from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
 

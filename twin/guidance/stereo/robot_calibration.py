@@ -19,9 +19,8 @@ from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.twin.guidance.stereo.cameras.calibration import CameraCalibration, calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, Search, look_at
-from puncture_twin.twin.guidance.stereo.poses import configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, path_contact
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
 

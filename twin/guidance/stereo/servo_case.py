@@ -14,13 +14,12 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.toml_types import Coordinate, Length, Name, Number, Section, Vector
+from puncture_twin.planning.formats import points
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
-from puncture_twin.planning.formats.points import point_files as points
-from puncture_twin.planning.formats.points.point_files import NamedPoints, parse_points
+from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.geometry.units import Unit
+from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.twin.guidance.stereo.declared_errors import (
     ServoErrors,

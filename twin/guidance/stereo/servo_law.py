@@ -6,20 +6,45 @@ J is the nominal Jacobian at the ball, da the needle's orientation error from fo
 short pieces with a Jacobian each, so that it is straight and can be checked for contacts. Near a singularity the
 orientation is given up first: damped steps of the position alone (Nakamura and Hanafusa 1986), as long as the needle
 turns by no more than a limit.
+
+From the image to the calibration frame: c_T_m by markers that both cameras see, and the error to expect at a target.
+
+Each marker errs in the image and in the cameras, and the cameras err most along their view. The fit weighs each marker
+by both covariances (maximum likelihood; Gauss-Newton from the plain rigid fit), and its normal matrix says how far the
+mapped target may be off. With equal round errors both agree with the plain fit and Fitzpatrick's formula.
+
+How the arm holds the rod: one orientation, one inverse-kinematics branch for every point of a session.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose, jacobian
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import (
+    ELBOW,
+    ELBOW_DIGITS,
+    TIE_DIGITS,
+    flange_pose,
+    jacobian,
+    link_poses,
+    singularity,
+)
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rotations import log_rotation
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
+from puncture_twin.planning.geometry.rigid import apply, frame_yz, log_rotation, pose, rotated_about
+from puncture_twin.planning.registration.conditioning import Conditioning
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.registration import register
 
 CHARACTERISTIC_MM = 300.0
 """Length by which millimetres are made comparable with radians: about half of a UR3's reach."""
@@ -161,3 +186,179 @@ def _refusal(rod: CarriedRod, q: Floats, blind: bool, limits: StepLimits) -> Ser
 
 def _scaled(J: Floats) -> Floats:
     return np.concatenate([J[:3] / CHARACTERISTIC_MM, J[3:]])
+
+
+MAX_ITERATIONS = 20
+CONVERGED = 1e-12
+"""A step of the fit (mm and rad) below which it has arrived."""
+
+
+class SeenMarkers(NamedTuple):
+    """Markers as the cameras have them."""
+
+    points_c: Floats
+    """Shape (n, 3), mm."""
+    covariances: Floats
+    """Shape (n, 3, 3), mm^2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mapping:
+    """c_T_m and what is known of its error.
+
+    Attributes:
+        T_c_m: Shape (4, 4), rigid, mm.
+        covariance: Shape (6, 6), of a turn (rad) about ``center_c`` and a shift (mm), axes of C.
+        center_c: Shape (3,), the markers' centre, mm.
+        residuals: Shape (n, 3), T_c_m markers_m - markers_c, mm.
+        conditioning: The flags of a weak marker set, at the middle of the targets.
+    """
+
+    T_c_m: Floats
+    covariance: Floats
+    center_c: Floats
+    residuals: Floats
+    conditioning: Conditioning
+
+    @property
+    def fre_mm(self) -> float:
+        """Root mean square residual. It is not the accuracy at the target."""
+        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
+
+    def to_c(self, points_m: Floats) -> Floats:
+        """Points (..., 3) of the image frame, in C, mm."""
+        return apply(self.T_c_m, points_m)
+
+    def covariance_at(self, points_m: Floats) -> Floats:
+        """Covariance of mapped points (n, 3), shape (n, 3, 3), mm^2, C."""
+        slope = turn_and_shift_slopes(self.to_c(points_m) - self.center_c)
+        return np.asarray(slope @ self.covariance @ slope.transpose(0, 2, 1))
+
+    def expected_tre_mm(self, points_m: Floats, target_mm: float = 0.0) -> Floats:
+        """Expected (rms) error at points (n, 3) of the image frame, shape (n,), mm.
+
+        Args:
+            points_m: Where.
+            target_mm: Standard deviation per axis with which the image has a target itself.
+        """
+        variance = np.trace(self.covariance_at(points_m), axis1=1, axis2=2) + 3 * target_mm**2
+        return np.asarray(np.sqrt(variance))
+
+
+def map_head(
+    names: tuple[str, ...],
+    seen: SeenMarkers,
+    markers_m: Floats,
+    image_mm: float,
+    targets_m: Floats,
+    *,
+    where: str | Path = "mapping",
+) -> Mapping:
+    """Fit c_T_m.
+
+    Args:
+        names: The markers, n at least 3.
+        seen: What the cameras have.
+        markers_m: Shape (n, 3), mm: what the image has.
+        image_mm: Standard deviation per axis of ``markers_m``.
+        targets_m: Shape (k, 3), mm: where the error matters.
+        where: What errors name.
+
+    Raises:
+        InputError: Fewer than three markers, collinear, mirrored, a unit slip, or a marker far off.
+    """
+    pairs = MarkerPairs(names, np.asarray(markers_m, dtype=np.float64), seen.points_c)
+    plain = register(pairs, method="rigid", target_ct=np.mean(targets_m, axis=0), where=where)
+    covariances, center = seen.covariances + max(image_mm, 1e-9) ** 2 * np.eye(3), seen.points_c.mean(axis=0)
+    roots = np.linalg.inv(np.linalg.cholesky(covariances))
+
+    def linearised(T: Floats) -> System[Floats]:
+        fitted = apply(T, pairs.points_ct)
+        slopes = roots @ turn_and_shift_slopes(fitted - center)
+        return System((roots @ (fitted - seen.points_c)[:, :, None]).ravel(), slopes.reshape(-1, 6))
+
+    def moved(T: Floats, step: Floats) -> Floats:
+        return rotated_about(T, center, step)
+
+    fit = gauss_newton(plain.T_base_ct, linearised, moved, _arrived, MAX_ITERATIONS)
+    residuals = apply(fit.estimate, pairs.points_ct) - seen.points_c
+    covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
+    return Mapping(fit.estimate, covariance, center, residuals, plain.conditioning)
+
+
+def _arrived(_: System[Floats], step: Floats) -> bool:
+    return bool(np.abs(step).max() < CONVERGED)
+
+
+def turn_and_shift_slopes(offsets: Floats) -> Floats:
+    """Derivative (n, 3, 6) of points by a turn about a centre and a shift; ``offsets`` (n, 3), mm, from that centre."""
+    x, y, z = offsets.T
+    zero = np.zeros_like(x)
+    turn = np.stack([np.stack(row, axis=-1) for row in ((zero, z, -y), (-z, zero, x), (y, -x, zero))], axis=1)
+    return np.concatenate([turn, np.broadcast_to(np.eye(3), turn.shape)], axis=2)
+
+
+LEAST_SINGULARITY = 0.05
+"""A branch that comes nearer to a singularity (of 0..1) at some point is not used."""
+
+REFERENCE_RAD = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+"""Whole turns are chosen nearest to this: arm up, elbow bent, flange down."""
+
+
+def rod_orientation(tilt_rad: float) -> Floats:
+    """R_base_flange, shape (3, 3): the flange looks down, its rod leaning away from the arm by an angle, rad."""
+    z = np.array([np.sin(tilt_rad), 0.0, -np.cos(tilt_rad)])
+    y = np.array([0.0, -1.0, 0.0])
+    return frame_yz(y, z)
+
+
+def flange_poses(rod: CarriedRod, points_base: Floats) -> Floats:
+    """T_base_flange, shape (n, 4, 4), mm, that put the ball on points (n, 3)."""
+    return pose(rod.R_base_flange, points_base - rod.rod_mm * rod.R_base_flange[:, 2])
+
+
+class Posture(NamedTuple):
+    """How the arm holds a set of points."""
+
+    q: Floats
+    """Shape (n, 6), rad."""
+    branch: int
+    """The inverse-kinematics branch of all of them. An arm's errors differ from branch to branch by millimetres, so
+    what was calibrated on one is to be used on it."""
+
+
+def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
+    """Joint angles that hold the ball on every point, all on one branch, free of contacts.
+
+    Of the branches the one that stays farthest from every singularity is taken; of equals, which mirrored ones are, the
+    one whose elbow is on the rod's side.
+
+    Args:
+        rod: The arm, its rod and its orientation.
+        points_base: Shape (n, 3), mm.
+        checker: Judges contacts.
+        first: Try this branch before the others.
+
+    Raises:
+        NoAnswerError: No branch holds all points freely; says what the best one lacks.
+    """
+    every = inverse(rod.model, flange_poses(rod, points_base))
+    workcell = np.nan_to_num(singularity(rod.model, every).least(), nan=0.0).min(axis=0)
+    why = f"a {rod.model.name} cannot hold the ball on all {len(points_base)} points on one branch"
+    elbow = np.nan_to_num(link_poses(rod.model, every[0])[:, ELBOW, :3, 3] @ -rod.R_base_flange[:, 2])
+    ranks = np.column_stack([np.round(workcell, TIE_DIGITS), np.round(elbow, ELBOW_DIGITS)])
+    order = sorted(range(len(ranks)), key=lambda branch: (branch != first, *-ranks[branch]))
+    for branch in (branch for branch in order if workcell[branch] >= LEAST_SINGULARITY):
+        q = nearest_within_limits(rod.model, every[:, branch], REFERENCE_RAD)
+        if np.isnan(q).any():
+            continue
+        found = checker.first_contact(q, needle_may_touch_patient=False)
+        if found is None:
+            return Posture(q, branch)
+        why = f"{found.contact.body} would touch {found.contact.other} at point {found.at + 1} of {len(points_base)}"
+    raise NoAnswerError(why)
+
+
+def path_upward(rod: CarriedRod, points_base: Floats, up_mm: float) -> Floats:
+    """Points (n, 3) farther back along the rod by a distance, mm: where the arm hovers."""
+    return np.asarray(points_base - up_mm * rod.R_base_flange[:, 2])

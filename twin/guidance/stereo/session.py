@@ -22,10 +22,7 @@ from puncture_twin.twin.guidance.stereo.detection import (
     picture_detector,
 )
 from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide, Known
-from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError
-from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome, needle_outcome
-from puncture_twin.twin.guidance.stereo.mapping import Mapping, SeenMarkers, map_head
-from puncture_twin.twin.guidance.stereo.poses import configurations, path_upward
+from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, NeedleOutcome, needle_outcome
 from puncture_twin.twin.guidance.stereo.robot_calibration import (
     RobotCalibration,
     calibrate_by_robot,
@@ -33,7 +30,15 @@ from puncture_twin.twin.guidance.stereo.robot_calibration import (
     grid_points,
 )
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import ServoStop, StepLimits
+from puncture_twin.twin.guidance.stereo.servo_law import (
+    Mapping,
+    SeenMarkers,
+    ServoStop,
+    StepLimits,
+    configurations,
+    map_head,
+    path_upward,
+)
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, path_contact, servo
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, workcell_checker
 

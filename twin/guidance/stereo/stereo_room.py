@@ -17,14 +17,12 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.geometry.crossings import crossings
-from puncture_twin.planning.geometry.frames import frame_yz
+from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply, pose, rotated_about
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_yz, pose, rotated_about
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair, tangent_axes
 from puncture_twin.twin.guidance.stereo.declared_errors import CameraErrors
-from puncture_twin.twin.guidance.stereo.joint.needle_outcome import TrueNeedle
+from puncture_twin.twin.guidance.stereo.joint.needle_error import TrueNeedle
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, ToolSection
 from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm, draw_true_arm
 

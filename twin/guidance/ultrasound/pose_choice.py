@@ -24,7 +24,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, active_columns, parameter_units
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate, active_columns, parameter_units
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import whitener

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Pixels
+from puncture_twin.twin.guidance.ultrasound.acquisition import WorkcellTruth, nearest_configuration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Lesion, NeedleInImage, render
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, needle_flange
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth, nearest_configuration
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 
 AIM_STEPS = 3

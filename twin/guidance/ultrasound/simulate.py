@@ -7,9 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.frames import frame_about, frame_yz
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about, frame_yz, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 
 SPEC_NOISE = Noise(robot_mm=0.1, robot_rad=np.radians(0.03), image_mm=0.3, direction_rad=np.radians(0.5))

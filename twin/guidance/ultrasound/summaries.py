@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition
+from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, WorkcellTruth
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, expected_error_mm
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.bodies.arm_bodies import arm_bodies
-from puncture_twin.planning.collision.bodies.body import Body, Shape
-from puncture_twin.planning.collision.bodies.shapes import surface, touch
-from puncture_twin.planning.collision.bodies.solid import Solid
+from puncture_twin.planning.collision.bodies import Body, Shape, Solid, arm_bodies, surface, touch
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose

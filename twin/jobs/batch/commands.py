@@ -27,7 +27,7 @@ def _plan(
     as_json: JsonOption = False,
 ) -> None:
     """Write down every case of a cohort, with the hash of its inputs, options and version."""
-    from puncture_twin.twin.jobs.batch.plan_job import plan_cohort
+    from puncture_twin.twin.jobs.batch.jobs import plan_cohort
     from puncture_twin.twin.jobs.batch.text import plan_text
 
     with progress_display() as progress:
@@ -52,7 +52,7 @@ def _run(
 ) -> None:
     """Run the cases that have no result yet; what is done is kept, whatever stops the run."""
     from puncture_twin.planning.batch.workers import Limits
-    from puncture_twin.twin.jobs.batch.run_job import Where, run_part, run_summary
+    from puncture_twin.twin.jobs.batch.jobs import Where, run_part, run_summary
     from puncture_twin.twin.jobs.batch.text import run_text
 
     where = Where(part, scheduler, jobs, pages, Limits(memory_mb, timeout_s))
@@ -64,7 +64,7 @@ def _run(
 @batch_app.command("status")
 def _status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
     """Count the cases that are done, failed, missing and stale; every input is hashed again."""
-    from puncture_twin.planning.batch.state import cohort_state
+    from puncture_twin.planning.batch.run import cohort_state
     from puncture_twin.twin.jobs.batch.text import state_text
 
     with progress_display() as progress:
@@ -84,7 +84,7 @@ def _merge(
     as_json: JsonOption = False,
 ) -> None:
     """Write one table of all cases, one dataset of all candidates, and one page."""
-    from puncture_twin.twin.jobs.batch.merge_job import merge_cohort
+    from puncture_twin.twin.jobs.batch.jobs import merge_cohort
     from puncture_twin.twin.jobs.batch.text import merge_text
 
     with progress_display() as progress:
@@ -99,8 +99,8 @@ def _compare(
     as_json: JsonOption = False,
 ) -> None:
     """Say what became safe, what was lost, and how far best entries moved, from A to B."""
-    from puncture_twin.planning.batch.compare import compare, read_cases
-    from puncture_twin.twin.jobs.batch.merge_job import change_summary
+    from puncture_twin.planning.batch.merge import compare, read_cases
+    from puncture_twin.twin.jobs.batch.jobs import change_summary
     from puncture_twin.twin.jobs.batch.text import compare_text
 
     found = compare(read_cases(before), read_cases(after))

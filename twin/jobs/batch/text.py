@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.batch.compare import CaseChange, Comparison
-from puncture_twin.planning.batch.run import RunCounts
-from puncture_twin.planning.batch.state import CohortState
-from puncture_twin.twin.jobs.batch.merge_job import Merged
-from puncture_twin.twin.jobs.batch.plan_job import PlanRun, estimate_summary
+from puncture_twin.planning.batch.merge import CaseChange, Comparison
+from puncture_twin.planning.batch.run import CohortState, RunCounts
+from puncture_twin.twin.jobs.batch.jobs import Merged, PlanRun, estimate_summary
 from puncture_twin.twin.report.pace import duration_text
 
 MOST_LINES = 10

@@ -20,7 +20,7 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.search.candidates import ANGLE_DIGITS
-from puncture_twin.planning.search.selection.choice import BEST, Choice
+from puncture_twin.planning.search.choice import BEST, Choice
 from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
 
 TABLE = "candidates.parquet"

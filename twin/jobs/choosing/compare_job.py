@@ -1,27 +1,33 @@
-"""Which two paths are compared: two choices of one case, or two plans."""
+"""Which two paths are compared: two choices of one case, or two plans.
+
+Two paths side by side: numbers with their units, and why one is not safe.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.choice import Choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.selection.choice import Choice, parse_choice
-from puncture_twin.planning.search.selection.windows import find_windows, nearest_row
-from puncture_twin.twin.jobs.choosing.comparison import Comparison, OnGrid, Side
+from puncture_twin.planning.search.doubt import Doubt
+from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
+from puncture_twin.planning.search.windows import Window, find_windows, nearest_row
 from puncture_twin.twin.jobs.patient.answers import explain_choice
 from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
+from puncture_twin.twin.jobs.patient.summaries import plan_summary
 
 SAME_DIRECTION = 1e-9
 """Radians within which a direction is one of the grid: rounding of typed degrees."""
@@ -153,3 +159,267 @@ def _on_grid(found: Candidates, outward_ct: Floats, *, safe: bool) -> OnGrid:
     if np.linalg.norm(found.outward_ct[row] - outward_ct) > SAME_DIRECTION:
         return OnGrid(None, float("nan"), window)
     return OnGrid(int(found.ranking.rank[row]), float(found.safe_cone[row]), window)
+
+
+NEAREST = 5
+"""Structures of either side whose clearances stand beside each other."""
+
+LEAST_CHANCE = 1e-4
+"""What is shown of a chance: a smaller one is no number that anybody can rely on."""
+
+NOTHING = "-"
+"""Where there is no number."""
+
+NOT_CHECKED = "as the plans state it; name their case with --case to have them checked again, with chances and windows"
+
+
+class OnGrid(NamedTuple):
+    """What a search says of the direction of its grid that a path is, or lies beside.
+
+    Attributes:
+        rank: None between the grid's directions, and for a rejected one.
+        safe_cone: rad; NaN where the grid does not say.
+        window: None outside of all windows.
+    """
+
+    rank: int | None
+    safe_cone: float
+    window: Window | None
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of two paths.
+
+    Attributes:
+        title: How it was chosen.
+        outward_ct: Shape (3,), unit.
+        entry_ct: Shape (3,), mm; NaN without a skin entry.
+        explained: Checked against its case; None of a plan alone.
+        grid: What the search of its case says; None without one.
+        plan: The plan, where it is one.
+    """
+
+    title: str
+    outward_ct: Floats
+    entry_ct: Floats
+    explained: Explanation | None = None
+    grid: OnGrid | None = None
+    plan: Plan | None = None
+
+    @property
+    def safe(self) -> bool:
+        """Whether it is not rejected; a plan that was not checked again is what it was when it was made."""
+        return self.explained is None or self.explained.safe
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values: mm and degrees; null where there is no number."""
+        grid = None
+        if self.grid is not None:
+            window = self.grid.window
+            grid = {
+                "rank": self.grid.rank,
+                "safe_cone_deg": finite(np.degrees(self.grid.safe_cone)),
+                "window": None if window is None else window.number,
+                "window_square_deg": None if window is None else window.square_deg,
+                "window_entry_cm2": None if window is None else window.entry_cm2,
+            }
+        own = ("case", "inputs", "warnings")
+        checked = {} if self.explained is None else self.explained.summary()
+        return {
+            "title": self.title,
+            "check": {key: value for key, value in checked.items() if key not in own} or None,
+            "search": grid,
+            "plan": None if self.plan is None else plan_summary(self.plan),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two paths.
+
+    Attributes:
+        case_name: The case, or those that two plans name.
+        inputs: Every file that decided it.
+        warnings: Of the case.
+    """
+
+    case_name: str
+    inputs: tuple[Input, ...]
+    a: Side
+    b: Side
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def safe(self) -> bool:
+        """Whether neither is rejected."""
+        return self.a.safe and self.b.safe
+
+    @property
+    def apart_deg(self) -> float:
+        """Angle between the two directions, degrees."""
+        u, v = self.a.outward_ct, self.b.outward_ct
+        return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v)))
+
+    @property
+    def entries_apart_mm(self) -> float:
+        """Between the skin entries, straight; NaN without one."""
+        return float(np.linalg.norm(self.a.entry_ct - self.b.entry_ct))
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "case": self.case_name,
+            "inputs": inputs_document(self.inputs),
+            "apart_deg": self.apart_deg,
+            "entries_apart_mm": finite(self.entries_apart_mm),
+            "a": self.a.summary(),
+            "b": self.b.summary(),
+            "warnings": list(self.warnings),
+        }
+
+    def text(self) -> str:
+        """A table, then what takes a sentence."""
+        entries = f", their entries {self.entries_apart_mm:.0f} mm" if np.isfinite(self.entries_apart_mm) else ""
+        rows = [("", "A", "B"), *self._rows()]
+        rows = [row for row in rows if row[1:] != (NOTHING, NOTHING)]
+        first, second = (max(len(row[column]) for row in rows) for column in (0, 1))
+        table = [f"  {what:{first}s}  {one:{second}s}  {two}".rstrip() for what, one, two in rows]
+        head = f"case {self.case_name}: two paths {self.apart_deg:.1f} deg apart{entries}"
+        return "\n".join([head, *table, *self._sentences(), *(f"warning: {one}" for one in self.warnings)])
+
+    def _rows(self) -> Iterator[tuple[str, str, str]]:
+        for what, values in _ROWS:
+            yield what, values(self.a), values(self.b)
+        for name in self._structures():
+            yield f"clearance to {name}, mm", _clearance(self.a, name), _clearance(self.b, name)
+
+    def _structures(self) -> list[str]:
+        """The nearest of either side that demand a margin, the nearest first."""
+        least: dict[str, float] = {}
+        for side in (self.a, self.b):
+            for name, mm in _demanding(side)[:NEAREST]:
+                least[name] = min(mm, least.get(name, np.inf))
+        return sorted(least, key=lambda name: least[name])
+
+    def _sentences(self) -> Iterator[str]:
+        for letter, side in (("A", self.a), ("B", self.b)):
+            if side.explained is None:
+                continue
+            if not side.safe:
+                yield f"  {letter} is rejected: {reason_text(side.explained.candidates, 0)}"
+            for what, values in side.explained.facts.rows():
+                yield f"  {letter} {what}: {values}"
+        if self.a.explained is None:
+            yield f"  {NOT_CHECKED}"
+
+
+def _demanding(side: Side) -> list[tuple[str, float]]:
+    if side.explained is None:
+        return []
+    demanding = {one.name for one in side.explained.anatomy.checked if one.demands_margin}
+    return sorted(
+        (item for item in side.explained.clearances().items() if item[0] in demanding), key=lambda item: item[1]
+    )
+
+
+def _clearance(side: Side, name: str) -> str:
+    if side.explained is None:
+        return NOTHING
+    digits = next(decimals(one) for one in side.explained.anatomy.checked if one.name == name)
+    clearance = side.explained.clearances()[name]
+    return "crossed" if clearance < 0 else f"{clearance:.{digits}f}"
+
+
+def _shown(value: float, form: str) -> str:
+    return form.format(value) if np.isfinite(value) else NOTHING
+
+
+def _checked(number: Callable[[Explanation], float], form: str) -> Callable[[Side], str]:
+    return lambda side: NOTHING if side.explained is None else _shown(number(side.explained), form)
+
+
+def _percent(chance: float) -> str:
+    return f"{100 * chance:.2f}" if chance >= LEAST_CHANCE else "below 0.01"
+
+
+def _of_doubt(values: Callable[[Doubt], str]) -> Callable[[Side], str]:
+    def shown(side: Side) -> str:
+        doubt = None if side.explained is None else side.explained.doubt
+        return NOTHING if doubt is None else values(doubt)
+
+    return shown
+
+
+def _of_window(number: Callable[[Window], float], form: str) -> Callable[[Side], str]:
+    def values(side: Side) -> str:
+        window = None if side.grid is None else side.grid.window
+        return NOTHING if window is None else _shown(number(window), form)
+
+    return values
+
+
+def _of_plan(number: Callable[[Plan], float], form: str) -> Callable[[Side], str]:
+    return lambda side: NOTHING if side.plan is None else _shown(number(side.plan), form)
+
+
+def _angles(side: Side) -> str:
+    if side.plan is not None:
+        theta, beta = side.plan.theta, side.plan.beta
+    elif side.explained is not None:
+        theta, beta = side.explained.candidates.theta[0], side.explained.candidates.beta[0]
+    return f"{np.degrees(theta):.6g}, {np.degrees(beta):.6g}"
+
+
+def _verdict(side: Side) -> str:
+    if side.explained is None:
+        return "not checked"
+    return side.explained.candidates.safe_text if side.safe else side.explained.verdict
+
+
+def _rank(side: Side) -> str:
+    return NOTHING if side.grid is None or side.grid.rank is None else str(side.grid.rank)
+
+
+def _reach(side: Side) -> str:
+    if side.explained is None:
+        return NOTHING
+    arm = side.explained.candidates.arm
+    return {-1: "not computed", 0: "no", 1: f"yes, margin {arm.margin[0]:.2f}"}[int(arm.reachable[0])]
+
+
+def _likeliest(doubt: Doubt) -> str:
+    name, chance = doubt.likeliest
+    return f"{_percent(chance)}, {name}" if name else NOTHING
+
+
+_ROWS: tuple[tuple[str, Callable[[Side], str]], ...] = (
+    ("chosen by", lambda side: side.title),
+    ("theta, beta, deg", _angles),
+    ("verdict", _verdict),
+    ("rank", _rank),
+    ("window", _of_window(lambda one: one.number, "{:g}")),
+    ("window's area, deg2", _of_window(lambda one: one.square_deg, "{:.0f}")),
+    ("its entry on the skin, cm2", _of_window(lambda one: one.entry_cm2, "{:.1f}")),
+    (
+        "safe cone, deg",
+        lambda side: NOTHING if side.grid is None else _shown(np.degrees(side.grid.safe_cone), "{:.1f}"),
+    ),
+    ("chance to hit, %", _of_doubt(lambda doubt: _percent(doubt.p_hit))),
+    ("chance to touch anything, %", _of_doubt(lambda doubt: _percent(doubt.p_touch_any))),
+    ("likeliest to be touched, %", _of_doubt(_likeliest)),
+    ("expected tip error (rms), mm", _of_doubt(lambda doubt: f"{doubt.budget.rms_mm:.2f}")),
+    ("path length, mm", _checked(lambda one: one.candidates.path.length[0], "{:.1f}")),
+    ("skin angle, deg", _checked(lambda one: np.degrees(one.candidates.path.skin_angle[0]), "{:.1f}")),
+    ("tissue crossed, mm", _checked(lambda one: one.candidates.path.tissue[0], "{:.1f}")),
+    ("arm reaches it", _reach),
+    ("standoff, mm", _of_plan(lambda plan: plan.standoff_mm, "{:.1f}")),
+    ("approach, s", _of_plan(lambda plan: float(plan.approach.times_s[-1]), "{:.1f}")),
+    ("insertion, s", _of_plan(lambda plan: float(plan.insertion.times_s[-1]), "{:.1f}")),
+    ("expected tip error in the plan, mm", _of_plan(lambda plan: plan.expected_target_error_mm, "{:.2f}")),
+    ("needle to the nearest, mm", _of_plan(lambda plan: plan.clearance_mm.get("needle", np.nan), "{:.2f}")),
+    ("arm on the approach, mm", _of_plan(lambda plan: plan.clearance_mm.get("approach", np.nan), "{:.2f}")),
+    ("arm on the insertion, mm", _of_plan(lambda plan: plan.clearance_mm.get("insertion", np.nan), "{:.2f}")),
+    ("least clearance, mm", _checked(lambda one: one.candidates.least_clearance[0], "{:.2f}")),
+)
+"""What stands in each row; rows that neither side has are left out."""

@@ -1,22 +1,32 @@
-"""The command that checks a list: which list it is, and what it is read and written with."""
+"""The command that checks a list: which list it is, and what it is read and written with.
+
+A list of entries, or of targets, checked row by row: one row out for each row in.
+"""
 
 from __future__ import annotations
 
+import csv
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.files import check_writable
+from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
+from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.geometry.spaces import to_lps
+from puncture_twin.planning.search.choice import BEST, Choice, Listed, ReadList, read_entries, read_targets
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.planning.search.selection.choice import BEST, Choice
-from puncture_twin.planning.search.selection.listed import Listed, read_entries, read_targets
-
-if TYPE_CHECKING:
-    from puncture_twin.twin.jobs.choosing.row_by_row import CheckedList
+from puncture_twin.planning.search.explain import Explanation, finite
+from puncture_twin.planning.search.windows import find_windows
+from puncture_twin.twin.jobs.patient.answers import explain_choice
 
 
 def lists_of(
@@ -53,8 +63,6 @@ def check_list(
     Raises:
         InputError: A case, list or folder that cannot be used. A row that cannot be checked is a row that says so.
     """
-    from puncture_twin.twin.jobs.choosing.row_by_row import check_entries, check_targets, write_checked
-
     out = None if out_dir is None else check_writable(out_dir)
     context = prepare(path, arm=arm, watcher=watcher)
 
@@ -68,3 +76,217 @@ def check_list(
         assert targets is not None
         checked = check_targets(context, read_targets(targets, context.case, choice), aimed)
     return checked if out is None else write_checked(checked, context, out)
+
+
+CSV, PARQUET = "checked.csv", "checked.parquet"
+
+REFUSED = "refused"
+"""The verdict of a row that could not be checked: neither safe nor rejected."""
+
+TEXTS = frozenset({"name", "verdict", "reason", "reason_structure", "detail", "on_the_skin", "nearest"})
+WHOLE = frozenset({"row", "safe_directions", "windows"})
+COLUMNS = (
+    *("row", "name", "x_mm", "y_mm", "z_mm", "verdict", "reason", "reason_structure", "detail"),
+    *("theta_deg", "beta_deg", "entry_x_mm", "entry_y_mm", "entry_z_mm", "on_the_skin"),
+    *("path_length_mm", "skin_angle_deg", "min_clearance_mm", "nearest", "reachable", "p_hit", "p_touch_any"),
+    *("safe_directions", "windows"),
+)
+"""Of the table, in this order; what has no number is empty."""
+
+
+class Outcome(NamedTuple):
+    """A row that was checked.
+
+    Attributes:
+        explained: None of a row that was refused, or for whose target nothing is safe.
+        verdict: ``safe``, ``rejected``, or `REFUSED`.
+        detail: Why it has no explanation.
+        safe_directions: Of a target's search; None of an entry.
+        windows: The same.
+    """
+
+    explained: Explanation | None
+    verdict: str
+    detail: str = ""
+    safe_directions: int | None = None
+    windows: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedList:
+    """All rows of a list.
+
+    Attributes:
+        case_name: The case.
+        arm: Whether the arm was checked: see `Candidates.arm_note`.
+        inputs: The list, then what the case names.
+        rows: In the order of the list, by `COLUMNS`.
+        warnings: Of the list and of the case.
+        files: What was written.
+    """
+
+    case_name: str
+    arm: str
+    inputs: tuple[Input, ...]
+    rows: tuple[dict[str, Any], ...]
+    warnings: tuple[str, ...]
+    files: tuple[Path, ...] = ()
+
+    @property
+    def safe(self) -> bool:
+        """Whether every row is."""
+        return all(row["verdict"] == "safe" for row in self.rows)
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "case": self.case_name,
+            "arm": self.arm,
+            "inputs": inputs_document(self.inputs),
+            "rows": list(self.rows),
+            "warnings": list(self.warnings),
+            "files": [str(path) for path in self.files],
+        }
+
+    def text(self) -> str:
+        """A line a row, then what kept those that are not safe."""
+        wide = max(4, *(len(row["name"]) for row in self.rows))
+        lines = [
+            f"case {self.case_name}: {len(self.rows)} rows, arm {self.arm}",
+            f"   row  {'name':{wide}s}  verdict    theta   beta  clearance   path  angle  nearest",
+            f"        {'':{wide}s}               deg    deg         mm     mm    deg",
+            *(_line(row, wide) for row in self.rows),
+        ]
+        kept = [f"  row {row['row']}: {_why(row)}" for row in self.rows if row["verdict"] != "safe"]
+        rest = [f"warning: {one}" for one in self.warnings] + [f"  {path}" for path in self.files]
+        return "\n".join([*lines, *kept, *rest])
+
+
+def check_entries(context: CaseContext, listed: ReadList) -> CheckedList:
+    """Check every listed direction of one case."""
+
+    def outcome(row: Listed) -> Outcome:
+        explained = explain_choice(context, row.choice, None)
+        return Outcome(explained, explained.verdict)
+
+    return _checked(context, listed, outcome)
+
+
+def check_targets(context: CaseContext, listed: ReadList, aimed: Callable[[Listed], CaseContext]) -> CheckedList:
+    """Search the case again for every listed target, and explain the choice, or the best.
+
+    Args:
+        context: Of the case, for what does not depend on the target.
+        listed: The targets.
+        aimed: The case with a row's point as its target, read anew.
+    """
+
+    def outcome(row: Listed) -> Outcome:
+        there = aimed(row)
+        found = there.search()
+        windows = len(find_windows(found).windows)
+        counts = int(found.safe.sum()), windows
+        try:
+            explained = explain_choice(there, row.choice, found)
+        except NoAnswerError as error:
+            return Outcome(None, "rejected", str(error), *counts)
+        return Outcome(explained, explained.verdict, "", *counts)
+
+    return _checked(context, listed, outcome)
+
+
+def write_checked(checked: CheckedList, context: CaseContext, out: Path) -> CheckedList:
+    """The same, with its rows as CSV and Parquet in a folder."""
+    names, stages, note = (CSV, PARQUET), context.stages.seconds, context.watcher.note
+    with writing(out, "check list", inputs=checked.inputs, seconds=stages, names=names, note=note) as draft:
+        paths = (draft.folder / CSV, draft.folder / PARQUET)
+        _write_csv(checked.rows, paths[0])
+        run = {**context.provenance(), "inputs": inputs_document(checked.inputs)}
+        table = pa.table({name: pa.array([row[name] for row in checked.rows], _kind(name)) for name in COLUMNS})
+        pq.write_table(table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)}), paths[1])
+    return CheckedList(**{**vars(checked), "files": draft.final(paths)})
+
+
+def _checked(context: CaseContext, listed: ReadList, outcome: Callable[[Listed], Outcome]) -> CheckedList:
+    rows = []
+    for done, row in enumerate(listed.rows, start=1):
+        try:
+            rows.append(_document(context, row, outcome(row)))
+        except InputError as error:
+            rows.append(_document(context, row, Outcome(None, REFUSED, str(error))))
+        context.watcher.count("rows", done, len(listed.rows))
+    inputs = (listed.input, *context.case.inputs)
+    return CheckedList(
+        context.case.name, context.arm, inputs, tuple(rows), (*listed.warnings, *context.anatomy.warnings)
+    )
+
+
+def _document(context: CaseContext, row: Listed, found: Outcome) -> dict[str, Any]:
+    blank: dict[str, Any] = dict.fromkeys(COLUMNS)
+    blank |= dict.fromkeys(TEXTS, "")
+    point = {} if row.point_mm is None else dict(zip(("x_mm", "y_mm", "z_mm"), row.point_mm, strict=True))
+    stated = {"row": row.number, "name": row.name, "verdict": found.verdict, "detail": found.detail}
+    counts = {"safe_directions": found.safe_directions, "windows": found.windows}
+    rest = {} if found.explained is None else _explained(found.explained)
+    return {**blank, **point, **rest, **stated, **counts, "detail": found.detail or rest.get("detail", "")}
+
+
+def _explained(explained: Explanation) -> dict[str, Any]:
+    one = explained.candidates
+    entry = to_lps(one.path.entry_ct, explained.case.space)[0]
+    place, doubt = explained.facts.place, explained.doubt
+    return {
+        **one.at(0),
+        "reason": str(one.verdict.reason[0]),
+        "reason_structure": str(one.verdict.structure[0]),
+        "detail": str(one.verdict.detail[0]),
+        **{f"entry_{axis}_mm": finite(mm) for axis, mm in zip("xyz", entry, strict=True)},
+        "on_the_skin": "" if place is None else place.text(explained.case.space),
+        "path_length_mm": finite(one.path.length[0]),
+        "skin_angle_deg": finite(np.degrees(one.path.skin_angle[0])),
+        "min_clearance_mm": finite(one.least_clearance[0]),
+        "nearest": explained.nearest_demanding(),
+        "reachable": None if one.arm.reachable[0] < 0 else bool(one.arm.reachable[0]),
+        "p_hit": None if doubt is None else doubt.p_hit,
+        "p_touch_any": None if doubt is None else doubt.p_touch_any,
+    }
+
+
+def _kind(name: str) -> pa.DataType:
+    if name in TEXTS:
+        return pa.string()
+    if name == "reachable":
+        return pa.bool_()
+    return pa.int64() if name in WHOLE else pa.float64()
+
+
+def _write_csv(rows: Iterable[dict[str, Any]], path: Path) -> None:
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows([_field(row[name]) for name in COLUMNS] for row in rows)
+
+
+def _field(value: Any) -> str:
+    if value is None:
+        return ""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _line(row: dict[str, Any], wide: int) -> str:
+    angles, lengths = ("theta_deg", "beta_deg"), ("path_length_mm", "skin_angle_deg")
+    cells = [*(_number(row[name], 7, 1) for name in angles), _number(row["min_clearance_mm"], 11, 2)]
+    cells += [_number(row[name], 7, 1) for name in lengths]
+    crosses = "crosses " if (row["min_clearance_mm"] or 0) < 0 else ""
+    line = f"{row['row']:6d}  {row['name']:{wide}s}  {row['verdict']:8s} {''.join(cells)}  {crosses}{row['nearest']}"
+    return line.rstrip()
+
+
+def _number(value: float | None, width: int, digits: int) -> str:
+    return f"{'-':>{width}s}" if value is None else f"{value:{width}.{digits}f}"
+
+
+def _why(row: dict[str, Any]) -> str:
+    where = f" ({row['reason_structure']})" if row["reason_structure"] else ""
+    reason = f"{row['reason']}{where}" if row["reason"] else row["verdict"]
+    return f"{reason}: {row['detail']}" if row["detail"] else reason

@@ -21,9 +21,9 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.search.choice import BEST
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.selection.choice import BEST
-from puncture_twin.planning.touch.straight_approach import plan_puncture
+from puncture_twin.planning.touch.tour_motions import plan_puncture
 from puncture_twin.twin.jobs.experiment.touch_job import (
     Tour,
     drawn_once,
@@ -32,7 +32,7 @@ from puncture_twin.twin.jobs.experiment.touch_job import (
     true_at_target,
     true_touches,
 )
-from puncture_twin.twin.rehearsal.in_physics import rehearse_touched
+from puncture_twin.twin.rehearsal.plan_truth import rehearse_touched
 from puncture_twin.twin.rehearsal.result import Rehearsal
 
 DRAWS = 400

@@ -1,23 +1,39 @@
-"""`pivot CASE JOINTS`: the needle's tip from touches of one place, beside what the case says of it."""
+"""`pivot CASE JOINTS`: the needle's tip from touches of one place, beside what the case says of it.
+
+`pivot CASE`: the tip set onto one place in several poses in the twin, found from the joints, beside the truth.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.stated_arm import check_recording
+from puncture_twin.planning.arm.kinematics import PARAMETERS, check_recording, flange_pose
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.joint_readings import parse_joint_recording
-from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES
+from puncture_twin.planning.formats.points import (
+    MAX_FILE_BYTES,
+    NamedPoints,
+    parse_coordinate,
+    parse_joint_recording,
+    write_points,
+)
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.touch.pivot_planner import LEAST_POSES, MOST_POSES, plan_pivot
+from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers
+from puncture_twin.planning.touch.tour_motions import TouchTour
 from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, check_one_place, pivot_calibration
+from puncture_twin.twin.jobs.experiment.result_file import write_result
+from puncture_twin.twin.plant.true_needle import TouchTruth, draw_pivot_truth
+from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
 
 STANDS_OUT = 2.0
 """A touch that misses by so many times the others' root mean square is named."""
@@ -121,3 +137,136 @@ def _doubt(run: PivotRun) -> list[str]:
         one = f"{run.names[worst]} misses by {pivot.misses_mm[worst]:.2f} mm, the others by {rest:.2f} (rms)"
         return [f"{head}: {one}: the tip slipped there, or touched another place"]
     return [f"{head}, and all touches alike: the arm errs by more than it declares, or they are of several places"]
+
+
+PIVOT, SUMMARY = "pivot.csv", "pivot.json"
+
+
+@dataclass(frozen=True, eq=False)
+class PivotTourRun:
+    """An executed pivot calibration.
+
+    Attributes:
+        found: The tip that its joints give.
+        seed: Of the truth.
+        place_base: Shape (3,), mm: the place as it was planned.
+        true_tip_flange: Shape (3,), mm.
+        touched: The readings.
+        files: Written.
+    """
+
+    found: PivotRun
+    seed: int
+    place_base: Floats
+    true_tip_flange: Floats
+    touched: Touched
+    files: tuple[Path, ...]
+
+    @property
+    def error_mm(self) -> float:
+        """Found tip against the true one."""
+        return float(np.linalg.norm(self.found.pivot.tip_flange - self.true_tip_flange))
+
+    @property
+    def expected_error_mm(self) -> float:
+        """The same (rms) as declared."""
+        return float(np.sqrt(np.trace(self.found.pivot.cov_tip)))
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            **self.found.summary(),
+            "seed": self.seed,
+            "place_mm": self.place_base.tolist(),
+            "true_tip_flange_mm": self.true_tip_flange.tolist(),
+            "tip_error_mm": self.error_mm,
+            "expected_tip_error_mm": self.expected_error_mm,
+            "failed": dict(self.touched.failed),
+            "seconds": self.touched.seconds,
+            "files": [str(path) for path in self.files],
+        }
+
+
+def parse_place(text: str | None) -> Floats | None:
+    """A place in the base frame, mm, as it is typed.
+
+    Raises:
+        InputError: Not three numbers.
+    """
+    if text is None:
+        return None
+    numbers = [parse_coordinate(part.strip(), "--at") for part in text.split(",")]
+    if len(numbers) != 3:
+        raise InputError(f"{len(numbers)} numbers", where="--at", allowed="X,Y,Z in mm, in the robot's base frame")
+    return np.array(numbers)
+
+
+def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats | None, seed: int) -> PivotTourRun:
+    """Plan a pivot calibration, execute it in the twin, write what was read.
+
+    Args:
+        context: Of a case with declared errors and an arm.
+        out: The output folder.
+        poses: How many, 4 to 12.
+        place_base: Shape (3,), mm, where; None for a place that is found.
+        seed: Of the motions and of the truth.
+
+    Raises:
+        InputError: The case declares no errors or has no arm, or so many poses are not planned.
+        NoAnswerError: No place can be touched in so many poses, or too few were touched.
+    """
+    case = context.case
+    if not LEAST_POSES <= poses <= MOST_POSES:
+        raise InputError(f"{poses} poses", where="--poses", allowed=f"{LEAST_POSES} to {MOST_POSES}")
+    if case.errors is None:
+        raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm")
+    with writing(out, "pivot", inputs=case.inputs, names=(PIVOT, SUMMARY), note=context.watcher.note) as draft:
+        with context.stages.time("pivot plan"):
+            count = partial(context.watcher.count, "motions")
+            tour = plan_pivot(context, poses, place_base=place_base, seed=seed, progress=count)
+        truth = _truth(context, tour, seed)
+        touched = _executed(context, tour, truth)
+        names, joints = tuple(one.name for one in touched.readings), np.array([one.q for one in touched.readings])
+        found = PivotRun(case, calibrated(case, names, joints, where=str(case.path)), names, case.inputs)
+        true_tip = truth.eta[PARAMETERS["tip_offset"]] + np.array([0.0, 0.0, tour.tip_mm])
+        files = draft.final((draft.folder / PIVOT, draft.folder / SUMMARY))
+        run = PivotTourRun(found, seed, tour.touches[0].point_base, true_tip, touched, files)
+        points = np.array([one.point_base for one in touched.readings])
+        write_points(draft.folder / PIVOT, NamedPoints(names, points, None, joints=joints))
+        write_result(run.summary(), draft.folder / SUMMARY, out)
+    return run
+
+
+def _truth(context: CaseContext, tour: TouchTour, seed: int) -> TouchTruth:
+    errors = context.case.truth_errors or context.case.errors
+    assert errors is not None and context.reach is not None
+    names = tuple(f"P{number + 1}" for number in range(len(tour.touches)))
+    return draw_pivot_truth(context.reach.T_base_ct, names, tour.touches[0].point_base, errors, seed)
+
+
+def _executed(context: CaseContext, tour: TouchTour, truth: TouchTruth) -> Touched:
+    checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
+    with context.stages.time("touches"):
+        touched = execute_touches(tour, context.case, context.anatomy, checkers, truth, count)
+    if len(touched.readings) < LEAST_POSES:
+        why = "; ".join(f"{name}: {reason}" for name, reason in touched.failed.items())
+        poses = f"{len(touched.readings)} of {len(tour.touches)} poses were touched"
+        raise NoAnswerError(f"{poses}, {LEAST_POSES} are needed: {why}")
+    return touched
+
+
+def pivot_tour_text(run: PivotTourRun) -> str:
+    """For the terminal."""
+    at = ", ".join(f"{mm:.0f}" for mm in run.place_base)
+    count, seconds = len(run.touched.readings), run.touched.seconds
+    x, y, z = run.true_tip_flange
+    return "\n".join(
+        [
+            f"{count} poses touched about ({at}) mm (base) in {seconds:.0f} s",
+            *(f"  {name:<12} not touched: {why}" for name, why in run.touched.failed.items()),
+            pivot_text(run.found),
+            f"the true tip (seed {run.seed}) is ({x:.3f}, {y:.3f}, {z:.3f}) mm: {run.error_mm:.3f} mm off, "
+            f"{run.expected_error_mm:.3f} expected (rms)",
+            *(f"wrote {path}" for path in run.files),
+        ]
+    )

@@ -10,10 +10,7 @@ from typing import Any, get_args
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.manifest import FORMAT
 from puncture_twin.planning.formats.meshes.ply import ply_bytes
-from puncture_twin.twin.plant.beside.arms import Arms
-from puncture_twin.twin.plant.beside.bed import Bed
-from puncture_twin.twin.plant.beside.beside import Beside
-from puncture_twin.twin.plant.beside.tubes import Part
+from puncture_twin.twin.plant.outside_objects import Arms, Bed, Beside, Part
 
 FOLDER = "beside"
 LIST = "manifest.json"

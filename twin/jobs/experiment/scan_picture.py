@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.formats.points.point_files import NamedPoints
+from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle
 from puncture_twin.twin.plant.scanner.image import CtImage

@@ -12,14 +12,13 @@ import numpy as np
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.formats.points.raw_points import parse_coordinate
+from puncture_twin.planning.formats.points import parse_coordinate
+from puncture_twin.planning.search.choice import Choice, choose, chosen_angles
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles
-from puncture_twin.planning.search.selection.windows import find_windows
-from puncture_twin.planning.sweep.sweep_plan import SweepPlan
-from puncture_twin.planning.sweep.sweep_planner import plan_sweep
+from puncture_twin.planning.search.windows import find_windows
+from puncture_twin.planning.sweep.sweep_planner import SweepPlan, plan_sweep
 from puncture_twin.twin.jobs.experiment.result_file import write_result
-from puncture_twin.twin.rehearsal.executed import Swept, execute_sweep
+from puncture_twin.twin.rehearsal.rehearsal import Swept, execute_sweep
 
 SWEEP = "sweep.json"
 

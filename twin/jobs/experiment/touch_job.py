@@ -14,13 +14,12 @@ from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.formats.points.point_files import NamedPoints, write_points
+from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.search.choice import Choice, choose, chosen_angles
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.selection.choice import Choice, choose, chosen_angles
-from puncture_twin.planning.touch.straight_approach import registered_joints
 from puncture_twin.planning.touch.touch_planner import (
     TOUCHING_PADDING_MM,
     approach_checkers,
@@ -28,10 +27,16 @@ from puncture_twin.planning.touch.touch_planner import (
     plan_touches,
     registered,
 )
-from puncture_twin.planning.touch.tour_motions import TouchPlan
+from puncture_twin.planning.touch.tour_motions import TouchPlan, registered_joints
 from puncture_twin.twin.jobs.experiment.result_file import write_result
-from puncture_twin.twin.plant.touch_truth import AtTarget, TouchTruth, draw_at_target, draw_touch_truth, nominal_tip
-from puncture_twin.twin.plant.true_needle import true_needle
+from puncture_twin.twin.plant.true_needle import (
+    AtTarget,
+    TouchTruth,
+    draw_at_target,
+    draw_touch_truth,
+    nominal_tip,
+    true_needle,
+)
 from puncture_twin.twin.rehearsal.distribution import misregistered
 from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
 

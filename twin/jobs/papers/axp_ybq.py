@@ -17,15 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rotations import log_rotation
+from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import closed_form
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import mean_direction
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate, active_columns
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate, active_columns, closed_form
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import mean_direction, tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, SimulatedTruth, simulate_recording
 

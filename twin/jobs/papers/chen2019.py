@@ -18,7 +18,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import needle_pose, outward
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_triad
-from puncture_twin.twin.experiment.chen2019_tables import TABLE_1, TABLE_2, TABLE_4, Point
+from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2, TABLE_4, Point
 
 TOLERANCE_MM = 0.01
 """The paper prints two decimals; so much may rounding its inputs and outputs differ."""

@@ -12,9 +12,17 @@ import numpy as np
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.progress import Watcher
-from puncture_twin.twin.experiment.declarations import AS_FOUND, AS_STATED
-from puncture_twin.twin.experiment.monte_carlo import REJECTED, Experiment, Standing, paper_strains, run_draws
-from puncture_twin.twin.experiment.skew import SkewFinding, find_skew
+from puncture_twin.twin.experiment.chen2019 import (
+    AS_FOUND,
+    AS_STATED,
+    REJECTED,
+    Experiment,
+    SkewFinding,
+    Standing,
+    find_skew,
+    paper_strains,
+    run_draws,
+)
 from puncture_twin.twin.jobs.papers import axp_ybq, chen2019
 from puncture_twin.twin.jobs.papers.chen2019 import reproduction_summary, reproduction_text
 from puncture_twin.twin.jobs.servo.job import reproduce_paper

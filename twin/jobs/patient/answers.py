@@ -22,8 +22,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
-from puncture_twin.planning.formats.points.point_files import MAX_FILE_BYTES, parse_points
-from puncture_twin.planning.formats.points.raw_points import parse_coordinate
+from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_coordinate, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.advice import OneMore, odd_branches, one_more, without_each
@@ -36,18 +35,11 @@ from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.registration.residual_test import INTERVAL
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.choice import Choice, choose, chosen_angles, refuse_other_entry, with_file_read
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.planning.search.selection.choice import (
-    Choice,
-    choose,
-    chosen_angles,
-    refuse_other_entry,
-    with_file_read,
-)
 from puncture_twin.planning.uncertainty.hit import radius_that_holds
-from puncture_twin.twin.jobs.patient.budget import budget_facts
-from puncture_twin.twin.jobs.patient.correction import correction_facts
+from puncture_twin.twin.jobs.patient.budget import budget_facts, correction_facts
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 
 

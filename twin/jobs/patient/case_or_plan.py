@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.search.selection.choice import BEST, Choice
+from puncture_twin.planning.search.choice import BEST, Choice
 
 
 def is_plan(source: Path) -> bool:

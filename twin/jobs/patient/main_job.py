@@ -19,11 +19,11 @@ from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.clearance.cross_check import CrossChecked
+from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
+from puncture_twin.planning.search.choice import BEST, Choice, Pick, choose, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.selection.choice import BEST, Choice, Pick, choose, choose_stated, with_file_read
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
 from puncture_twin.twin.jobs.second_process import Beside, Here
@@ -276,8 +276,7 @@ def export(
 
 def _certified(run: Run, size_deg: float, touch: float | None, out: Path) -> Run:
     """Certify the cap to a cell size, and a chance to touch, and rank again with the safe cones."""
-    from puncture_twin.planning.certify.certificate import write_certificate
-    from puncture_twin.planning.certify.cone_column import with_safe_cone
+    from puncture_twin.planning.certify.certificate import with_safe_cone, write_certificate
     from puncture_twin.planning.certify.subdivision import certify
 
     context = run.context

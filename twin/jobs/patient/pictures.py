@@ -14,10 +14,10 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.checks.touching import touchable_points
+from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.planning.search.selection.choice import Pick, best_pick
-from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
+from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.budget import budget_facts
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
@@ -101,7 +101,7 @@ def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:
     Raises:
         InputError: Not a PNG's name, no budget to draw, or a folder or file that cannot be written.
     """
-    from puncture_twin.twin.report.budget_picture import draw_budget  # with matplotlib
+    from puncture_twin.twin.report.error_pictures import draw_budget  # with matplotlib
 
     _check_png(path)
     budget = report.get("budget")

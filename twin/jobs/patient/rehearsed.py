@@ -53,7 +53,7 @@ class Begun:
 
     def _rooms_drawn(self, out: Path) -> dict[str, Any]:
         """What the rehearsal's file says of many rooms, their picture being drawn; nothing where there are none."""
-        from puncture_twin.twin.report.rooms_picture import draw_rooms_picture
+        from puncture_twin.twin.report.error_pictures import draw_rooms_picture
 
         found = self.run.distribution
         if found is None:
@@ -98,7 +98,7 @@ def _distribution(run: Run, count: RoomCount) -> Distribution:
         found = rehearse_rooms(context, run.plan.outward_ct, q, count.rooms, context.case.rehearsal.seed)
     if not (count.physics and len(found)):
         return found
-    from puncture_twin.twin.rehearsal.in_physics import physics_rooms
+    from puncture_twin.twin.rehearsal.plan_truth import physics_rooms
 
     with context.stages.time("physics"):
         again = partial(context.watcher.count, "rooms in the simulator")

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.certify.certificate import Certificate
-from puncture_twin.planning.clearance.cross_check import CrossChecked
+from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
+from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings
-from puncture_twin.planning.search.selection.choice import Pick, best_pick
-from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
 from puncture_twin.planning.search.sides import sides_text
+from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.summaries import (
     plan_summary,
     rehearsal_failures,

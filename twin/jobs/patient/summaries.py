@@ -16,8 +16,8 @@ from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
-from puncture_twin.planning.search.selection.windows import Window
-from puncture_twin.planning.uncertainty.chances import touch_limit
+from puncture_twin.planning.search.windows import Window
+from puncture_twin.planning.uncertainty.chance_model import touch_limit
 
 if TYPE_CHECKING:  # they bring export and simulator with them
     from puncture_twin.planning.export.exporter import Exported

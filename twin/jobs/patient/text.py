@@ -11,11 +11,10 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.explain import deep_text, needle_warnings, reason_text
-from puncture_twin.planning.search.selection.windows import find_windows
 from puncture_twin.planning.search.sides import sides_text
+from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.uncertainty.sources import SOURCES
-from puncture_twin.twin.jobs.patient.budget import budget_lines
-from puncture_twin.twin.jobs.patient.correction import correction_lines
+from puncture_twin.twin.jobs.patient.budget import budget_lines, correction_lines
 from puncture_twin.twin.jobs.patient.run import Run
 from puncture_twin.twin.jobs.patient.summaries import plan_summary, rehearsal_summary
 from puncture_twin.twin.report.numbers import TRUTH_IS_BELIEF

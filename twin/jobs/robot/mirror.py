@@ -11,8 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.stated_arm import check_recording
+from puncture_twin.planning.arm.kinematics import check_recording, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
@@ -21,7 +20,7 @@ from puncture_twin.planning.base.extras import require_extra
 from puncture_twin.planning.base.input_file import read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.joint_readings import joint_readings, parse_joint_recording
+from puncture_twin.planning.formats.points import joint_readings, parse_joint_recording
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 
 MAX_RECORDING_BYTES = 200_000_000

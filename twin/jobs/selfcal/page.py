@@ -15,9 +15,8 @@ from puncture_twin.twin.guidance.ultrasound.puncture import Puncture
 from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
 from puncture_twin.twin.jobs.selfcal.text import NOISE_TEXT, REASON_TEXT, Facts, counted, missed_text, selfcal_facts
 from puncture_twin.twin.report.numbers import number
-from puncture_twin.twin.report.page.page_charts import curve
 from puncture_twin.twin.report.page.page_tables import TIMES, faint, inputs_table, origin_section, pairs, table
-from puncture_twin.twin.report.page.template import Card, data_address, plotly_script, script_json, write_html
+from puncture_twin.twin.report.page.template import Card, curve, data_address, plotly_script, script_json, write_html
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73")
 """Okabe and Ito's blue, orange, green."""

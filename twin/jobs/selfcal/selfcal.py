@@ -12,16 +12,15 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.input_file import read_input, unfinished_warnings
 from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.planning.base.provenance import Input, content_input
-from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, acquire, choice_noise
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, WorkcellTruth, acquire, choice_noise
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import tangent_basis
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, drawing, expected_tre_mm, find_candidates
 from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
 from puncture_twin.twin.guidance.ultrasound.recording_file import MAX_BYTES, parse_recording, recording_file
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.selfcal_truth import WorkcellTruth
 from puncture_twin.twin.guidance.ultrasound.slips import calibrate_case, checked_calibration
 from puncture_twin.twin.guidance.ultrasound.summaries import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms

@@ -14,7 +14,7 @@ from puncture_twin.twin.guidance.stereo.experiment import (
     declaration_test,
     needle_statistics,
 )
-from puncture_twin.twin.guidance.stereo.joint.needle_outcome import NeedleOutcome
+from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleOutcome
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.jobs.servo.liu2007 import (
     TABLE_1,

@@ -1,20 +1,25 @@
-"""A scan of a scene: exact partial volume, blur in the plane, noise, and the range that a scanner stores."""
+"""A scan of a scene: exact partial volume, blur in the plane, noise, and the range that a scanner stores.
+
+What lies in a scanner: closed surfaces with Hounsfield units, and the simple bodies of devices.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
-from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.twin.plant.scanner.coverage import cut_solids
-from puncture_twin.twin.plant.scanner.solids import Solid
 
 AIR_HU = -1000.0
 """By the scale's definition."""
@@ -179,3 +184,56 @@ def _samples(corners: Floats) -> Iterator[Floats]:
         step = max(1, MOST_SAMPLES // len(i))
         for start in range(0, len(some), step):
             yield np.einsum("wp,twc->tpc", weights, some[start : start + step]).reshape(-1, 3)
+
+
+SIDES = 64
+"""Of a round body: its volume is that of the circle to 1.6e-3."""
+
+
+class Solid(NamedTuple):
+    """One body in the scanner; a later one fills the place of an earlier one.
+
+    Attributes:
+        name: What it is.
+        mesh: Closed, mm.
+        hu: What it is made of, Hounsfield units.
+        label: Its number in its label map; 0 for what no segmentation names.
+        layer: Which label map shows it: bodies that hold others have one of their own.
+        whole: Its label leaves out no part of it, however thin.
+    """
+
+    name: str
+    mesh: TriangleMesh
+    hu: float
+    label: int = 0
+    layer: int = 0
+    whole: bool = False
+
+
+def check_closed(solid: Solid, where: str) -> Solid:
+    """The solid, if it has an inside.
+
+    Raises:
+        InputError: Its surface is open.
+    """
+    if not solid.mesh.closed:
+        raise InputError(f"'{solid.name}' has an open surface", where=where, allowed="closed surfaces")
+    return solid
+
+
+def ball(centre: Floats, diameter_mm: float) -> TriangleMesh:
+    """A ball about a point (3,), mm."""
+    mesh = trimesh.creation.icosphere(4, diameter_mm / 2)
+    return TriangleMesh(np.asarray(mesh.vertices) + centre, np.asarray(mesh.faces))
+
+
+def rod(start: Floats, end: Floats, diameter_mm: float) -> TriangleMesh:
+    """A round rod between the middles of its flat ends, points (3,), mm: a needle, or a disc where it is short."""
+    mesh = trimesh.creation.cylinder(diameter_mm / 2, segment=np.stack([start, end]), sections=SIDES)
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def box(centre: Floats, size_mm: Floats) -> TriangleMesh:
+    """A box with edges along the axes, mm."""
+    mesh = trimesh.creation.box(np.asarray(size_mm, dtype=float))
+    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)).transformed(pose(np.eye(3), centre))

@@ -2,12 +2,14 @@
 
 Lines and hatching, no colours: they read over every shade of safe, in print, and for colour-blind people. The chance to
 hit hardly changes with the direction, so that it stands beside the map as a number.
+
+The marks of directions, on the map and in its legend.
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +18,12 @@ from scipy import ndimage
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.twin.report.canvas.canvas import BLACK, Canvas, Words
-from puncture_twin.twin.report.map.map_layout import POINT, side_pixels
+from puncture_twin.twin.report.canvas import BLACK, WHITE, Canvas, Words, circle, star
+from puncture_twin.twin.report.map.map_raster import POINT, side_pixels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
 
 LEVELS = (0.5, 0.9, 0.99)
 STYLES = (":", "--", "-")
@@ -143,3 +146,20 @@ def _hatch(canvas: Canvas, box: tuple[float, float, float, float], hatch: str) -
         dots = np.stack(np.meshgrid(np.arange(5, right - left, 10), np.arange(5, high, 9)), -1).reshape(-1, 1, 2)
         part.segments(np.repeat(dots, 2, axis=1), 3.0, BLACK, opacity=0.7)
     canvas.paste(part.pixels, round(left), round(top))
+
+
+def mark_dot(canvas: Canvas, place: Any) -> None:
+    """A direction of the Pareto front."""
+    canvas.segments(np.array([[place, place]]), 3.5 * POINT, BLACK)
+    canvas.segments(np.array([[place, place]]), 2.5 * POINT, WHITE)
+
+
+def mark_ring(canvas: Canvas, place: Any) -> None:
+    """The best of a window."""
+    canvas.line(circle(place, 3.4 * POINT), 1.2 * POINT, BLACK)
+
+
+def mark_star(canvas: Canvas, place: Any, radius: float) -> None:
+    """The chosen direction."""
+    canvas.fill(star(place, radius), WHITE)
+    canvas.line(star(place, radius), 1.6 * POINT, BLACK)

@@ -15,23 +15,23 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.search.candidates import Candidates, Verdict
-from puncture_twin.planning.search.selection.choice import Pick, best_pick
-from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
-from puncture_twin.twin.report.canvas.canvas import BLACK, Canvas, Halo, Words, circle
-from puncture_twin.twin.report.map.chance_layer import chance_picture
-from puncture_twin.twin.report.map.front import shown_front
-from puncture_twin.twin.report.map.map_layout import (
+from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
+from puncture_twin.twin.report.canvas import BLACK, Canvas, Halo, Words, circle
+from puncture_twin.twin.report.map.chance_layer import chance_picture, mark_dot, mark_ring, mark_star
+from puncture_twin.twin.report.map.map_raster import (
     HEIGHT,
     MIDDLE,
     POINT,
     RADIUS,
     RINGS_AT,
     Label,
+    MapRaster,
     disc_pixels,
+    map_raster,
     ring_radii,
+    shown_front,
 )
-from puncture_twin.twin.report.map.map_marks import mark_dot, mark_ring, mark_star
-from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map.map_side import draw_side
 from puncture_twin.twin.report.map_view import BEYOND, MapView, map_view, step_of
 from puncture_twin.twin.report.numbers import needle_text, target_text

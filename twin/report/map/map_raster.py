@@ -1,17 +1,21 @@
 """The map as pixels: every pixel asks which grid cell it lies in, so no gap and no moire can arise.
 
 A pixel with other colours around it is the mean of a few samples; all others have the colour of their cell.
+
+The Pareto front on the map: hundreds of dots hide the shades below, so a large front is thinned, and says so.
+
+Where things stand in ``map.png``: pixels from its upper left corner, and places in the disc.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.reasons import REASON_COLOURS, UNSEEN_AIR, Reason, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import MapCells, MapView
@@ -160,3 +164,93 @@ def _beside_another(colours: NDArray[np.uint32]) -> NDArray[np.bool_]:
         beside[a] |= differs
         beside[b] |= differs
     return beside
+
+
+MOST_DOTS = 40
+"""A front of up to so many directions is shown whole."""
+
+SPACING, WIDER = 0.04, 1.25
+"""Of a thinned front, in the map's radii: the least distance of two dots, and its growth while they are too many."""
+
+
+SAME = 1e-6
+"""In the map's radii: directions nearer than this are one, as those of θ = 0 are for every β."""
+
+
+class ShownFront(NamedTuple):
+    """The dots.
+
+    Attributes:
+        rows: Shape (k,), the candidates that get one, best rank first.
+        of: How many different directions are on the front.
+    """
+
+    rows: Ints
+    of: int
+
+    @property
+    def text(self) -> str:
+        """For a legend."""
+        return "Pareto front" if len(self.rows) == self.of else f"Pareto front ({len(self.rows)} of {self.of:,})"
+
+
+def shown_front(candidates: Candidates, view: MapView) -> ShownFront:
+    """The safe directions of the Pareto front that the map shows: all, or the best-ranked that keep apart."""
+    front = np.flatnonzero(candidates.ranking.pareto & candidates.safe)
+    front = front[np.argsort(candidates.ranking.rank[front], kind="stable")]
+    places = view.place(candidates.theta[front], candidates.beta[front])
+    alone = _apart(places, SAME)
+    front, places = front[alone], places[alone]
+    rows, spacing = front, SPACING
+    while len(rows) > MOST_DOTS:
+        rows, spacing = front[_apart(places, spacing)], spacing * WIDER
+    return ShownFront(rows, len(front))
+
+
+def _apart(places: Floats, spacing: float) -> Ints:
+    """Which of the points (n, 2) lie no nearer than a distance to any that was kept before them."""
+    kept: list[int] = []
+    for i, place in enumerate(places):
+        if not kept or np.linalg.norm(places[kept] - place, axis=1).min() >= spacing:
+            kept.append(i)
+    return np.array(kept, dtype=np.int64)
+
+
+HEIGHT = 1222
+
+POINT = 130 / 72
+"""Pixels: a printer's point."""
+
+MIDDLE, RADIUS = (583.0, 642.0), 412
+"""Of the disc; labels stand around it."""
+
+SIDE_LEFT, SIDE_TOP, SIDE_WIDTH, SIDE_HEIGHT = 1158.0, 122.0, 515.0, 1039.0
+"""Of the column beside it."""
+
+RINGS_AT = np.radians(67.5)
+"""Where the rings' angles are written, counter-clockwise from the right."""
+
+
+class Label(NamedTuple):
+    """What is written on the map, and where, in the disc's radii (x right, y up)."""
+
+    x: float
+    y: float
+    text: str
+
+
+def disc_pixels(points: Any) -> Floats:
+    """Columns and rows of points of the unit disc (x right, y up), shape (..., 2)."""
+    return np.asarray(np.asarray(MIDDLE) + RADIUS * np.asarray(points, dtype=float) * [1.0, -1.0])
+
+
+def side_pixels(x: float, y: float) -> tuple[float, float]:
+    """Column and row of a place in the column beside the map, 0..1 to the right and down."""
+    return SIDE_LEFT + x * SIDE_WIDTH, SIDE_TOP + y * SIDE_HEIGHT
+
+
+def ring_radii(view: MapView) -> list[tuple[int, float]]:
+    """θ of the rings that are drawn, degrees, and their radius in the disc."""
+    top = float(np.degrees(view.theta_max))
+    spacing = 15 if top <= 100 else 30
+    return [(ring, ring / top) for ring in range(spacing, int(top) + 1, spacing)]

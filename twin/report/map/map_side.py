@@ -9,15 +9,22 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, Reason, Rgb
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.planning.search.doubt import chance_text
-from puncture_twin.planning.search.selection.choice import Pick, best_pick
-from puncture_twin.twin.report.canvas.canvas import Canvas, Words, rounded
-from puncture_twin.twin.report.canvas.fonts import Anchor, Face
-from puncture_twin.twin.report.map.chance_layer import chance_legend
-from puncture_twin.twin.report.map.front import shown_front
-from puncture_twin.twin.report.map.map_layout import POINT, SIDE_HEIGHT, SIDE_WIDTH, side_pixels
-from puncture_twin.twin.report.map.map_marks import mark_dot, mark_ring, mark_star
-from puncture_twin.twin.report.map.map_raster import HATCH, HATCH_AIR, SCALE_DIGITS, ClearanceScale, clearance_scale
+from puncture_twin.twin.report.canvas import Anchor, Canvas, Face, Words, rounded
+from puncture_twin.twin.report.map.chance_layer import chance_legend, mark_dot, mark_ring, mark_star
+from puncture_twin.twin.report.map.map_raster import (
+    HATCH,
+    HATCH_AIR,
+    POINT,
+    SCALE_DIGITS,
+    SIDE_HEIGHT,
+    SIDE_WIDTH,
+    ClearanceScale,
+    clearance_scale,
+    shown_front,
+    side_pixels,
+)
 from puncture_twin.twin.report.map_view import BEYOND, MapView, step_of
 from puncture_twin.twin.report.numbers import ReasonCount, arm_text, nearest_text, number, percent, reason_counts
 from puncture_twin.twin.report.palette import safe_shades

@@ -21,14 +21,13 @@ from scipy.spatial import ConvexHull
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.case.mount import mount_pose
-from puncture_twin.planning.collision.surroundings import case_boxes
+from puncture_twin.planning.case.settings import mount_pose
+from puncture_twin.planning.collision.workcell import case_boxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.place.mounts import Region
 from puncture_twin.planning.place.search import PlaceSearch, RatedPlacement
-from puncture_twin.twin.report.mount_text import direction_text, mounting_text
-from puncture_twin.twin.report.numbers import needle_text, target_text
+from puncture_twin.twin.report.numbers import direction_text, mounting_text, needle_text, target_text
 
 DPI = 110
 PANEL_INCHES = 4.3

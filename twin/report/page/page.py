@@ -1,7 +1,12 @@
-"""``report.html``: everything about a run on one page that needs no network."""
+"""``report.html``: everything about a run on one page that needs no network.
+
+The page's slices: CT and overlay apart, so that a page can show the CT in every window.
+"""
 
 from __future__ import annotations
 
+import base64
+import io
 import os
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -11,15 +16,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
+from PIL import Image
 
 from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.formats.dicom.storage import is_dicom_file
 from puncture_twin.planning.geometry.spaces import to_lps
-from puncture_twin.planning.search.bedside.entry_facts import EntryFacts
+from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.planning.search.doubt import Doubt
-from puncture_twin.planning.search.selection.choice import Pick, best_pick
-from puncture_twin.planning.search.selection.windows import find_windows
+from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.numbers import (
@@ -35,12 +42,18 @@ from puncture_twin.twin.report.numbers import (
 )
 from puncture_twin.twin.report.page import page_tables as tables
 from puncture_twin.twin.report.page.page_chances import chance_card, chances_section, rooms_section
-from puncture_twin.twin.report.page.page_charts import rehearsal_charts
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import scene_figure
-from puncture_twin.twin.report.page.page_slices import SHOWN_TONES, slices_data
 from puncture_twin.twin.report.page.page_tables import PROJECT, faint, table, two
-from puncture_twin.twin.report.page.template import Card, plotly_script, png_address, script_json, write_html
+from puncture_twin.twin.report.page.template import (
+    Card,
+    plotly_script,
+    png_address,
+    rehearsal_charts,
+    script_json,
+    write_html,
+)
+from puncture_twin.twin.report.slices.panel import TONES, Panel, grey_table, stored
 from puncture_twin.twin.report.slices.sheet import Slices
 
 
@@ -322,7 +335,7 @@ def budget_section(facts: Mapping[str, Any]) -> Markup:
     Args:
         facts: As ``register --json`` has them under ``budget``, of the direction that is shown.
     """
-    from puncture_twin.twin.report.budget_picture import budget_png  # with matplotlib, only where there is a budget
+    from puncture_twin.twin.report.error_pictures import budget_png  # with matplotlib, only where there is a budget
 
     now, best = facts["expected_mm"], facts["best"]
     won = now - best["expected_mm"]
@@ -344,3 +357,54 @@ def budget_section(facts: Mapping[str, Any]) -> Markup:
     )
     shown = Markup(form).format(text, png_address(budget_png(facts)))
     return shown + numbers + faint(f"Not modelled: {facts['not_modelled']}.")
+
+
+MOST_BYTES = 2_900_000
+"""Of all slices on a page: the directions beyond it are left out, the last windows first."""
+
+QUALITY, COLOURS = 72, 128
+"""Of the CT as JPEG, and of the overlay's palette: both were looked at."""
+
+OVERLAY_LEVEL = 6
+"""How hard overlays are packed: at 9 they take seven times as long and are a fifteenth smaller."""
+
+SHOWN_TONES = ("abdomen", "lung", "bone")
+
+
+def slices_data(shown: Sequence[Slices]) -> dict[str, Any]:
+    """What the page's script shows, of as many directions as `MOST_BYTES` takes; the first always."""
+    directions: list[dict[str, Any]] = []
+    size = 0
+    for one in shown:
+        data = _direction(one)
+        size += sum(len(part) for panel in data["panels"] for part in (panel["ct"], panel["over"])) + len(data["units"])
+        if directions and size > MOST_BYTES:
+            break
+        directions.append(data)
+    return {"directions": directions, "tones": {name: grey_table(TONES[name]) for name in SHOWN_TONES}}
+
+
+def _direction(one: Slices) -> dict[str, Any]:
+    pick = one.subject.pick
+    return {
+        **({} if pick is None else pick.candidates.at(pick.row)),
+        "panels": [_panel(panel) for panel in one.panels],
+        "units": "" if one.units is None else _png(one.units.quantize(COLOURS)),
+        "legend": [[name.replace("_", " "), css(colour)] for name, colour in one.legend],
+        "notes": list(one.notes),
+    }
+
+
+def _panel(panel: Panel) -> dict[str, str]:
+    ct = ""
+    if panel.hu is not None:
+        stream = io.BytesIO()
+        Image.fromarray(stored(panel.hu)).save(stream, format="JPEG", quality=QUALITY)
+        ct = "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+    return {"name": panel.plane.name, "ct": ct, "over": _png(Image.fromarray(panel.overlay).quantize(COLOURS))}
+
+
+def _png(image: Image.Image) -> str:
+    stream = io.BytesIO()
+    image.save(stream, format="PNG", compress_level=OVERLAY_LEVEL)
+    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")

@@ -14,9 +14,9 @@ from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.reasons import UNSEEN_AIR, Reason, css
-from puncture_twin.planning.plan.html import CLEARANCE_TEXT
+from puncture_twin.planning.plan.plan import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.selection.windows import MOST_WINDOWS, find_windows
+from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.numbers import (
     ReasonCount,
     arm_text,

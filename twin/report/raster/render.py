@@ -1,7 +1,15 @@
+# mypy: disable-error-code="no-untyped-def"
 """Pictures without a screen: triangles drawn into a sample grid with depth, and shaded, by compiled code.
 
 Opaque surfaces give one hit per sample; translucent surfaces (skin, corridor) are seen through, with up to
 ``MAX_SHELLS`` hits.
+
+What moves, drawn over what stands still, and taken away again: one picture after the other of the same view.
+
+The pixels of a picture, from the triangles that its samples show: lit, and blended from back to front; compiled.
+
+A pixel whose samples show the same smooth surfaces is lit and blended once. What is computed is rounded where what
+moves is drawn by way of arrays (`shade_nearest`, `shade_shells`, `recompose`): both make the same pixels.
 """
 
 from __future__ import annotations
@@ -9,6 +17,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
@@ -17,18 +26,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints32
+from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.report.raster.camera import ViewCamera
+from puncture_twin.twin.report.raster.camera import ViewCamera, blocked
 from puncture_twin.twin.report.raster.compositing import (
+    NOWHERE,
     SAMPLES,
+    PixelBox,
     RasterShot,
     Shells,
+    byte,
+    compose,
+    recompose,
 )
-from puncture_twin.twin.report.raster.finish import finish
-from puncture_twin.twin.report.raster.line_of_sight import blocked
 from puncture_twin.twin.report.raster.raster import depth_before, draw, outlines, sorted_by_band
-from puncture_twin.twin.report.raster.shading import corner_normals, flat_normals, rotated, shade_nearest, shade_shells
+from puncture_twin.twin.report.raster.shading import (
+    all_alike,
+    corner_normals,
+    flat_normals,
+    lit,
+    rotated,
+    shade_nearest,
+    shade_shells,
+)
 
 Floats32 = NDArray[np.float32]
 T = TypeVar("T")
@@ -298,3 +319,176 @@ def _in_bands(camera: ViewCamera, work: Callable[[int, slice], T]) -> list[T]:
 def _joined(arrays: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
     """Rows of three, one after the other; also of no array at all."""
     return np.concatenate([np.empty((0, 3), dtype=dtype), *arrays]).astype(dtype, copy=False)
+
+
+class MovingPicture:
+    """One view of what stands still, with bodies that move.
+
+    Args:
+        opaque: What stands still, CT frame.
+        translucents: What of it is see-through.
+        layers: What moves, each in its own frame. Of two in one place the first is seen.
+        camera: Its pixels are the picture's.
+    """
+
+    def __init__(self, opaque: Layer, translucents: Layer, layers: Sequence[Layer], camera: ViewCamera) -> None:
+        self._camera, self._layers = camera.finer(SAMPLES), tuple(layers)
+        self._together = Layer([surface for layer in layers for surface in layer.surfaces])
+        self._still, self._shells = opaque_shot(opaque, self._camera), shells_of(translucents, self._camera)
+        self._picture = compose(self._still, self._shells)
+        fine = self._camera
+        self._hidden = depth_before(self._still.depth, (fine.scale, fine.height, fine.width), (0, 0))
+        self._with_own_arrays()
+
+    @property
+    def still(self) -> NDArray[np.uint8]:
+        """The picture without what moves, shape (h, w, 3)."""
+        return self._picture
+
+    @property
+    def changed_pixels(self) -> PixelBox:
+        """Where the last picture may differ from `still`."""
+        left, top, right, bottom = self.changed
+        return PixelBox(left // SAMPLES, top // SAMPLES, -(-right // SAMPLES), -(-bottom // SAMPLES))
+
+    def another(self) -> MovingPicture:
+        """The same picture for another thread: what stands still is shared."""
+        made = copy(self)
+        made._with_own_arrays()
+        return made
+
+    def _with_own_arrays(self) -> None:
+        self._drawn = Drawn.empty(1, self._still.depth.shape)
+        self.shot = RasterShot(self._still.colour.copy(), self._still.depth.copy())
+        self.changed = NOWHERE
+
+    def at(self, T_ct_layers: Sequence[Floats]) -> NDArray[np.uint8]:
+        """The picture with what moves at its poses, each (4, 4), mm; shape (h, w, 3)."""
+        self._take_away()
+        seen = [posed(layer, self._camera, T) for layer, T in zip(self._layers, T_ct_layers, strict=True)]
+        joined = Posed(*(np.concatenate(parts) for parts in zip(*seen, strict=True)))
+        view = View(self._together, self._camera, joined)
+        self.changed = _box(view)
+        view.draw(self._hidden, self._drawn, (0, 0), view.spans)
+        view.shade(*self._parts(), (self.changed.y0, self.changed.x0))
+        picture = self._picture.copy()
+        recompose(picture, self.shot, self._shells, self._still.depth, self.changed)
+        return picture
+
+    def _take_away(self) -> None:
+        """What stands still, and nothing before it."""
+        drawn, shot = self._parts()
+        still = self._still.part(self.changed.slices)
+        shot.colour[:], shot.depth[:] = still.colour, still.depth
+        drawn.inverse[:], drawn.triangle[:] = 0.0, -1
+
+    def _parts(self) -> tuple[Drawn, RasterShot]:
+        """Where something changed."""
+        part = self.changed.slices
+        return self._drawn.part(part), self.shot.part(part)
+
+
+def _box(view: View) -> PixelBox:
+    """The part of a picture in which a view may show something, whole pixels."""
+    if len(view.spans) == 0:
+        return NOWHERE
+    first, last, begin, end = view.spans[:, 1:].T
+    top, left = (int(low.min()) // SAMPLES * SAMPLES for low in (first, begin))
+    return PixelBox(left, top, int(end.max()) + 1, int(last.max()) + 1)
+
+
+ALL = SAMPLES * SAMPLES
+"""Samples of a pixel."""
+
+
+@allocation_free(nogil=True, error_model="numpy")
+def finish(solid, glass, light, grid, corner, behind, shells, background, held, pixels):
+    """Light and blend every pixel of a part of a picture.
+
+    Args:
+        solid: Of the opaque layer, points (n, 3), faces (m, 3), bodies (m,), normals (n, 3), flats (m, 3), colours
+            (b, 3), alphas (b,) and rims (b,), as `shade_shells` takes them.
+        glass: The same of the see-through layer.
+        light: Three numbers, unit, toward the lamp, camera's frame.
+        grid: Samples per unit of x and y, rows, columns of the whole picture.
+        corner: Row and column of the picture at which the part begins, in samples; multiples of ``SAMPLES``.
+        behind: Shape (1, h, w), the triangle of ``solid`` that each sample shows, -1 for none.
+        shells: Shape (k, h, w), those of ``glass`` before it, nearest first.
+        background: Three float32, the colour where nothing is.
+        held: Shape (k + 1, ALL, 4), float32, to work in.
+        pixels: Shape (h / SAMPLES, w / SAMPLES, 3), uint8, written to.
+    """
+    for i in range(pixels.shape[0]):
+        for j in range(pixels.shape[1]):
+            place = i * SAMPLES, j * SAMPLES
+            for s in range(ALL):
+                held[0, s, 0], held[0, s, 1], held[0, s, 2] = background
+            used = _shade(held, 0, solid, light, grid, corner, behind, 0, place)
+            count = 0
+            while count < len(shells):
+                found = _shade(held, count + 1, glass, light, grid, corner, shells, count, place)
+                if found == 0:
+                    break
+                used, count = max(used, found), count + 1
+            red, green, blue = _blended(held, count, used)
+            pixels[i, j, 0], pixels[i, j, 1], pixels[i, j, 2] = byte(red), byte(green), byte(blue)
+
+
+@allocation_free(nogil=True, error_model="numpy", forceinline=True)
+def _shade(held, layer, look, light, grid, corner, triangle, k, place):
+    """Colour and opacity of what a pixel shows of a layer.
+
+    Returns:
+        0 where it shows nothing, 1 where all samples show one smooth surface, and else 2.
+    """
+    top, left = place
+    scale, height, width = grid
+    if all_alike(triangle[k], top, top + SAMPLES, left, left + SAMPLES, look[2], look[4]):
+        x = (corner[1] + 0.5 * (left + left + SAMPLES) - width / 2) / scale
+        y = (height / 2 - corner[0] - 0.5 * (top + top + SAMPLES)) / scale
+        _shade_one(held, layer, 0, look, light, triangle[k, top, left], x, y)
+        for s in range(1, ALL):
+            for c in range(4):
+                held[layer, s, c] = held[layer, 0, c]
+        return 1
+    found = 0
+    for s in range(ALL):
+        row, column = top + s // SAMPLES, left + s % SAMPLES
+        f = triangle[k, row, column]
+        if f >= 0:
+            x = (corner[1] + column + 0.5 - width / 2) / scale
+            y = (height / 2 - (corner[0] + row) - 0.5) / scale
+            _shade_one(held, layer, s, look, light, f, x, y)
+            found = 2
+        elif layer > 0:
+            held[layer, s, 3] = 0.0
+    return found
+
+
+@allocation_free(nogil=True, error_model="numpy", forceinline=True)
+def _shade_one(held, layer, s, look, light, f, x, y):
+    """Colour and opacity of one sample."""
+    points, faces, bodies, normals, flats, colours, alphas, rims = look
+    tone, shine, facing = lit(points, normals, flats, faces, f, x, y, light)
+    body, edge_on = bodies[f], 1.0 - facing
+    # A shell seen edge-on is thicker along the ray: glass-like outlines help to read its shape.
+    held[layer, s, 3] = min(1.0, alphas[body] * (1.0 + rims[body] * edge_on * edge_on * edge_on))
+    for c in range(3):
+        held[layer, s, c] = min(colours[body, c] * tone + shine, 255.0)
+
+
+@allocation_free(nogil=True, error_model="numpy", forceinline=True)
+def _blended(held, count, used):
+    """The sums over a pixel's samples of what so many shells leave of the layer behind them."""
+    red, green, blue = 0.0, 0.0, 0.0
+    samples = ALL if used == 2 else 1
+    for s in range(samples):
+        x, y, z = held[0, s, 0], held[0, s, 1], held[0, s, 2]
+        for k in range(count, 0, -1):
+            alpha = held[k, s, 3]
+            x += alpha * (held[k, s, 0] - x)
+            y += alpha * (held[k, s, 1] - y)
+            z += alpha * (held[k, s, 2] - z)
+        red, green, blue = red + x, green + y, blue + z
+    often = ALL / samples
+    return often * red, often * green, often * blue

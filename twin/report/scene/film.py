@@ -25,8 +25,7 @@ from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.compositing import PixelBox
-from puncture_twin.twin.report.raster.moving import MovingPicture
-from puncture_twin.twin.report.raster.render import Layer, Surface
+from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
 from puncture_twin.twin.report.scene.film_file import Frame, Part, Pixels, write_gif, write_mp4
 from puncture_twin.twin.report.scene.film_text import BELOW, FrameText, FrameWords, model_note
 from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, needle_bodies, patient, room

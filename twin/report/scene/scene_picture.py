@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.selection.choice import Pick, best_pick
+from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate, palette
 from puncture_twin.twin.report.numbers import nearest_text, number, target_text
 from puncture_twin.twin.report.raster.camera import ViewCamera

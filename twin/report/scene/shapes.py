@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import outward
-from puncture_twin.planning.geometry.frames import frame_about
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box as box
-from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import step_of
 

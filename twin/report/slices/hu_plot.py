@@ -9,9 +9,8 @@ from PIL import Image
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
-from puncture_twin.planning.search.along_path import BEYOND_SKIN_MM, Stretch, stretches
-from puncture_twin.twin.report.canvas.canvas import BLACK, Canvas, Words
-from puncture_twin.twin.report.canvas.ticks import ticks
+from puncture_twin.planning.search.bending import BEYOND_SKIN_MM, Stretch, stretches
+from puncture_twin.twin.report.canvas import BLACK, Canvas, Words, ticks
 from puncture_twin.twin.report.palette import TARGET_POINT
 from puncture_twin.twin.report.slices.subject import Subject
 

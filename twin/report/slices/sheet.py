@@ -13,10 +13,9 @@ from puncture_twin.twin.report.annotate import FAINT, legend, write
 from puncture_twin.twin.report.numbers import number, target_text
 from puncture_twin.twin.report.palette import PNG_LEVEL, TARGET_POINT
 from puncture_twin.twin.report.slices.hu_plot import draw_hu_plot
-from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, Panel, draw_panel
+from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, TONES, Panel, Tone, draw_panel
 from puncture_twin.twin.report.slices.planes import body_planes, needle_planes
 from puncture_twin.twin.report.slices.subject import Subject
-from puncture_twin.twin.report.slices.tones import TONES, Tone
 
 WITHOUT_CT: Rgb = (44, 47, 54)
 """Behind the outlines of a case without CT."""

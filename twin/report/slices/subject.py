@@ -12,8 +12,8 @@ from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, OUTSIDE_BODY
 from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
-from puncture_twin.planning.search.bending.insertion import insertion_along
-from puncture_twin.planning.search.selection.choice import Pick
+from puncture_twin.planning.search.bending import insertion_along
+from puncture_twin.planning.search.choice import Pick
 from puncture_twin.twin.report.numbers import clearance_text, number
 from puncture_twin.twin.report.palette import OUTSIDE, organ_colours
 

@@ -19,8 +19,7 @@ from scipy.optimize import brentq
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
-from puncture_twin.twin.guidance.stereo.cameras.lens import distortion_slope, undistort
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, distortion_slope, tangent_axes, undistort
 
 CELLS = 4
 """Cells per pixel and axis."""

@@ -17,16 +17,19 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.stereo.ball.ball_edges import (
+    Circle,
     Edges,
     Grey,
     Spokes,
+    cone,
+    consensus,
     find_edges,
     grey_part,
+    refit,
     visible_fraction,
 )
 from puncture_twin.twin.guidance.stereo.ball.ball_image import Picture
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
-from puncture_twin.twin.guidance.stereo.cameras.circle import Circle, cone, consensus, refit
 
 Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low_contrast"]
 

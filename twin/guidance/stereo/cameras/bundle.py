@@ -22,10 +22,8 @@ from scipy.optimize import least_squares
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.geometry.rotations import exp_rotation, left_jacobian, skew
-from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope, distort
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose, skew
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, coefficient_slope, distort
 
 CAMERA_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "wx", "wy", "wz", "tx", "ty", "tz")
 """Order of a camera's parameters: px, 1, rad, mm; w and t turn and move the camera's frame (T_camera_c)."""

@@ -26,7 +26,7 @@ from puncture_twin.twin.guidance.stereo.cameras.bundle import (
     adjust,
 )
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.cameras.dlt import LinearFit, decompose, fit_matrix, project
+from puncture_twin.twin.guidance.stereo.cameras.triangulation import LinearFit, decompose, fit_matrix, project
 
 MIN_POINTS = 6
 """Eleven unknowns, two equations per point."""

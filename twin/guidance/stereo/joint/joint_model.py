@@ -5,6 +5,15 @@ the ball at every stay. Known are the ball and marker pixels, the measuring arm'
 what the arm was commanded, and how far each of these may be off, as the case declares it. Each residual is divided by
 its standard deviation, so the normal matrix is Fisher's information and its inverse the Cramer-Rao bound (van Trees'
 for what has a declared deviation). That is counted in deviations, so that one of 0 fixes it.
+
+The statistically best estimate of ball and target, and the bound that no estimate can beat.
+
+The chain of the paper calibrates, triangulates and maps one after the other, and each step forgets what the others
+know: the servo's own images also see the cameras, the arm's commands also see the ball. Here everything that was
+measured is adjusted together (`joint_model`). With normal errors and small curvature that attains the
+Cramer-Rao bound, which is the same normal matrix taken at the truth.
+
+How an arm that errs holds its rod: ball and flange, and how each of 26 errors moves them.
 """
 
 from __future__ import annotations
@@ -15,16 +24,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.arm.kinematics import FREE_D, PARAMETERS, erring_arm
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.geometry.gauss_newton import System
-from puncture_twin.planning.geometry.rigid import apply, pose, rotated_about
-from puncture_twin.planning.geometry.rotations import exp_rotation
-from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.cameras.lens import coefficient_slope
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotated_about
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, coefficient_slope
 from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
-from puncture_twin.twin.guidance.stereo.joint.erring_rod import N_ROD, RodPoses, rod_poses
-from puncture_twin.twin.guidance.stereo.mapping import turn_and_shift_slopes
-from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_jacobian
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_jacobian, turn_and_shift_slopes
 
 PER_CAMERA = 13
 """Focal length, principal point, four of the lens, turn, shift: square pixels are known."""
@@ -278,3 +285,155 @@ def _roots(covariance: Floats) -> Floats:
 def _whitened(missed: Floats, J: Floats, roots: Floats) -> tuple[Floats, Floats]:
     """Rows of the system from misses (n, d), slopes (n, d, N) and roots (n, d, d)."""
     return np.einsum("nij,nj->ni", roots, missed).ravel(), (roots @ J).reshape(-1, J.shape[-1])
+
+
+MAX_ITERATIONS = 30
+ARRIVED = 1e-4
+"""A step of the adjustment whose every residual changes by less than this standard deviation has arrived."""
+
+UNSETTLED = "the joint adjustment does not settle: a measurement is far off, or the cameras see too little"
+
+
+class Offset(NamedTuple):
+    """Target minus ball, what the servo takes to zero; C."""
+
+    ball_c: Floats
+    """Shape (3,), mm."""
+    target_c: Floats
+    """Shape (3,), mm."""
+    ball_covariance: Floats
+    """Shape (3, 3), mm^2."""
+    target_covariance: Floats
+    """Shape (3, 3), mm^2."""
+    covariance: Floats
+    """Shape (3, 3), mm^2: of target minus ball; less than the sum where both err together."""
+
+    def rms_mm(self) -> float:
+        """Root of the mean squared length of the error of target minus ball, mm."""
+        return float(np.sqrt(np.trace(self.covariance)))
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """The joint estimate, or the truth with its bound.
+
+    Attributes:
+        model: The problem.
+        unknowns: Their values.
+        covariance: Shape (N, N): of the unknowns, by Fisher's information.
+        chi2: Sum of the squared residuals.
+        freedom: Their number, less that of the unknowns: what chi2 is on average if the declaration holds.
+        iterations: Steps taken.
+    """
+
+    model: JointModel
+    unknowns: Unknowns
+    covariance: Floats
+    chi2: float
+    freedom: int
+    iterations: int
+
+    def offset(self, stay: int, target_m: Floats) -> Offset:
+        """Ball at one stay and a target of the image, with their covariances.
+
+        Args:
+            stay: Which of the stays; -1 is the last.
+            target_m: Shape (3,), mm.
+        """
+        x = self.unknowns
+        stay = stay % len(x.balls_c)
+        target = apply(self.model.pose_of_head(x), target_m)
+        ball_rows = np.zeros((3, len(self.covariance)))
+        start = x.span("balls_c").start + 3 * stay
+        ball_rows[:, start : start + 3] = np.eye(3)
+        target_rows = np.zeros_like(ball_rows)
+        target_rows[:, x.span("head")] = self.model.head_slopes(x, target[None])[0]
+        ball, aim, both = (
+            rows @ self.covariance @ rows.T for rows in (ball_rows, target_rows, target_rows - ball_rows)
+        )
+        return Offset(x.balls_c[stay], target, ball, aim, both)
+
+
+def adjust(observed: Observed, guess: Guess, start: Unknowns | None = None) -> Adjusted:
+    """The joint estimate of everything, by Gauss-Newton.
+
+    Args:
+        observed: What was measured.
+        guess: Where poses are counted from; within a few degrees and centimetres.
+        start: Unknowns to start from; all errors 0 when None.
+
+    Raises:
+        NoAnswerError: It does not settle: some measurement is grossly wrong.
+    """
+    model = JointModel(observed, guess)
+    x = first_unknowns(observed, guess) if start is None else start
+    try:
+        fit = gauss_newton(x, model.linearised, Unknowns.moved, _arrived, MAX_ITERATIONS)
+    except (InputError, np.linalg.LinAlgError, ValueError) as error:  # a camera that cannot be, or what is no number
+        raise NoAnswerError(UNSETTLED) from error
+    if not (fit.settled and fit.determined):
+        raise NoAnswerError(UNSETTLED)
+    covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
+    chi2 = float(np.sum((fit.system.residuals + fit.system.slopes @ fit.step) ** 2))
+    return Adjusted(model, fit.estimate, covariance, chi2, _freedom(fit.system), fit.iterations)
+
+
+def _freedom(system: System[Unknowns]) -> int:
+    rows, unknowns = system.slopes.shape
+    return rows - unknowns
+
+
+def _arrived(system: System[Unknowns], step: Floats) -> bool:
+    return bool(np.abs(system.slopes @ step).max() < ARRIVED)
+
+
+def bound(observed: Observed, guess: Guess, truth: Unknowns) -> Adjusted:
+    """The Cramer-Rao bound: Fisher's information at the truth. ``observed`` says who measured what, and how well.
+
+    Args:
+        observed: The measurements, of which only the covariances, commands and counts matter.
+        guess: What the true poses are counted from.
+        truth: The true unknowns.
+    """
+    model = JointModel(observed, guess)
+    system = model.linearised(truth)
+    covariance = np.asarray(np.linalg.inv(system.information), dtype=np.float64)
+    chi2 = float(system.residuals @ system.residuals)
+    return Adjusted(model, truth, covariance, chi2, _freedom(system), 0)
+
+
+FLANGE_ERRORS = PARAMETERS["joint"].stop
+"""Of these move the flange: 23."""
+
+N_ROD = PARAMETERS["tip_offset"].stop
+"""a1..a6, d1, d3..d6, alpha1..alpha6, six zeros of the joints, the ball on the flange: what moves the ball."""
+
+
+class RodPoses(NamedTuple):
+    """How an arm that errs holds its rod, base frame."""
+
+    ball: Floats
+    """Shape (s, 3), mm."""
+    slopes: Floats
+    """Shape (s, 6, 26): shift of the ball (mm) and turn of the flange (rad) per unit of each parameter's error."""
+    R_base_flange: Floats
+    """Shape (s, 3, 3)."""
+
+
+def rod_poses(rod: CarriedRod, eta: Floats, q: Floats) -> RodPoses:
+    """Ball and flange at configurations (s, 6), rad, of an arm with errors (26,), mm and rad.
+
+    Each error shifts or turns all that follows it (Mooring, Roth, Driels 1991; `error_jacobian`).
+    """
+    poses = erring_arm(rod.model, eta[:FLANGE_ERRORS]).link_poses(q)
+    origins, axes = poses[..., :3, 3], poses[..., :3, :3]
+    R = axes[:, 6]
+    ball = origins[:, 6] + R @ (eta[FLANGE_ERRORS:] + np.array([0.0, 0.0, rod.rod_mm]))
+    x, z = axes[:, 1:, :, 0], axes[:, :-1, :, 2]
+    twist = np.cross(x, ball[:, None] - origins[:, 1:])
+    zero = np.cross(z, ball[:, None] - origins[:, :-1])
+    slopes = np.zeros((len(q), 6, N_ROD))
+    slopes[:, :3] = np.concatenate([x, z[:, list(FREE_D)], twist, zero, R.swapaxes(1, 2)], axis=1).swapaxes(1, 2)
+    slopes[:, 3:, PARAMETERS["twist"]] = x.swapaxes(1, 2)
+    slopes[:, 3:, PARAMETERS["joint"]] = z.swapaxes(1, 2)
+    return RodPoses(ball, slopes, R)

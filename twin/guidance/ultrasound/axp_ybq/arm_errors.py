@@ -21,12 +21,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.error_jacobian import PARAMETERS, error_jacobian
-from puncture_twin.planning.arm.stated_arm import check_flanges
+from puncture_twin.planning.arm.kinematics import PARAMETERS, check_flanges, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rotations import exp_rotation
+from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 N_ARM = PARAMETERS["joint"].stop

@@ -7,14 +7,16 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import (
-    Calibration,
-    calibration_of,
-    with_length,
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibration_of, with_length
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
+    DIRECTION,
+    LEAST_POSES,
+    LEAST_POSES_KNOWN_TIP,
+    Estimate,
+    active_columns,
+    closed_form,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import LEAST_POSES, LEAST_POSES_KNOWN_TIP, closed_form
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, needle_direction
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate, active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import refitted
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability, require_observable
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit, robust_fit

@@ -10,18 +10,27 @@ from scipy.stats import chi2, f
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.findings import Finding, Severity
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.geometry.rotations import log_rotation
+from puncture_twin.planning.geometry.rigid import log_rotation, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, direction_findings
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, PARAMETERS, T_Q, Estimate, tangent_basis
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.image_errors import ImageErrors, image_errors
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
+    DIRECTION,
+    PARAMETERS,
+    T_Q,
+    Estimate,
+    tangent_basis,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
+    SeenDirection,
+    direction_findings,
+    linearised_tip,
+    needle_in_image,
+    tip_residuals,
+)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import SmallSample, small_sample
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, linear_model
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit, weighed
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, needle_in_image, tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import ImageErrors, RobustFit, image_errors, weighed
 
 LARGEST_RATIO = 1.1
 """Chi-squared over its freedom from which on a declaration is doubted: arms declared half as large as they are give

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.stats import f
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import DIRECTION
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import settled
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import LEAST_MM, UNWEIGHTED, Problem, Spread
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Fitted, RobustFit, weighed

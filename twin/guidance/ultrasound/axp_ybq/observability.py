@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rotations import exp_rotation, log_rotation, skew
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import nearest_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
+from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, skew
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
     LENGTH_MM,
     T_Q,
     T_X,
@@ -33,10 +32,11 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import (
     W_X,
     W_Y,
     Estimate,
+    nearest_rotation,
     parameter_units,
 )
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import linearised_tip, needle_in_image, tip_points
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import linearised_tip, needle_in_image, tip_points
 
 LEAST_RATIO = 9e-3
 """Below it the calibration is refused: constant insertion angle 1e-16, with noise 4e-4; 45 +- 1 deg 3.4e-3 to 4.4e-3,

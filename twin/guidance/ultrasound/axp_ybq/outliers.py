@@ -14,7 +14,8 @@ from scipy.special import gammaincinv
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import facing
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
     LinearModel,
     Problem,
@@ -23,7 +24,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
     median_spread,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit, refine, weighed
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import facing
 
 FALSE_ALARMS = 0.01
 """Chance that a recording without outliers loses a pose."""

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.geometry.rotations import skew
+from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import ArmErrors
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import HALF_NORMAL
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.estimate import DIRECTION, Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import DIRECTION, Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
+    HALF_NORMAL,
     Linearised,
     across,
     direction_residuals,
@@ -27,6 +26,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.residuals import (
     tip_points,
     tip_residuals,
 )
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 
 Weights = Floats | Bools
 

@@ -16,7 +16,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
-from puncture_twin.planning.formats.joint_readings import joint_readings
+from puncture_twin.planning.formats.points import joint_readings
 
 OPTIONAL = ("v", "shaft_mm", "q_probe", "q_needle", "turn_probe", "turn_needle")
 """What a recording may hold beside both flanges and the tip: arrays with one row per pose."""

@@ -1,0 +1,313 @@
+"""What a cohort is made of: a folder, a CSV, or a TOML file with patterns and grids of options.
+
+A cohort as ``cohort.toml``: patterns of cases, and a grid of options that each of them is run with.
+
+One case of a cohort, before anything of it has been read.
+"""
+
+from __future__ import annotations
+
+import csv
+import glob
+import io
+import math
+import os
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, NoReturn
+
+from pydantic import Field
+
+from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.files import is_folder
+from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.provenance import Input, content_input
+from puncture_twin.planning.base.text_names import unprintable_texts
+from puncture_twin.planning.base.toml_file import SchemaOne, parse_toml
+from puncture_twin.planning.case.options import NO_OPTIONS, SECTIONS, CaseOptions, case_options
+from puncture_twin.planning.case.toml_types import Section, Text
+
+CASE_FILE = "case.toml"
+ALLOWED = f"a folder with {CASE_FILE} files, a CSV with the header 'case', or a cohort.toml"
+MAX_FILE_BYTES = 200_000_000
+"""A million lines of two hundred characters."""
+
+
+def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]]:
+    """The cases of a cohort, in its order, and the file that lists them, if one does.
+
+    Args:
+        cohort: A folder: every ``case.toml`` below it. A ``.csv`` or ``.toml`` file: what it lists.
+
+    Raises:
+        InputError: Something else, a file that cannot be read whole, or no case at all.
+    """
+    inputs: tuple[Input, ...] = ()
+    if is_folder(cohort):
+        cases = _folder_cases(cohort)
+    else:
+        cases, inputs = _listed_cases(cohort)
+    if not 0 < len(cases) <= MOST_CASES:
+        what = f"holds {len(cases)} cases" if cases else "holds no case"
+        raise InputError(what, where=cohort, allowed=f"1 to {MOST_CASES} cases: {ALLOWED}")
+    for one in cases:
+        _check_path(one, cohort)
+    return tuple(cases), inputs
+
+
+def _check_path(case: CohortCase, cohort: Path) -> None:
+    """Refuse a path that no table can hold: a case that cannot be named would be lost."""
+    try:
+        str(case.path.absolute()).encode("utf-8")
+    except UnicodeEncodeError as error:
+        what = f"the path '{one_line(case.stated, 100)}' is no UTF-8"
+        raise InputError(what, where=cohort, allowed="cases whose paths are UTF-8") from error
+
+
+def _listed_cases(path: Path) -> tuple[list[CohortCase], tuple[Input, ...]]:
+    readers = {".csv": csv_cases, ".toml": toml_cases}
+    if path.suffix.lower() not in readers:
+        raise InputError("is no cohort", where=path, allowed=ALLOWED)
+    content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    return readers[path.suffix.lower()](content, path), (content_input("cohort", path.name, content),)
+
+
+def _folder_cases(cohort: Path) -> list[CohortCase]:
+    """Every case file below a folder, also behind links to folders, each folder once; none that cannot be looked into.
+
+    Raises:
+        InputError: A folder that cannot be read, or a link to nothing beside folders: a patient would be lost.
+    """
+    found, seen = [], set[str]()
+    for folder, below, files in os.walk(cohort, followlinks=True, onerror=_refuse_unreadable):
+        real = os.path.realpath(folder)
+        if real in seen:
+            below.clear()
+            continue
+        seen.add(real)
+        below.sort()
+        if CASE_FILE in files:
+            path = Path(folder) / CASE_FILE
+            found.append(CohortCase(path.relative_to(cohort).as_posix(), path))
+        elif below and (lost := [one for one in files if not (Path(folder) / one).exists()]):
+            _refuse(f"'{one_line(lost[0], 100)}' is a link to what is not there", folder)
+    return sorted(found, key=lambda one: one.stated)
+
+
+def _refuse_unreadable(error: OSError) -> NoReturn:
+    _refuse(f"cannot be read ({error.strerror})", str(error.filename))
+
+
+def _refuse(what: str, where: str) -> NoReturn:
+    raise InputError(what, where=where, allowed="folders of patients that can be read", code="cohort_not_whole")
+
+
+CASE, NAME, TARGET = "case", "name", "target"
+ALLOWED_COLUMNS = f"{CASE}, {NAME}, {TARGET}, and options as KIND.KEY (KIND one of {', '.join(SECTIONS)})"
+LONGEST_CELL = 20_000
+
+
+def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
+    """The cases that a CSV lists.
+
+    Args:
+        content: The whole file.
+        path: Its name; cases are relative to its folder.
+
+    Raises:
+        InputError: No column ``case``, an unknown column, or a line that cannot be used; names the line.
+    """
+    rows = _rows(content, path)
+    header = _header(next(rows, []), path)
+    cases = []
+    for row in rows:
+        where = f"{path}: line {rows.line_num}"
+        if not any(row):
+            continue
+        if len(row) != len(header):
+            raise InputError(f"{len(row)} cells", where=where, allowed=f"{len(header)}, as in the header")
+        cases.append(_case(dict(zip(header, row, strict=True)), path, where))
+    return cases
+
+
+def _rows(content: bytes, path: Path) -> Any:
+    """The lines, as a reader that counts them."""
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"is not UTF-8 ({error})", where=path, allowed="a CSV in UTF-8") from error
+    if "\0" in text or max(map(len, text.splitlines()), default=0) > LONGEST_CELL:
+        raise InputError("is no CSV", where=path, allowed=f"text, lines of at most {LONGEST_CELL} characters")
+    return csv.reader(io.StringIO(text), strict=False)
+
+
+def _header(row: list[str], path: Path) -> list[str]:
+    header = [cell.strip() for cell in row]
+    if CASE not in header:
+        raise InputError(f"has no column '{CASE}'", where=f"{path}: line 1", allowed=ALLOWED_COLUMNS)
+    for name in header:
+        kind, _, key = name.partition(".")
+        if name not in (CASE, NAME, TARGET) and not (kind in SECTIONS and key):
+            raise InputError(f"column '{name}' is not known", where=f"{path}: line 1", allowed=ALLOWED_COLUMNS)
+        if header.count(name) > 1:
+            raise InputError(f"column '{name}' stands twice", where=f"{path}: line 1", allowed="each column once")
+    return header
+
+
+def _case(cells: dict[str, str], path: Path, where: str) -> CohortCase:
+    stated = cells[CASE]
+    if not stated.strip() or any(unprintable_texts(cells)):
+        raise InputError("has no case that can be printed", where=where, allowed="the path of a case")
+    return CohortCase(stated, path.parent / stated.strip(), cells.get(NAME, "").strip(), _options(cells, where))
+
+
+def _options(cells: dict[str, str], where: str) -> CaseOptions:
+    sections: dict[str, dict[str, Any]] = {}
+    if cells.get(TARGET, "").strip():
+        sections["target"] = target_option(cells[TARGET].strip())
+    for name, cell in cells.items():
+        kind, _, key = name.partition(".")
+        if key and cell.strip():
+            sections.setdefault(kind, {})[key] = _value(cell.strip())
+    return case_options(sections, where=where)
+
+
+def target_option(text: str) -> dict[str, Any]:
+    """Three numbers are a position in the case's space, mm; anything else is the name of a point."""
+    parts = re.split(r"[\s,;]+", text.strip("[]() "))
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        return {"name": text}
+    return {"position_mm": numbers} if len(numbers) == 3 else {"name": text}
+
+
+def _value(cell: str) -> Any:
+    """A cell as TOML reads it: a number, a list, a text in quotes; else it is a text as it stands."""
+    try:
+        return tomllib.loads(f"value = {cell}\n")["value"]
+    except (tomllib.TOMLDecodeError, KeyError, RecursionError):
+        return cell
+
+
+ALLOWED_TOML = "a cohort.toml with cases = [patterns] and, if wanted, tables of options"
+KEYS = "docs/how-to/cohorts.md"
+
+Choices = dict[Text, dict[str, Any]] | tuple[Any, ...]
+"""Options of one kind: by name, or as a list: texts are their own names, the rest is counted from 1."""
+
+AXES = {
+    "targets": "target",
+    "margins": "margins",
+    "mounts": "mount",
+    "needles": "needle",
+    "arms": "arm",
+    "errors": "errors",
+}
+"""Table of the cohort to the kind of its options."""
+
+
+class CohortFile(Section):
+    """The whole file."""
+
+    schema_: SchemaOne = Field(1, alias="schema")
+    cases: Annotated[tuple[Text, ...], Field(min_length=1)]
+    targets: Choices = ()
+    margins: Choices = ()
+    mounts: Choices = ()
+    needles: Choices = ()
+    arms: Choices = ()
+    errors: Choices = ()
+
+
+class _Choice(NamedTuple):
+    """One option of an axis of the grid."""
+
+    name: str
+    kind: str
+    values: Mapping[str, Any]
+
+
+def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
+    """The cases that a cohort file describes: every match of its patterns with every combination of its options.
+
+    Args:
+        content: The whole file.
+        path: Its name; patterns are relative to its folder.
+
+    Raises:
+        InputError: Not of this schema, a pattern that matches nothing, or too many combinations.
+    """
+    stated = parse_toml(content, path, CohortFile, allowed=ALLOWED_TOML, keys=KEYS)
+    found = _matches(stated.cases, path)
+    axes = [axis for name, kind in AXES.items() if (axis := _axis(getattr(stated, name), name, kind, path))]
+    count = len(found) * math.prod(len(axis) for axis in axes)
+    if count > MOST_CASES:
+        raise InputError(f"makes {count} cases", where=path, allowed=f"at most {MOST_CASES}")
+    combinations = [_combined(choices, path) for choices in product(*axes)]
+    return [CohortCase(one, path.parent / one, name, options) for one in found for name, options in combinations]
+
+
+def _matches(patterns: Sequence[str], path: Path) -> list[str]:
+    """What the patterns match, each once, in the order of the patterns."""
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        matches = sorted(glob.glob(pattern, root_dir=path.parent, recursive=True))  # noqa: PTH207  # absolute ones too
+        if not matches:
+            raise InputError(f"cases '{pattern}' matches nothing", where=path, allowed="patterns of existing cases")
+        found |= dict.fromkeys(matches)
+    return list(found)
+
+
+def _axis(stated: Any, axis: str, kind: str, path: Path) -> list[_Choice]:
+    if isinstance(stated, Mapping):
+        named = list(stated.items())
+    else:
+        named = [(one if isinstance(one, str) else str(number), one) for number, one in enumerate(stated, start=1)]
+    return [_Choice(name, kind, _table(values, kind, f"{path}: {axis}.{name}")) for name, values in named]
+
+
+def _table(values: Any, kind: str, where: str) -> Mapping[str, Any]:
+    """A table as it stands; of a target a point, of an arm its model, without the key."""
+    if isinstance(values, Mapping):
+        return values
+    if kind == "target" and isinstance(values, list | tuple):
+        return {"position_mm": list(values)}
+    if kind == "arm" and isinstance(values, str):
+        return {"model": values}
+    raise InputError(f"option '{kind}' is no table", where=where, allowed="keys and values, as in the case")
+
+
+def _combined(choices: Sequence[_Choice], path: Path) -> tuple[str, CaseOptions]:
+    name = ", ".join(_labels(choices))
+    return name, case_options({one.kind: dict(one.values) for one in choices}, where=str(path))
+
+
+def _labels(choices: Sequence[_Choice]) -> Iterator[str]:
+    for one in choices:
+        yield f"{one.kind} {one.name}"
+
+
+@dataclass(frozen=True)
+class CohortCase:
+    """One case with its options.
+
+    Attributes:
+        stated: As the cohort writes it.
+        path: The case file, or the folder that holds ``case.toml``.
+        name: What people call it; "" leaves it to the case.
+        options: What is stated in place of what the case states.
+    """
+
+    stated: str
+    path: Path
+    name: str = ""
+    options: CaseOptions = NO_OPTIONS
+
+
+MOST_CASES = 1_000_000
+"""Of one cohort: more is a slip in a grid of options."""

@@ -1,0 +1,641 @@
+"""``[[structure]]``, ``[[structures]]``, ``[ct]``: one structure, many by name patterns, and the CT beside them.
+
+``[search]`` and ``[ranking]``: which directions are searched, their limits, and what a good one is.
+
+``[needle]`` and ``[tissue.NAME]``: the needle, and what it bends in.
+
+``[robot]``: the arm, its speeds, and where its base is located.
+
+``[place]``: where ``place`` may stand the arm.
+
+Where the patient lies for the robot, as a case states it: by markers, or by a transform that somebody else found.
+
+``[errors]`` and ``[rehearsal]``: what is declared to err, and the truth that a rehearsal draws instead.
+
+The table ``[breathing]`` of a case. See docs/concepts/breathing.md.
+
+``[[obstacle]]`` and ``[gantry]``: what is located around the patient.
+
+The body of the user's own that the flange carries beside the needle and its holder.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+import scipy
+from pydantic import Field, Strict, model_validator
+
+from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, HIGHEST
+from puncture_twin.planning.arm.tool import ToolBody
+from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.provenance import InputFiles
+from puncture_twin.planning.case.toml_types import (
+    Anatomical,
+    Coordinate,
+    Degrees180,
+    Degrees360,
+    Label,
+    Length,
+    Margin,
+    Name,
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    Sextuple,
+    StructureName,
+    Text,
+    Vector,
+    Weight,
+    Yes,
+)
+from puncture_twin.planning.formats.meshes import mesh_files as meshes
+from puncture_twin.planning.geometry.rigid import inverse, pose
+from puncture_twin.planning.geometry.spaces import Space, Up, parse_unit
+
+MAX_STRUCTURES = 1000
+"""Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree."""
+
+Stated = Literal["none", "present"]
+"""What a person says of arms, or of a table, in an image."""
+
+Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
+
+MAX_LABEL_MAPS = 100
+"""Tables ``[[structures]]``, each with a label map of its own."""
+
+Patterns = Annotated[tuple[Text, ...], Field(max_length=MAX_STRUCTURES)]
+
+AIR_HU = -900.0
+"""Air is -1000; its noise in a mean over 3 mm is some 15, so that 100 is more than six times that. Foam of a mattress
+has -970 to -900: what is less dense than this is not told from air."""
+
+DENSE_HU = 250.0
+"""Cancellous bone starts at about 200; soft tissue with contrast in the venous phase ends at about 200."""
+
+
+class StructureSection(Section):
+    """One structure from one source."""
+
+    name: StructureName
+    role: Role
+    margin_mm: Margin | None = None
+    mesh: str | None = None
+    unit: str | None = None
+    space: str | None = None
+    up: Up | None = None
+    labelmap: str | None = None
+    label: Label | None = None
+    ct: str | None = None
+    cut: tuple[Literal["right", "left", "front", "back", "feet", "head"], ...] | None = None
+    hu: Annotated[Number, Field(ge=-1024, le=30_000)] | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        sources = [key for key in ("mesh", "labelmap", "ct") if getattr(self, key) is not None]
+        if len(sources) != 1:
+            raise ValueError(f"'{self.name}' needs exactly one of mesh, labelmap, ct; it has {sources or 'none'}")
+        if (self.labelmap is None) != (self.label is None):
+            raise ValueError(f"'{self.name}': labelmap and label go together")
+        if self.mesh is not None and self.unit is None:
+            raise ValueError(f'\'{self.name}\': a mesh needs unit = "mm", "cm" or "m"; no mesh file says it')
+        if self.mesh is None and (self.unit or self.space or self.up):
+            raise ValueError(f"'{self.name}': unit, space and up belong to a mesh; a volume says its own")
+        if self.ct is not None and self.role != "skin":
+            raise ValueError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"")
+        if self.cut is not None and self.role != "skin":
+            raise ValueError(f"'{self.name}': cut belongs to the skin: it says where the body was cut")
+        if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
+            raise ValueError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"')
+        return self
+
+
+class StructuresSection(Section):
+    """Many structures of one label map, a folder of masks, a SEG (DICOM or Slicer) or RTSTRUCT, by name pattern."""
+
+    labelmap: str | None = None
+    masks: str | None = None
+    seg: str | None = None
+    rtstruct: str | None = None
+    ct: str | None = None
+    naming: str | None = None
+    target: Patterns = ()
+    avoid: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
+    unknown: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
+    traverse: Patterns = ()
+    ignore: Patterns = ()
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        sources = [key for key in ("labelmap", "masks", "seg", "rtstruct") if getattr(self, key) is not None]
+        if len(sources) != 1:
+            raise ValueError(
+                "needs either labelmap (a file) or masks (a folder with one file a structure), not both; "
+                f"or seg (DICOM, or Slicer's .seg.nrrd), or rtstruct; it has {' and '.join(sources) or 'none'}"
+            )
+        if self.labelmap is None and self.naming is not None:
+            raise ValueError(
+                "naming belongs to labelmap; masks are named after their files, SEG and RTSTRUCT state their names"
+            )
+        if self.ct is not None and self.seg is None and self.rtstruct is None:
+            raise ValueError("ct belongs to seg and rtstruct: the DICOM series on which they were drawn")
+        return self
+
+    @property
+    def source(self) -> str:
+        """The file or the folder, as the case writes it."""
+        return self.labelmap or self.mask_set or ""
+
+    @property
+    def mask_set(self) -> str | None:
+        """The folder of masks, or the DICOM file that holds them; None for a label map."""
+        return self.masks or self.seg or self.rtstruct
+
+
+class CtSection(Section):
+    """The CT beside the structures: what it shows that they do not name. Hounsfield units."""
+
+    file: str | None = None
+    air_hu: Annotated[Number, Field(ge=-990, le=-300)] = AIR_HU
+    dense_hu: Annotated[Number, Field(ge=100, le=3000)] = DENSE_HU
+    margin_mm: Margin = 2.0
+    unnamed: Literal["unknown", "free"] = "unknown"
+    arms: Stated | None = None
+    table: Stated | None = None
+    beyond_mm: Annotated[Number, Field(ge=0, le=1000)] | Literal["all"] | None = None
+
+
+Chance = Annotated[Number, Field(ge=0, le=1)]
+
+MAX_DIRECTIONS = 1_000_000
+"""Rows of a search: a hemisphere at 0.2 degrees; 2 GB of table with 60 structures."""
+
+
+class EntryAxes(Section):
+    """An entry frame of one's own: where its z and x axes point; y = z × x."""
+
+    z: Anatomical | Vector
+    x: Anatomical | Vector
+
+
+class SearchSection(Section):
+    """The grid of directions and the limits at the skin."""
+
+    theta_deg: tuple[Degrees180, Degrees180] = (0.0, 90.0)
+    beta_deg: tuple[Degrees360, Degrees360] = (0.0, 360.0)
+    step_deg: Annotated[Number, Field(ge=0.05, le=45)] = 1.0
+    max_skin_angle_deg: Annotated[Number, Field(gt=0, le=90)] = 60.0
+    frame: Literal["ct", "bed"] | EntryAxes | None = None
+    trust_labels: Annotated[bool, Strict()] = False
+    min_hit: Chance | None = None
+    max_touch: Chance | None = None
+    max_touch_of: Annotated[dict[Text, Chance], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _grid_fits(self) -> Self:
+        rows = 1.0
+        for low, high in (self.theta_deg, self.beta_deg):
+            rows *= (high - low) / self.step_deg + 1
+        if rows > MAX_DIRECTIONS:
+            raise ValueError(f"step_deg {self.step_deg:g} makes {rows:,.0f} directions; {MAX_DIRECTIONS:,} at most")
+        return self
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> Self:
+        for key in ("theta_deg", "beta_deg"):
+            low, high = getattr(self, key)
+            if low > high:
+                raise ValueError(f"{key} [{low:g}, {high:g}] descends; it is [lowest, highest]")
+            if 0 < high - low < self.step_deg:
+                raise ValueError(f"step_deg {self.step_deg:g} is larger than the range {key} [{low:g}, {high:g}]")
+        return self
+
+
+class RankingSection(Section):
+    """Weights of the cost terms; each term lies in 0..1, see planning/search/ranking.py."""
+
+    clearance: Weight = 1.0
+    path_length: Weight = 0.5
+    skin_angle: Weight = 0.3
+    tissue: Weight = 0.5
+    reach: Weight = 0.5
+    safe_cone: Weight = 0.5
+
+    @model_validator(mode="after")
+    def _one_counts(self) -> Self:
+        if not any(getattr(self, name) > 0 for name in type(self).model_fields):
+            raise ValueError("every weight is 0; one at least is above")
+        return self
+
+
+Force = Annotated[Number, Field(ge=0, le=50)]
+Stiffness = Annotated[Number, Field(ge=0, le=100)]
+"""Soft tissue has 0.01 to 1, rubber some 10."""
+
+
+class NeedleSection(Section):
+    """The needle: lengths from the tip; the holder is what lies between shaft and flange."""
+
+    length_mm: Annotated[Number, Field(ge=20, le=1000)]
+    shaft_mm: Annotated[Number, Field(ge=10, le=1000)]
+    diameter_mm: Annotated[Number, Field(ge=0.1, le=20)]
+    standoff_mm: Annotated[Number, Field(ge=5, le=1000)] | None = None
+    skin_gap_mm: Annotated[Number, Field(ge=6, le=200)] = 10.0  # the least, along the needle; see standoff.py
+    holder_diameter_mm: Annotated[Number, Field(ge=1, le=200)] = 30.0
+    lengths_mm: tuple[Annotated[Number, Field(ge=20, le=1000)], ...] = ()
+    gauge: Annotated[int, Strict()] | None = None
+    solid: Annotated[bool, Strict()] | None = None
+    bevel_deg: Annotated[Number, Field(ge=0, le=10)] | None = None
+    modulus_gpa: Annotated[Number, Field(ge=1, le=1000)] | None = None
+
+    @model_validator(mode="after")
+    def _shaft_fits(self) -> Self:
+        if self.shaft_mm > self.length_mm:
+            raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
+        least = self.length_mm - self.shaft_mm + 10.0
+        if self.lengths_mm and (self.length_mm not in self.lengths_mm or min(self.lengths_mm) < least):
+            raise ValueError(f"lengths_mm holds length_mm, and none below {least:g}: the holder, and 10 mm of shaft")
+        if self.solid is not None and self.gauge is None:
+            raise ValueError("solid belongs to gauge; without one the shaft is solid, of diameter_mm")
+        return self
+
+
+class TissueSection(Section):
+    """One tissue."""
+
+    stiffness_n_mm2: Stiffness
+    cutting_n: Force = 0.0
+    friction_n_mm: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    capsule_n: Force = 0.0
+    capsule_mm: Annotated[Number, Field(ge=0, le=50)] = 0.0
+
+    @model_validator(mode="after")
+    def _capsule_is_whole(self) -> Self:
+        if (self.capsule_n > 0) != (self.capsule_mm > 0):
+            raise ValueError("capsule_n and capsule_mm go together: force at the rupture, and how far in it is")
+        return self
+
+
+class TargetSection(Section):
+    """The point to reach: coordinates, or a name in a file of points."""
+
+    position_mm: Vector | None = None
+    points: str | None = None
+    name: Text = "target"
+    structure: StructureName | None = None
+    hit_radius_mm: Annotated[Number, Field(gt=0, le=100)] | None = None
+
+    @model_validator(mode="after")
+    def _one_position(self) -> Self:
+        if (self.position_mm is None) == (self.points is None):
+            raise ValueError("needs either position_mm or points (a file, with the target's name), not both")
+        if self.structure is None and self.hit_radius_mm is None:
+            raise ValueError("needs structure, or hit_radius_mm where the target lies in no structure")
+        return self
+
+
+Turn = Annotated[Number, Field(ge=-720, le=720)]
+Turns = tuple[Turn, Turn, Turn, Turn, Turn, Turn]
+Speed = Annotated[Number, Field(gt=0, le=720)]
+Speeds = tuple[Speed, Speed, Speed, Speed, Speed, Speed]
+
+
+class LimitsSection(Section):
+    """The angles and speeds of six joints, from the base on; degrees."""
+
+    lowest_deg: Turns | None = None
+    highest_deg: Turns | None = None
+    max_speed_deg_s: Speeds | None = None
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> Self:
+        if (self.lowest_deg is None) != (self.highest_deg is None):
+            raise ValueError("lowest_deg and highest_deg go together")
+        for joint, (low, high) in enumerate(zip(self.lowest_deg or (), self.highest_deg or (), strict=True)):
+            if not low < high:
+                raise ValueError(f"joint {joint + 1}: lowest_deg {low:g} is not below highest_deg {high:g}")
+        return self
+
+
+class MountSection(Section):
+    """Where the robot's base stands in the CT, when no markers say it."""
+
+    position_mm: Vector
+    x_axis: Vector
+    z_axis: Vector
+
+
+class RobotSection(Section):
+    """The arm: one of the table, by its name, or one's own, by a URDF."""
+
+    model: str = "ur3"
+    urdf: str | None = None
+    flange: Text = FLANGE
+    limits: LimitsSection | None = None
+    home_deg: Sextuple | None = None
+    mount: MountSection | None = None
+    tip_speed_mm_s: Annotated[Number, Field(ge=1, le=HIGHEST.tip_speed_mm_s)] = DEFAULT_SPEEDS.tip_speed_mm_s
+    insertion_speed_mm_s: Annotated[Number, Field(ge=0.1, le=HIGHEST.insertion_speed_mm_s)] = (
+        DEFAULT_SPEEDS.insertion_speed_mm_s
+    )
+    joint_speed_fraction: Annotated[Number, Field(ge=0.01, le=1)] = DEFAULT_SPEEDS.joint_speed_fraction
+    joint_acceleration_fraction: Annotated[Number, Field(ge=0.01, le=1)] = DEFAULT_SPEEDS.joint_acceleration_fraction
+
+    @model_validator(mode="after")
+    def _one_arm(self) -> Self:
+        if self.urdf is not None and "model" in self.model_fields_set:
+            raise ValueError("model and urdf both say which arm it is; keep one")
+        if self.urdf is None and "flange" in self.model_fields_set:
+            raise ValueError("flange names a link of urdf, which is not there")
+        return self
+
+    @model_validator(mode="after")
+    def _insertion_is_the_slower(self) -> Self:
+        if self.insertion_speed_mm_s > self.tip_speed_mm_s:
+            raise ValueError(
+                f"insertion_speed_mm_s {self.insertion_speed_mm_s:g} is above tip_speed_mm_s {self.tip_speed_mm_s:g}"
+            )
+        return self
+
+
+Range = tuple[Coordinate, Coordinate]
+
+MountName = Literal["floor", "rail", "ceiling", "side"]
+
+
+class MountBounds(Section):
+    """Where a base of one kind may stand, seen from the target; what is left out follows from the arm's length."""
+
+    along_mm: Range | None = None
+    across_mm: Range | None = None
+    height_mm: Range | None = None
+
+    @model_validator(mode="after")
+    def _ranges_ascend(self) -> Self:
+        for key in ("along_mm", "across_mm", "height_mm"):
+            bounds = getattr(self, key)
+            if bounds is not None and bounds[0] > bounds[1]:
+                raise ValueError(f"{key} [{bounds[0]:g}, {bounds[1]:g}] descends; it is [lowest, highest]")
+        return self
+
+
+class PlaceSection(Section):
+    """Where ``place`` may stand the arm."""
+
+    mounts: tuple[MountName, ...] | None = None
+    step_mm: Annotated[Number, Field(ge=20, le=500)] = 150.0
+    table: Name = "table"
+    rail_gap_mm: Annotated[Number, Field(ge=0, le=1000)] = 110.0
+    up: Anatomical | Vector | None = None
+    along: Anatomical | Vector | None = None
+    floor: MountBounds = MountBounds()
+    rail: MountBounds = MountBounds()
+    ceiling: MountBounds = MountBounds()
+    side: MountBounds = MountBounds()
+
+    @model_validator(mode="after")
+    def _mounts_make_sense(self) -> Self:
+        if self.mounts is not None and (not self.mounts or len(set(self.mounts)) < len(self.mounts)):
+            raise ValueError(f"mounts {list(self.mounts)}: at least one, each once")
+        if self.rail.across_mm is not None:
+            raise ValueError("rail.across_mm: a rail lies beside the table; rail_gap_mm says how far")
+        return self
+
+
+RAS_OF_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Its own inverse."""
+NO_RESIDUALS = "stated transform {file}: no residuals, expected error unknown"
+
+_OF_MARKERS = ("method", "correct", "correct_joints_deg")
+_OF_COMPARISON = ("use", "fle_mm", "accept_residuals", "accept_symmetry")
+
+
+class RegistrationSection(Section):
+    """Markers seen in the CT and touched by the robot, or the transform between both in a file of ITK.
+
+    Markers beside a transform do not place the base: the transform is held against them.
+    """
+
+    method: Literal["triad", "rigid", "weighted", "affine"] | None = None
+    markers_ct: str | None = None
+    markers_base: str | None = None
+    use: tuple[Text, ...] | None = None
+    fle_mm: Positive | None = None
+    correct: Yes = False
+    correct_joints_deg: Sextuple | None = None
+    accept_residuals: Yes = False
+    accept_symmetry: Yes = False
+    transform: str | None = None
+    transform_maps: Literal["base_to_ct", "ct_to_base"] | None = None
+    base_axes: Literal["LPS", "RAS"] | None = None
+
+    @model_validator(mode="after")
+    def _corrected(self) -> Self:
+        if self.correct_joints_deg is not None and not self.correct:
+            raise ValueError("correct_joints_deg is the insertion that correct = true corrects for")
+        if self.correct and self.method not in {None, "weighted"}:
+            raise ValueError(f'correct = true has a fit of its own; method "{self.method}" has another')
+        return self
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        markers = [key for key in ("markers_ct", "markers_base") if getattr(self, key) is None]
+        if self.transform is None:
+            if markers:
+                raise ValueError(f"{' and '.join(markers)}: missing; markers_ct and markers_base, or transform")
+            if self.transform_maps or self.base_axes:
+                raise ValueError("transform_maps and base_axes belong to transform")
+            return self
+        if len(markers) == 1:
+            raise ValueError(f"{markers[0]}: missing; beside transform both lists of markers, which it is held against")
+        placing = (*_OF_MARKERS, *_OF_COMPARISON) if markers else _OF_MARKERS
+        given = [key for key in placing if getattr(self, key)]
+        if given:
+            raise ValueError(f"transform stands in place of markers; {', '.join(given)} belongs to markers")
+        if self.transform_maps is None:
+            raise ValueError(
+                'transform needs transform_maps = "base_to_ct" (as Slicer saves a transform that moves the CT to the '
+                'robot) or "ct_to_base": no file says which way it goes'
+            )
+        if self.base_axes is None:
+            raise ValueError(
+                'transform needs base_axes = "RAS" (the robot\'s x, y, z are what Slicer shows as R, A, S) or "LPS" '
+                "(they stand in the file as they are)"
+            )
+        return self
+
+
+class MarkerSection(RegistrationSection):
+    """The section where it names markers."""
+
+    markers_ct: str
+    markers_base: str
+
+
+def stated_base_ct(section: RegistrationSection, T_file: Floats) -> Floats:
+    """T_base_ct, shape (4, 4), mm, of a stated transform.
+
+    Args:
+        section: Says which way it goes, and what its coordinates on the robot's side are.
+        T_file: Shape (4, 4), what the file does to a point; rigid to the digits of its file.
+    """
+    U, _, Vt = np.linalg.svd(T_file[:3, :3])
+    T = pose(U @ Vt, T_file[:3, 3])
+    return _read_as(T, inverted=section.transform_maps == "base_to_ct", turned=section.base_axes == "RAS")
+
+
+def other_readings(section: RegistrationSection, T_base_ct: Floats) -> dict[str, Floats]:
+    """What T_base_ct would be with other values of ``transform_maps`` and ``base_axes``, by these keys as text.
+
+    Args:
+        section: As the case states it.
+        T_base_ct: Shape (4, 4), mm, by its own keys.
+    """
+    T = RAS_OF_LPS @ T_base_ct if section.base_axes == "RAS" else T_base_ct
+    maps = "ct_to_base" if section.transform_maps == "base_to_ct" else "base_to_ct"
+    axes = "LPS" if section.base_axes == "RAS" else "RAS"
+    inverted, turned = f'transform_maps = "{maps}"', f'base_axes = "{axes}"'
+    return {
+        inverted: _read_as(T, inverted=True, turned=section.base_axes == "RAS"),
+        turned: _read_as(T, inverted=False, turned=axes == "RAS"),
+        f"{inverted} and {turned}": _read_as(T, inverted=True, turned=axes == "RAS"),
+    }
+
+
+def _read_as(T: Floats, *, inverted: bool, turned: bool) -> Floats:
+    T = inverse(T) if inverted else T
+    return np.asarray(RAS_OF_LPS @ T if turned else T)
+
+
+Millimetres = Annotated[Number, Field(ge=0, le=100)]
+Degrees = Annotated[Number, Field(ge=0, le=10)]
+Cell = Annotated[Number, Field(gt=0, le=100)]
+
+
+class ErrorsSection(Section):
+    """The declared errors; what is left out takes its default, which for the CT follows from pixel and slices."""
+
+    ct_pixel_mm: Cell | None = None
+    ct_spacing_mm: Cell | None = None
+    ct_in_plane_mm: Millimetres | None = None
+    ct_slice_mm: Millimetres | None = None
+    bed_axis: Anatomical | Vector | None = None
+    touch_mm: Millimetres | None = None
+    target_mm: Millimetres | None = None
+    marker_noise: Literal["declared", "found"] = "declared"
+    arm: Literal["calibrated", "nominal"] = "calibrated"
+    link_mm: Millimetres | None = None
+    twist_deg: Degrees | None = None
+    joint_deg: Degrees | None = None
+    repeatability_deg: Degrees = 0.003
+    joint_drift_deg: Degrees | None = None
+    tip_offset_mm: Millimetres = 0.3
+    needle_direction_deg: Degrees = 0.2
+    surface_mm: Millimetres | None = None
+
+    @model_validator(mode="after")
+    def _cell_or_deviation(self) -> Self:
+        for cell, deviation in (("ct_pixel_mm", "ct_in_plane_mm"), ("ct_spacing_mm", "ct_slice_mm")):
+            if getattr(self, cell) is not None and getattr(self, deviation) is not None:
+                raise ValueError(f"{cell} and {deviation} state the same error; keep one")
+        return self
+
+
+class RehearsalSection(Section):
+    """What the twin's truth is drawn from; the planner never reads it."""
+
+    seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
+    truth_base: str | None = None
+    fle_ct_mm: NotNegative = 0.5
+    fle_touch_mm: NotNegative = 0.1
+    joint_offset_deg: NotNegative = 0.02
+    control: Literal["impedance", "admittance", "position"] = "impedance"
+    errors: ErrorsSection | None = None
+
+
+Position = Annotated[Number, Field(ge=0, le=1)]
+PatternWeight = Annotated[Number, Field(ge=0, le=2)]
+"""Of what moves more than the target, such as the dome of a liver over a lesion deep in it, a weight is above 1."""
+
+MOST_PATTERNS = 1000
+
+
+class BreathingSection(Section):
+    """The keys; positions s are 0 at exhale and 1 at full inhale."""
+
+    amplitude_mm: Annotated[Number, Field(ge=0, le=100)]
+    direction: Anatomical | Vector = "feet"
+    weights: Annotated[dict[Text, PatternWeight], Field(max_length=MOST_PATTERNS)]
+    phases: Annotated[int, Strict(), Field(ge=1, le=64)] = 8
+    exponent: Annotated[int, Strict(), Field(ge=1, le=6)] = 2
+    scanned_at: Position = 0.0
+    gate: Position | None = None
+
+    @model_validator(mode="after")
+    def _full_inhale_is_a_phase(self) -> Self:
+        if self.phases > 1 and self.phases % 2:
+            raise ValueError(f"phases {self.phases}: an even number, so that full inhale is one of them, or 1")
+        return self
+
+
+class ObstacleSection(Section):
+    """A box in the workcell (table, gantry side), axes parallel to its frame's."""
+
+    name: Name
+    frame: Literal["ct", "base"]
+    center_mm: Vector
+    size_mm: tuple[Length, Length, Length]
+
+
+class GantrySection(Section):
+    """A CT gantry: a wall with a round bore. ``axis`` and ``up`` are the bore's directions before the tilt."""
+
+    bore_diameter_mm: Annotated[Number, Field(ge=200, le=5000)]
+    center_mm: Vector
+    thickness_mm: Annotated[Number, Field(ge=10, le=5000)]
+    wall_mm: Annotated[Number, Field(ge=10, le=5000)] = 600.0
+    tilt_deg: Annotated[Number, Field(ge=-45, le=45)] = 0.0
+    axis: Anatomical | Vector | None = None
+    up: Anatomical | Vector | None = None
+
+
+TOOL_ROLE = "tool mesh"
+"""Of the file that decides a tool."""
+
+Beside = Annotated[Number, Field(ge=-1000, le=1000)]
+ToolTurn = Annotated[Number, Field(ge=-360, le=360)]
+
+
+class ToolSection(Section):
+    """A mesh and where it is on the flange: z along the needle, as the controller has it."""
+
+    mesh: str
+    unit: str
+    up: Up | None = None
+    position_mm: tuple[Beside, Beside, Beside] = (0.0, 0.0, 0.0)
+    rotation_deg: tuple[ToolTurn, ToolTurn, ToolTurn] = (0.0, 0.0, 0.0)
+
+
+def tool_of(section: ToolSection | None, files: InputFiles, path: Path) -> ToolBody | None:
+    """The tool's body; its file becomes an input of the case. None where the case names none.
+
+    Args:
+        section: As the case states it. It is turned about the flange's x, y and z, in this order, then moved.
+        files: The case's files.
+        path: The case file, for errors.
+
+    Raises:
+        InputError: A file that cannot be used, or a unit that is not known.
+    """
+    if section is None:
+        return None
+    unit, file = parse_unit(section.unit, where=f"{path}: tool.unit"), path.parent / section.mesh
+    data = files.read(TOOL_ROLE, section.mesh, max_bytes=meshes.MAX_FILE_BYTES, key="tool.mesh", where=path)
+    turn = scipy.spatial.transform.Rotation.from_euler("xyz", section.rotation_deg, degrees=True).as_matrix()
+    T = pose(turn, np.array(section.position_mm))
+    mesh = meshes.parse_mesh(data, file, unit=unit, space=Space.LOCAL, up=section.up).transformed(T)
+    return ToolBody(mesh, file, unit.mm, T, f"{path}: tool")

@@ -1,0 +1,432 @@
+"""One body of an arm as FCL objects that move with the joints.
+
+The bodies of an arm with its tool: links and tool of convex pieces, bare and padded; holder and needle.
+
+A shape of a body that FCL builds when it is first asked about it.
+
+Meshes as FCL sees them: surfaces, solids, and whether two of them touch.
+
+Prisms about cylinders.
+
+Spheres in a tree that enclose a body: what is clear of them is clear of the body.
+
+A sphere is convex, so it contains the convex hull of any points in it. A convex piece is cut by planes into smaller
+ones; the corners of each part are the piece's corners on that side and the points where its edges cross the plane;
+a sphere about those corners contains the part, and the parts together are the piece (docs/concepts/arm-collisions.md).
+
+The connected parts of a surface, and whether one lies within a convex piece, where surfaces do not touch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import islice, product
+from types import MappingProxyType
+from typing import NamedTuple
+
+import fcl
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from puncture_twin.planning.arm.links import LINK_NAMES, Link, collision_links
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined, packed_meshes, unpacked_meshes
+from puncture_twin.planning.geometry.rigid import pose
+
+BODY_NAMES = (*LINK_NAMES, "tool", "holder", "needle")
+"""The bodies of the arm, from the base on; not every arm has a tool."""
+
+FLANGE_FRAME = 6
+"""The frame of wrist 3, whose origin and axes are the flange's."""
+
+NEVER_TESTED: Mapping[tuple[str, str], str] = MappingProxyType(
+    {
+        ("base", "shoulder"): "joined by a joint: they overlap at every angle",
+        ("shoulder", "upper_arm"): "joined by a joint",
+        ("upper_arm", "forearm"): "joined by a joint",
+        ("forearm", "wrist_1"): "joined by a joint",
+        ("wrist_1", "wrist_2"): "joined by a joint",
+        ("wrist_2", "wrist_3"): "joined by a joint",
+        ("wrist_3", "tool"): "bolted together",
+        ("tool", "holder"): "bolted together",
+        ("tool", "needle"): "bolted together",
+        ("wrist_3", "holder"): "bolted together",
+        ("wrist_3", "needle"): "bolted together",
+        ("holder", "needle"): "bolted together",
+    }
+)
+"""Pairs that touch by construction, with the reason; of an own arm's neighbours what is not joined is tested."""
+
+NEVER_TOUCHING: Mapping[tuple[str, str], str] = MappingProxyType(
+    {
+        ("wrist_2", "holder"): "the holder begins at the flange, beyond wrist 2, and leads away from it at every angle",
+        ("wrist_2", "needle"): "as the holder",
+    }
+)
+"""Pairs that cannot touch where the arm ships with the program; wrist 2 of an own arm may carry a bracket."""
+
+
+class Shape(NamedTuple):
+    """A body for FCL: solid convex pieces, and one surface for the test against the skin."""
+
+    solids: tuple[Solid, ...]
+    surface: Solid
+    hulls: tuple[Floats, ...]
+    """For each solid, corners (n, 3), mm, of a convex hull that contains it, in the frame of the shapes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One body of the arm.
+
+    Attributes:
+        name: One of ``BODY_NAMES``.
+        frame: Index of its frame among ``link_poses``.
+        T_frame_body: Shape (4, 4), mm: its shapes in that frame.
+        bare: The body as it is.
+        full: The body grown by the padding; ``bare`` itself where there is none.
+        radius_mm: Every point of ``bare`` lies within this distance of the shapes' origin.
+    """
+
+    name: str
+    frame: int
+    T_frame_body: Floats
+    bare: Shape
+    full: Shape
+    radius_mm: float
+
+    @cached_property
+    def box(self) -> Floats:
+        """Shape (2, 3), mm: lowest and highest corner of a box about ``full``, in the frame of the shapes."""
+        return box_of(np.concatenate(self.full.hulls))
+
+    @property
+    def hollow(self) -> bool:
+        """Whether FCL sees no more than its surface against the skin."""
+        return self.full.surface not in self.full.solids
+
+    @cached_property
+    def half_spaces(self) -> tuple[Floats, ...]:
+        """Of each piece of ``full`` the half spaces whose intersection it is, (m, 4), in the frame of the shapes."""
+        return tuple(half_spaces(corners) for corners in self.full.hulls)
+
+    def pose(self, poses: Floats) -> fcl.Transform:
+        """Where ``link_poses`` (7, 4, 4) has the body's shapes."""
+        T = poses[self.frame] @ self.T_frame_body
+        return fcl.Transform(T[:3, :3], T[:3, 3])
+
+    def place(self, poses: Floats) -> None:
+        """Move the shapes to where ``link_poses`` (7, 4, 4) has them."""
+        transform = self.pose(poses)
+        for shape in (self.bare,) if self.full is self.bare else (self.bare, self.full):
+            for item in (*shape.solids, shape.surface):
+                item.place(transform)
+
+
+def link_body(link: Link, grown: Link) -> Body:
+    """A link as it is, and grown by the padding; the same object where there is none."""
+    bare = _link_shape(link)
+    full = bare if grown is link else _link_shape(grown)
+    radius_mm = float(np.linalg.norm(link.mesh.vertices, axis=1).max())
+    return Body(link.name, link.frame, np.eye(4), bare, full, radius_mm)
+
+
+def _link_shape(link: Link) -> Shape:
+    solids = tuple(Solid(partial(convex, piece)) for piece in link.pieces)
+    hulls = tuple(np.asarray(piece.vertices) for piece in link.pieces)
+    return Shape(solids, Solid(lambda: surface(joined(link.pieces))), hulls)
+
+
+def round_body(name: str, diameter_mm: float, span_mm: tuple[float, float], padding_mm: float) -> Body:
+    """A cylinder about the needle's axis, from one height above the flange to another, mm."""
+    length = span_mm[1] - span_mm[0]
+    T_flange_body = pose(np.eye(3), [0.0, 0.0, (span_mm[0] + span_mm[1]) / 2.0])
+    bare = _cylinder(diameter_mm / 2.0, length)
+    full = _cylinder(diameter_mm / 2.0 + padding_mm, length + 2.0 * padding_mm) if padding_mm else bare
+    radius_mm = float(np.hypot(diameter_mm, length)) / 2.0
+    return Body(name, FLANGE_FRAME, T_flange_body, bare, full, radius_mm)
+
+
+def _cylinder(radius_mm: float, length_mm: float) -> Shape:
+    solid = Solid(partial(fcl.Cylinder, radius_mm, length_mm))
+    return Shape((solid,), solid, (prism(radius_mm, length_mm),))
+
+
+def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...]:
+    """All bodies, in the order of ``BODY_NAMES``, at the zero configuration of their own frames.
+
+    Args:
+        model: The arm.
+        tool: What its flange carries.
+        padding_mm: How much fuller ``full`` is than ``bare``.
+
+    Raises:
+        InputError: If the model's meshes do not ship, or the tool is flat.
+    """
+    own = () if tool.body is None else (Link("tool", FLANGE_FRAME, tool.body.pieces),)
+    links = (*collision_links(model), *own)
+    full = padded_links(links, padding_mm) if padding_mm else links
+    return (
+        *(link_body(bare, more) for bare, more in zip(links, full, strict=True)),
+        round_body("holder", tool.holder_diameter_mm, tool.holder_span_mm, padding_mm),
+        round_body("needle", tool.needle_diameter_mm, tool.needle_span_mm, padding_mm),
+    )
+
+
+def padded_links(links: Sequence[Link], padding_mm: float) -> tuple[Link, ...]:
+    """The links with every piece grown by the padding, from the user's cache where they are there."""
+    pieces = [piece for link in links for piece in link.pieces]
+    made_from = {"what": "padded", "padding_mm": padding_mm, "pieces": [piece.digest for piece in pieces]}
+
+    def grown() -> Arrays:
+        return packed_meshes([padded(piece, padding_mm) for piece in pieces])
+
+    kept = user_cache().arrays(made_from, grown, by=__name__, check=unpacked_meshes)
+    following = iter(unpacked_meshes(kept))
+    return tuple(Link(link.name, link.frame, tuple(islice(following, len(link.pieces)))) for link in links)
+
+
+class Solid:
+    """A shape that moves. Spheres and planes answer most questions about it, and FCL takes longer to build it.
+
+    Args:
+        make: Makes its geometry, mm.
+        pose: Where it stands at first.
+
+    Attributes:
+        pose: Where it stands.
+    """
+
+    def __init__(self, make: Callable[[], fcl.CollisionGeometry], pose: fcl.Transform | None = None) -> None:
+        self._make = make
+        self.pose = pose or fcl.Transform()
+
+    @cached_property
+    def made(self) -> fcl.CollisionObject:
+        """The shape where it stands, and wherever it is placed from now on."""
+        return fcl.CollisionObject(self._make(), self.pose)
+
+    def place(self, pose: fcl.Transform) -> None:
+        """Move it."""
+        self.pose = pose
+        if "made" in self.__dict__:
+            self.made.setTransform(pose)
+
+
+def touch(a: fcl.CollisionObject, b: fcl.CollisionObject) -> bool:
+    """A fresh result for every question: a reused one keeps its old hit."""
+    return bool(fcl.collide(a, b, fcl.CollisionRequest(), fcl.CollisionResult()))
+
+
+def surface(mesh: TriangleMesh) -> fcl.BVHModel:
+    """A surface without an inside."""
+    bvh = fcl.BVHModel()
+    bvh.beginModel(len(mesh.vertices), len(mesh.faces))
+    bvh.addSubModel(np.array(mesh.vertices), np.array(mesh.faces))
+    bvh.endModel()
+    return bvh
+
+
+def convex(mesh: TriangleMesh) -> fcl.Convex:
+    """A convex mesh as a solid."""
+    counted = np.insert(mesh.faces, 0, 3, axis=1)  # FCL wants each face's corner count before its indices
+    return fcl.Convex(np.array(mesh.vertices), len(mesh.faces), counted.ravel().astype(np.int32))
+
+
+def padded(mesh: TriangleMesh, padding_mm: float) -> TriangleMesh:
+    """A convex mesh grown by at least ``padding_mm`` on every side: its sum with the cube about such a sphere."""
+    import trimesh  # here: it costs a third of a second, and few need it
+
+    if padding_mm == 0.0:
+        return mesh
+    corners = padding_mm * np.array(list(product((-1.0, 1.0), repeat=3)))
+    hull = trimesh.convex.convex_hull((mesh.vertices[:, None] + corners).reshape(-1, 3))
+    return TriangleMesh(np.asarray(hull.vertices), np.asarray(hull.faces))
+
+
+PRISM_SIDES = 24
+"""Of the prism about a cylinder: 0.9 % fuller than it."""
+
+
+FINE_SIDES = 96
+"""Of the prism about a cylinder that is held against triangles: 0.05 % fuller than it."""
+
+
+def prism(radius_mm: float, length_mm: float, sides: int = PRISM_SIDES) -> Floats:
+    """Corners of a prism about a cylinder along z, centred: shape (2 ``sides``, 3), mm; those of one end first."""
+    turn = 2.0 * np.pi * np.arange(sides) / sides
+    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / sides)
+    ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    half = length_mm / 2.0 + SLACK_MM
+    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
+
+
+def finer_prism(corners: Floats) -> Floats:
+    """Corners of a prism of ``FINE_SIDES`` about the cylinder that :func:`prism` gave these corners about, as there."""
+    radius_mm = float(np.hypot(corners[:, 0], corners[:, 1]).max()) * np.cos(2.0 * np.pi / len(corners))
+    return prism(radius_mm, float(np.ptp(corners[:, 2])), FINE_SIDES)
+
+
+SLACK_MM = 1e-6
+"""Every sphere is larger by this: covers the rounding of cuts and of the hull's edges (about 1e-12 mm)."""
+
+CENTRE_STEPS = 25
+"""Of the walk to a sphere's centre; how good it is decides how tight the sphere is, never whether it encloses."""
+
+LEAF_RADIUS_MM = 30.0
+"""Parts are cut until their sphere is no larger: half of a UR3 wrist's size."""
+
+
+class BoundingSphere(NamedTuple):
+    """A sphere, mm."""
+
+    centre: Floats
+    radius: float
+
+
+def enclosing_sphere(points: Floats) -> BoundingSphere:
+    """A small sphere about points (n, 3): steps toward the farthest point, ever shorter (Badoiu and Clarkson 2003)."""
+    centre = np.empty(3)
+    radius = _walk_to_centre(np.ascontiguousarray(points), CENTRE_STEPS, centre)
+    return BoundingSphere(centre, radius + SLACK_MM)
+
+
+@nb.njit(cache=True)
+def _walk_to_centre(points, steps, best):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill ``best`` (3,) with the best centre met for points (n, 3); the radius that it needs."""
+    x, y, z = [(points[:, i].min() + points[:, i].max()) / 2.0 for i in range(3)]
+    least = math.inf
+    for step in range(1, steps + 1):
+        most, far = -1.0, 0
+        for i in range(len(points)):
+            squared = (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2 + (points[i, 2] - z) ** 2
+            if squared > most:
+                most, far = squared, i
+        if most < least:
+            least = most
+            best[0], best[1], best[2] = x, y, z
+        x += (points[far, 0] - x) / (step + 1)
+        y += (points[far, 1] - y) / (step + 1)
+        z += (points[far, 2] - z) / (step + 1)
+    return math.sqrt(least)
+
+
+@dataclass(frozen=True, eq=False)
+class SphereTree:
+    """Spheres in a tree, the root first: every node's sphere encloses all parts below it.
+
+    Attributes:
+        centres: Shape (n, 3), mm, in the frame of the body.
+        radii: Shape (n,), mm.
+        children: Shape (n, 2): rows of the two children; -1 at a leaf.
+    """
+
+    centres: Floats
+    radii: Floats
+    children: NDArray[np.int64]
+
+    @property
+    def leaves(self) -> NDArray[np.int64]:
+        """Rows of the leaves, whose spheres together cover the body."""
+        return np.flatnonzero(self.children[:, 0] < 0)
+
+
+def halves(corners: Floats) -> tuple[Floats, Floats]:
+    """A convex hull's corners (n, 3), cut in the middle of its longest side: the corners of the two parts, mm."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    axis = int(np.argmax(high - low))
+    cut = (low[axis] + high[axis]) / 2.0
+    faces = scipy.spatial.ConvexHull(corners).simplices
+    below = corners[:, axis] < cut
+    starts, ends = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    crosses = below[starts] != below[ends]  # Qhull turns its faces either way round: each edge counts from both
+    a, b = corners[starts[crosses]], corners[ends[crosses]]
+    crossings = a + ((cut - a[:, axis]) / (b[:, axis] - a[:, axis]))[:, None] * (b - a)
+    return np.concatenate([corners[below], crossings]), np.concatenate([corners[~below], crossings])
+
+
+def sphere_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM) -> SphereTree:
+    """Spheres that enclose the union of convex pieces, each given by its corners (n, 3), mm."""
+    spheres: list[BoundingSphere] = []
+    children: list[tuple[int, int]] = []
+
+    def add(parts: Sequence[Floats]) -> int:
+        row = len(spheres)
+        spheres.append(enclosing_sphere(np.concatenate(parts)))
+        children.append((-1, -1))
+        if len(parts) > 1:
+            half = len(parts) // 2
+            children[row] = (add(parts[:half]), add(parts[half:]))
+        elif spheres[row].radius > leaf_radius_mm:
+            below, above = halves(parts[0])
+            children[row] = (add([below]), add([above]))
+        return row
+
+    add(pieces)
+    return SphereTree(
+        np.array([sphere.centre for sphere in spheres]),
+        np.array([sphere.radius for sphere in spheres]),
+        np.array(children, dtype=np.int64),
+    )
+
+
+class LooseParts(NamedTuple):
+    """The connected parts of a surface.
+
+    Attributes:
+        corners: Shape (k, 3), mm: a corner of each.
+        sizes: Shape (k, 3), mm: the edges of the box about each.
+    """
+
+    corners: Floats
+    sizes: Floats
+
+    @classmethod
+    def of(cls, mesh: TriangleMesh) -> LooseParts:
+        """Of a mesh that has been checked."""
+        points, begins = _in_parts(mesh)
+        sizes = np.maximum.reduceat(points, begins) - np.minimum.reduceat(points, begins)
+        return cls(points[begins], sizes)
+
+    def no_larger_than(self, mm: float) -> LooseParts:
+        """Those about which a box is not longer than that from corner to corner."""
+        small = np.linalg.norm(self.sizes, axis=1) <= mm
+        return LooseParts(self.corners[small], self.sizes[small])
+
+
+def connected_parts(mesh: TriangleMesh) -> list[Floats]:
+    """The corners of each connected part of a surface, shapes (n, 3)."""
+    points, begins = _in_parts(mesh)
+    return np.split(points, begins[1:])
+
+
+def _in_parts(mesh: TriangleMesh) -> tuple[Floats, Ints]:
+    """Corners part by part, and where each part begins; faces are connected where they share a corner."""
+    count = len(mesh.vertices)
+    used = np.flatnonzero(np.bincount(mesh.faces.ravel(), minlength=count))
+    starts, ends = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
+    links = scipy.sparse.coo_array((np.ones(len(starts), np.int8), (starts, ends)), shape=(count, count))
+    part = scipy.sparse.csgraph.connected_components(links, directed=False)[1][used]
+    order = np.argsort(part, kind="stable")
+    return mesh.vertices[used[order]], np.flatnonzero(np.diff(part[order], prepend=-1))
+
+
+def half_spaces(corners: Floats) -> Floats:
+    """The half spaces that a convex hull of corners (n, 3), mm, is the intersection of: shape (m, 4), outward."""
+    return np.asarray(scipy.spatial.ConvexHull(corners).equations)
+
+
+def within(points: Floats, pieces: Sequence[Floats]) -> Bools:
+    """Which points (k, 3) lie within one of some convex pieces, each as of :func:`half_spaces`: shape (k,)."""
+    inside = np.zeros(len(points), np.bool_)
+    for planes in pieces:
+        inside |= (points @ planes[:, :3].T + planes[:, 3] <= 0.0).all(axis=1)
+    return inside

@@ -1,1 +1,0 @@
-"""The checks of one cell packed for compiled code: hulls, spheres, the skin's tree, and what moves."""

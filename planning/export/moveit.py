@@ -1,0 +1,327 @@
+"""The files of a plan for MoveIt: each read back before any is published.
+
+Messages of ROS 2 as plain values, in metres: what both the scene and the goals are made of.
+
+The arm's URDF with holder and needle on its flange, as ROS reads it: metres, z along the needle.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.arm.links import address_file, model_urdf
+from puncture_twin.planning.arm.tool import Box, Tool, ToolBody
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.collision.workcell import case_boxes, case_tool, patient_surface
+from puncture_twin.planning.export.program import SampledMotion, check_sampled, warning_lines
+from puncture_twin.planning.export.ros2 import NANOSECONDS, TIME_RESOLUTION_S, velocities
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_check import check_geometry
+
+PATIENT, NEEDLE, HOLDER = "patient", "needle", "needle_holder"
+
+
+def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
+    """The scene as a difference to what MoveIt knows: all that the plan was checked against, and its first state.
+
+    Args:
+        case: The plan's case.
+        anatomy: Its structures and skin.
+        plan: The plan; its registration places the patient.
+    """
+    frames = RosFrames.of(model_urdf(plan.model))
+    solids = [_solid(box, frames) for box in case_boxes(case, plan.T_base_ct)]
+    start = {"name": list(plan.model.joint_names), "position": [float(angle) for angle in plan.approach.q[0]]}
+    carried = _attached(case_tool(case), frames)
+    return {
+        "name": "puncture",
+        "is_diff": True,
+        "robot_state": {
+            "is_diff": True,
+            "joint_state": start,
+            "attached_collision_objects": carried,
+        },
+        "world": {"collision_objects": [_patient(anatomy, plan, frames), *solids]},
+    }
+
+
+def _patient(anatomy: Anatomy, plan: Plan, frames: RosFrames) -> dict[str, Any]:
+    """The skin with all that the CT shows outside of it, in its own frame; the pose says where it lies."""
+    pose = pose_message(frames.T_root_base @ plan.T_base_ct)
+    return _object(PATIENT, frames.root) | {"meshes": [mesh_message(patient_surface(anatomy))], "mesh_poses": [pose]}
+
+
+def _solid(box: Box, frames: RosFrames) -> dict[str, Any]:
+    primitive, pose = box_message(box, frames)
+    return _object(box.name, frames.root) | {"primitives": [primitive], "primitive_poses": [pose]}
+
+
+def _attached(tool: Tool, frames: RosFrames) -> list[dict[str, Any]]:
+    ends = tool.needle_length_mm - tool.shaft_mm, tool.needle_length_mm
+    parts = [(NEEDLE, *ends, tool.needle_diameter_mm)]
+    if ends[0] > 0:
+        parts.insert(0, (HOLDER, 0.0, ends[0], tool.holder_diameter_mm))
+    made = []
+    for name, start, end, diameter in parts:
+        primitive, pose = cylinder_message(start, end, diameter)
+        body = _object(name, frames.flange) | {"primitives": [primitive], "primitive_poses": [pose]}
+        made.append({"link_name": frames.flange, "object": body, "touch_links": list(frames.touching)})
+    if tool.body is not None:
+        body = _object("tool", frames.flange) | {
+            "meshes": [mesh_message(tool.body.mesh)],
+            "mesh_poses": [pose_message(np.eye(4))],
+        }
+        made.append({"link_name": frames.flange, "object": body, "touch_links": list(frames.touching)})
+    return made
+
+
+def _object(name: str, frame: str) -> dict[str, Any]:
+    """``moveit_msgs/CollisionObject``; its own pose is the frame's, those of its shapes say the rest."""
+    return {"header": {"frame_id": frame}, "id": name, "pose": {"orientation": {"w": 1.0}}}
+
+
+PATH_TOLERANCE_RAD, GOAL_TOLERANCE_RAD = 0.02, 0.002
+"""Beyond them the controller gives up: on the way 20 mm at a metre, at the end 2 mm."""
+
+GOAL_TIME_S = 1
+"""How much later than planned the arm may arrive."""
+
+
+def goal_messages(plan: Plan) -> dict[str, Any]:
+    """``approach`` and ``insertion``."""
+    return {phase: _goal(plan, getattr(plan, phase)) for phase in SampledMotion._fields}
+
+
+def _goal(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
+    speeds, names = velocities(plan.model, trajectory), plan.model.joint_names
+    points = [_point(*row) for row in zip(trajectory.times_s, trajectory.q, speeds, strict=True)]
+    return {
+        "trajectory": {"header": {"frame_id": ""}, "joint_names": list(names), "points": points},
+        "path_tolerance": [{"name": name, "position": PATH_TOLERANCE_RAD} for name in names],
+        "goal_tolerance": [{"name": name, "position": GOAL_TOLERANCE_RAD} for name in names],
+        "goal_time_tolerance": {"sec": GOAL_TIME_S, "nanosec": 0},
+    }
+
+
+def _point(time_s: float, q: Floats, speeds: Floats) -> dict[str, Any]:
+    sec, nanosec = divmod(round(float(time_s) * NANOSECONDS), NANOSECONDS)
+    return {
+        "positions": q.tolist(),
+        "velocities": speeds.tolist(),
+        "time_from_start": {"sec": sec, "nanosec": nanosec},
+    }
+
+
+def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
+    """Refuse goals that were read back and are not the plan's, or break a limit of the arm.
+
+    Raises:
+        InputError: Says what differs.
+    """
+    parts = {}
+    for phase in SampledMotion._fields:
+        trajectory = goals[phase]["trajectory"]
+        if trajectory["joint_names"] != list(plan.model.joint_names):
+            raise InputError(f"{phase} is of other joints", where=where, allowed=", ".join(plan.model.joint_names))
+        starts = [point["time_from_start"] for point in trajectory["points"]]
+        times = np.array([one["sec"] + one["nanosec"] / NANOSECONDS for one in starts])
+        parts[phase] = Trajectory(times, np.array([point["positions"] for point in trajectory["points"]]))
+    check_sampled(SampledMotion(**parts), plan, time_resolution_s=TIME_RESOLUTION_S, where=where)
+
+
+MOVEIT = "moveit"
+
+SCENE, GOALS, URDF, SENDER = "scene.json", "goals.json", "urdf", "send.py"
+"""Ends of the files' names, in the order of `moveit_names`."""
+
+SENDER_TEXT = '''"""Give MoveIt the scene, send one phase: python {sender} approach|insertion. Research software."""
+import json, pathlib, sys, rclpy
+from control_msgs.action import FollowJointTrajectory
+from moveit_msgs.srv import ApplyPlanningScene
+from rclpy.action import ActionClient
+from rosidl_runtime_py import set_message_fields
+
+scene, goals = (json.loads(pathlib.Path(__file__).with_name(name).read_text()) for name in ("{scene}", "{goals}"))
+rclpy.init(); node = rclpy.create_node("puncture"); wait = lambda future: rclpy.spin_until_future_complete(node, future)
+request, goal = ApplyPlanningScene.Request(), FollowJointTrajectory.Goal(); print(*goals["warnings"], sep="\\n")
+set_message_fields(request.scene, scene); set_message_fields(goal, goals[sys.argv[1]])
+apply = node.create_client(ApplyPlanningScene, "/apply_planning_scene"); apply.wait_for_service()
+wait(applied := apply.call_async(request)); assert applied.result().success, "MoveIt refused the scene"
+arm = ActionClient(node, FollowJointTrajectory, "/scaled_joint_trajectory_controller/follow_joint_trajectory")
+arm.wait_for_server(); input("The arm stands at the first positions, and nobody is near? Enter sends. ")
+wait(sent := arm.send_goal_async(goal)); assert sent.result().accepted, "the controller refused the goal"
+wait(done := sent.result().get_result_async()); print(done.result().result)
+'''
+
+
+def moveit_names(stem: str) -> tuple[str, ...]:
+    """The files' names for a plan's."""
+    return tuple(f"{stem}.{end}" for end in (SCENE, GOALS, URDF, SENDER))
+
+
+def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> Mapping[str, str]:
+    """Name to text.
+
+    Args:
+        plan: A plan that was checked against its case.
+        case: The plan's.
+        anatomy: The case's.
+        source: The plan's file, for the names and for errors.
+
+    Raises:
+        InputError: A plan that contradicts itself, or a number beyond the arm's limits.
+    """
+    check_geometry(plan, source)
+    names = moveit_names(source.stem)
+    goals = _json({**goal_messages(plan), "warnings": warning_lines(plan.warnings)})
+    check_goals(json.loads(goals), plan, where=source)
+    urdf = urdf_with_needle(plan.model, case_tool(case))
+    if not ElementTree.fromstring(urdf).findall("link"):
+        raise InputError("the URDF does not read back", where=source, allowed="links and joints")
+    sender = SENDER_TEXT.format(sender=names[3], scene=names[0], goals=names[1])
+    return dict(zip(names, (_json(scene_message(case, anatomy, plan)), goals, urdf, sender), strict=True))
+
+
+def _json(document: object) -> str:
+    return json.dumps(document, allow_nan=False, separators=(",", ":")) + "\n"
+
+
+M_PER_MM = 1e-3
+
+BOX, CYLINDER = 1, 3
+"""Of ``shape_msgs/SolidPrimitive``."""
+
+GRAIN_M = 1e-6
+"""To what coordinates are rounded."""
+
+
+class RosFrames(NamedTuple):
+    """The links of an arm's URDF in which messages speak."""
+
+    root: str
+    """The root, of a UR ``base_link``: the controller's base turned by 180 deg about z."""
+    flange: str
+    """The controller's flange, of a UR ``tool0``."""
+    touching: tuple[str, ...]
+    """What holder and needle are bolted to."""
+    T_root_base: Floats
+    """Shape (4, 4), mm: the controller's base in the root's frame."""
+
+    @classmethod
+    def of(cls, urdf: ArmUrdf) -> RosFrames:
+        """Those of an arm."""
+        last = [member.link.name for member in urdf.chain.bodies[-1]]
+        touching = dict.fromkeys((last[0], "flange", urdf.chain.flange, *last[1:]))
+        return cls(
+            urdf.root, urdf.chain.flange, tuple(touching), np.asarray(np.linalg.inv(urdf.T_base_root), np.float64)
+        )
+
+
+def pose_message(T: Floats) -> dict[str, Any]:
+    """``geometry_msgs/Pose`` of a motion, shape (4, 4), mm."""
+    quaternion = Rotation.from_matrix(T[:3, :3]).as_quat()
+    return {"position": _named("xyz", T[:3, 3] * M_PER_MM), "orientation": _named("xyzw", quaternion)}
+
+
+def box_message(box: Box, frames: RosFrames) -> tuple[dict[str, Any], dict[str, Any]]:
+    """``shape_msgs/SolidPrimitive`` of a box in the controller's base frame, and its pose in the root's."""
+    sides = [float(side) * M_PER_MM for side in box.size_mm]
+    return {"type": BOX, "dimensions": sides}, pose_message(frames.T_root_base @ box.T_base_box)
+
+
+def cylinder_message(start_mm: float, end_mm: float, diameter_mm: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A cylinder along z of the flange, and its pose there: about its middle, as the definition has it."""
+    T = np.eye(4)
+    T[2, 3] = (start_mm + end_mm) / 2
+    size = [(end_mm - start_mm) * M_PER_MM, diameter_mm / 2 * M_PER_MM]
+    return {"type": CYLINDER, "dimensions": size}, pose_message(T)
+
+
+def mesh_message(mesh: TriangleMesh) -> dict[str, Any]:
+    """``shape_msgs/Mesh`` of a surface in mm."""
+    vertices = np.round(mesh.vertices * M_PER_MM / GRAIN_M) * GRAIN_M
+    return {
+        "triangles": [{"vertex_indices": [int(i) for i in face]} for face in mesh.faces],
+        "vertices": [_named("xyz", vertex) for vertex in vertices],
+    }
+
+
+def _named(names: str, values: Floats) -> dict[str, float]:
+    return {name: round(float(value), 9) for name, value in zip(names, values, strict=True)}
+
+
+TIP_FRAME = "needle_tip"
+
+
+def urdf_with_needle(model: UrModel, tool: Tool) -> str:
+    """The URDF's text; its meshes are named by absolute addresses of this installation.
+
+    Raises:
+        InputError: Nobody has the shapes of such a model.
+    """
+    urdf = model_urdf(model)
+    robot, flange = ElementTree.fromstring(urdf.text), urdf.chain.flange
+    for mesh in robot.iter("mesh"):
+        file = address_file(urdf, mesh.get("filename", ""))
+        mesh.set("filename", Path(file).as_uri() if Path(file).is_absolute() else file)
+    start = tool.needle_length_mm - tool.shaft_mm
+    if start > 0:
+        _add_cylinder(robot, flange, "needle_holder", 0.0, start, tool.holder_diameter_mm)
+    _add_cylinder(robot, flange, "needle", start, tool.shaft_mm, tool.needle_diameter_mm)
+    if tool.body is not None:
+        _add_mesh(robot, flange, tool.body)
+    ElementTree.SubElement(robot, "link", name=TIP_FRAME)
+    _fix(robot, flange, TIP_FRAME, tool.needle_length_mm)
+    ElementTree.indent(robot, " ")
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
+
+
+def _add_cylinder(
+    robot: ElementTree.Element, flange: str, name: str, start_mm: float, length_mm: float, diameter_mm: float
+) -> None:
+    link = ElementTree.SubElement(robot, "link", name=name)
+    for kind in ("visual", "collision"):
+        part = ElementTree.SubElement(link, kind)
+        ElementTree.SubElement(part, "origin", rpy="0 0 0", xyz=f"0 0 {_metres(length_mm / 2)}")
+        shape = {"radius": _metres(diameter_mm / 2), "length": _metres(length_mm)}
+        ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), "cylinder", shape)
+    _fix(robot, flange, name, start_mm)
+
+
+def _add_mesh(robot: ElementTree.Element, flange: str, body: ToolBody) -> None:
+    """The tool's own file, scaled to metres."""
+    link = ElementTree.SubElement(robot, "link", name="tool")
+    T, scale = body.T_flange_file, f"{body.unit_mm * M_PER_MM:.9g}"
+    rpy = " ".join(f"{angle:.12g}" for angle in Rotation.from_matrix(T[:3, :3]).as_euler("xyz"))
+    for kind in ("visual", "collision"):
+        part = ElementTree.SubElement(link, kind)
+        ElementTree.SubElement(part, "origin", rpy=rpy, xyz=" ".join(_metres(value) for value in T[:3, 3]))
+        mesh = {"filename": body.file.resolve().as_uri(), "scale": " ".join([scale] * 3)}
+        ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), "mesh", mesh)
+    _fix(robot, flange, "tool", 0.0)
+
+
+def _fix(robot: ElementTree.Element, flange: str, name: str, at_mm: float) -> None:
+    """Bolt a link to the flange."""
+    joint = ElementTree.SubElement(robot, "joint", name=f"{flange}-{name}", type="fixed")
+    ElementTree.SubElement(joint, "parent", link=flange)
+    ElementTree.SubElement(joint, "child", link=name)
+    ElementTree.SubElement(joint, "origin", rpy="0 0 0", xyz=f"0 0 {_metres(at_mm)}")
+
+
+def _metres(mm: float) -> str:
+    return f"{mm * M_PER_MM:.9f}"

@@ -1,0 +1,575 @@
+"""Named points of other programs: CSV, Slicer markups (.mrk.json) and the older Slicer lists (.fcsv), in mm.
+
+A CSV states its unit in the header (``name,x_mm,y_mm,z_mm``) and leaves the space to the case; Slicer's files state
+both. Whatever states a patient space arrives in LPS.
+
+Points as CSV: a header with the unit in it, then one point per line.
+
+Points of 3D Slicer: markups as JSON (.mrk.json), and the older fiducial lists (.fcsv).
+
+Source: Slicer documentation, "Markups" module, file formats, and its published schema of versions 1.0.0 to 1.0.3;
+in older files the coordinate system is a number. Version 1.0.0 knows no ``coordinateUnits``: Slicer works in mm.
+
+What a point file holds, before unit, space and the guard: the common result of its readers.
+
+The one gate for how an arm stood: joint angles and times that a file, a case or a controller states.
+
+A recording, a list of touches, a case's home and a live controller's word come through here: angles that a joint can
+have, in the unit that is stated, at times that do not run backwards. Whose arm: `planning/arm/kinematics.py`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.brief import brief
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.input_file import decode_text, read_input
+from puncture_twin.planning.base.strict_json import parse_json
+from puncture_twin.planning.formats.guard import guard_points
+from puncture_twin.planning.formats.raw_mesh import refuse
+from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit, to_lps
+
+_ALLOWED = (
+    "a header name,x_mm,y_mm,z_mm (or _cm, _m; kind, and q1_deg to q6_deg, may be added), "
+    "then as many fields in every line"
+)
+
+
+class _Row(NamedTuple):
+    line: int
+    fields: list[str]
+
+
+def read_csv_points(data: bytes, where: str) -> RawPoints:
+    """The points of a CSV file, in the order of its lines; empty lines are passed over.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If the header or a line is not understood; the error names the line.
+    """
+    rows = list(_rows(data, where))
+    if not rows:
+        refuse("no line", where, _ALLOWED)
+    header = [field.strip() for field in rows[0].fields]
+    unit = _unit(header, where)
+    columns = {name.partition("_")[0]: index for index, name in enumerate(header)}
+    for line, fields in rows[1:]:
+        if len(fields) != len(header):
+            refuse(f"{len(fields)} fields instead of {len(header)}", f"{where}, line {line}", _ALLOWED)
+        if not fields[columns["name"]].strip():
+            refuse("empty name", f"{where}, line {line}", _ALLOWED)
+    points = [
+        tuple(parse_coordinate(fields[columns[axis]], f"{where}, line {line}") for axis in "xyz")
+        for line, fields in rows[1:]
+    ]
+    return RawPoints(
+        names=[fields[columns["name"]].strip() for _, fields in rows[1:]],
+        points=[(x, y, z) for x, y, z in points],
+        unit=unit,
+        space=None,
+        kinds=tuple(f[columns["kind"]].strip() for _, f in rows[1:]) if "kind" in columns else None,
+        joints_deg=[
+            tuple(row_numbers(fields, header, JOINTS_DEG, f"{where}, line {line}")) for line, fields in rows[1:]
+        ]
+        if "q1" in columns
+        else None,
+    )
+
+
+def _rows(data: bytes, where: str) -> Iterator[_Row]:
+    reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
+    try:
+        for fields in reader:
+            if any(field.strip() for field in fields):
+                yield _Row(reader.line_num, fields)
+    except csv.Error as error:
+        raise InputError(f"{error}", where=f"{where}, line {reader.line_num}", allowed=_ALLOWED) from error
+
+
+def _unit(header: list[str], where: str) -> Unit | None:
+    """The one unit of the three coordinate columns, None if they have none."""
+    units: dict[str, str] = {}
+    for name in header:
+        axis = re.fullmatch(r"([xyz])(?:_(\w+))?", name)
+        if axis:
+            units[axis[1]] = axis[2] or ""
+        elif name not in ("name", "kind", *JOINTS_DEG):
+            refuse(f"column {name[:40]!r}", f"{where}, header", _ALLOWED)
+    if len(set(header)) != len(header) or sorted(units) != ["x", "y", "z"] or "name" not in header:
+        refuse(f"columns {header}", f"{where}, header", _ALLOWED)
+    joints = sum(name in JOINTS_DEG for name in header)
+    if joints not in (0, 6) or len(header) != 4 + ("kind" in header) + joints:  # such as x_mm beside x_m
+        refuse(f"columns {header}", f"{where}, header", _ALLOWED)
+    if len(set(units.values())) != 1:
+        refuse(f"mixed units {sorted(set(units.values()))}", f"{where}, header", _ALLOWED)
+    text = units["x"]
+    return parse_unit(text, where=f"{where}, header") if text else None
+
+
+_MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, defined control points"
+_LINE_POINTS = 2
+_SPACES = {"LPS": Space.LPS, "RAS": Space.RAS, "0": Space.RAS, "1": Space.LPS}
+_FCSV_ALLOWED = "a Slicer fiducial list with '# CoordinateSystem = ' and '# columns = id,x,y,z,...,label,...'"
+_FCSV_DEFINED = "2"
+"""Slicer 5 writes two fields more than its header names: whether the position is defined (2), and one other."""
+_FCSV_SYSTEM = "# coordinatesystem"
+_FCSV_COLUMNS = "# columns"
+
+
+def read_markups_points(data: bytes, where: str) -> RawPoints:
+    """The control points of a Slicer markups file: a list of fiducials, or a line, each by its label.
+
+    Which end of a line is the target no file says: the case names it by its label.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If it is no such file, states no known space, or a point has no label or defined position.
+    """
+    tree = parse_json(data, where=where, allowed=_MARKUPS_ALLOWED)
+    markups = tree.get("markups") if isinstance(tree, dict) else None
+    if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
+        refuse("not exactly one entry in 'markups'", where, _MARKUPS_ALLOWED)
+    markup = markups[0]
+    points = _control_points(markup, where)
+    places = [f"{where}, control point {number}" for number in range(1, len(points) + 1)]
+    return RawPoints(
+        names=[_label(point, place) for point, place in zip(points, places, strict=True)],
+        points=[_position(point, place) for point, place in zip(points, places, strict=True)],
+        unit=_slicer_unit(markup.get("coordinateUnits"), where),
+        space=_space(markup.get("coordinateSystem"), where),
+    )
+
+
+def _control_points(markup: dict[str, Any], where: str) -> list[Any]:
+    kind, points = markup.get("type", "Fiducial"), markup.get("controlPoints")
+    if kind not in ("Fiducial", "Line"):
+        refuse(f"markup of type {str(kind)[:40]!r}", where, _MARKUPS_ALLOWED)
+    if not isinstance(points, list) or not points:
+        refuse("no control point", where, _MARKUPS_ALLOWED)
+    if kind == "Line" and len(points) != _LINE_POINTS:
+        refuse(f"a line of {len(points)} control points", where, "both ends of a line: 2 control points")
+    return points
+
+
+def read_fcsv_points(data: bytes, where: str) -> RawPoints:
+    """The points of an older Slicer fiducial list, which is in mm by its definition.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If it states no known space or columns, or a line is not understood.
+    """
+    lines = decode_text(data, where).splitlines()
+    system, header = _fcsv_value(lines, _FCSV_SYSTEM), _fcsv_value(lines, _FCSV_COLUMNS)
+    columns = [] if header is None else [name.strip() for name in header.split(",")]
+    if any(columns.count(name) != 1 for name in ("x", "y", "z", "label")):
+        refuse(f"columns {columns}", where, _FCSV_ALLOWED)
+    names, points = [], []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        place = f"{where}, line {number}"
+        fields = _fcsv_fields(line, place)
+        if len(fields) - len(columns) not in (0, 2):
+            refuse(f"{len(fields)} fields instead of {len(columns)}", place, _FCSV_ALLOWED)
+        if (status := (*fields, _FCSV_DEFINED)[len(columns)]) != _FCSV_DEFINED:
+            refuse(f"position status {status[:40]!r}", place, f"{_FCSV_DEFINED} (defined)")
+        names.append(fields[columns.index("label")].strip())
+        x, y, z = (parse_coordinate(fields[columns.index(axis)], place) for axis in "xyz")
+        points.append((x, y, z))
+    return RawPoints(names, points, Unit.MM, _space(system, where))
+
+
+def _space(value: object, where: str) -> Space:
+    key = str(value).strip() if isinstance(value, (str, int)) and not isinstance(value, bool) else ""
+    if key not in _SPACES:
+        refuse(f"coordinate system {str(value)[:40]!r}", where, "LPS or RAS (in older files 1 or 0)")
+    return _SPACES[key]
+
+
+def _slicer_unit(value: object, where: str) -> Unit:
+    """From "mm", or a coded entry such as ["mm", "UCUM", "millimeter"]; mm, the schema's default, if there is none."""
+    if value is None:
+        return Unit.MM
+    text = value[0] if isinstance(value, list) and value else value
+    if not isinstance(text, str):
+        refuse(f"coordinateUnits {str(value)[:40]!r}", where, 'such as "mm" or ["mm", "UCUM", "millimeter"]')
+    return parse_unit(text, where=where)
+
+
+def _label(point: object, where: str) -> str:
+    label = point.get("label") if isinstance(point, dict) else None
+    if not isinstance(label, str) or not label.strip():
+        refuse(f"label {str(label)[:40]!r}", where, "a label that is not empty")
+    return label.strip()
+
+
+def _position(point: dict[str, Any], where: str) -> tuple[float, float, float]:
+    status = point.get("positionStatus", "defined")
+    if status != "defined":
+        refuse(f"positionStatus is {str(status)[:40]!r}", where, '"defined"')
+    position = point.get("position")
+    if not isinstance(position, list) or len(position) != 3:
+        refuse(f"position {str(position)[:60]!r}", where, "three numbers")
+    for value in position:
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            refuse(f"position {str(position)[:60]!r}", where, "three numbers")
+    x, y, z = (parse_coordinate(str(value), where) for value in position)
+    return x, y, z
+
+
+def _fcsv_value(lines: list[str], key: str) -> str | None:
+    found = [line.partition("=")[2].strip() for line in lines if line.lower().startswith(key)]
+    return found[0] if len(found) == 1 else None
+
+
+def _fcsv_fields(line: str, where: str) -> list[str]:
+    try:
+        return next(csv.reader([line], strict=True))
+    except csv.Error as error:
+        raise InputError(f"{error}", where=where, allowed=_FCSV_ALLOWED) from error
+
+
+MAX_FILE_BYTES = 10_000_000
+"""A hundred thousand points; a larger file is no list of markers."""
+
+_READERS: Mapping[str, Callable[[bytes, str], RawPoints]] = MappingProxyType(
+    {".csv": read_csv_points, ".mrk.json": read_markups_points, ".fcsv": read_fcsv_points}
+)
+
+
+MOST_NAMED = 8
+"""Points that a line about a list names."""
+
+
+@dataclass(frozen=True, eq=False)
+class NamedPoints:
+    """Points with names, as guarded: finite, at least one, every name once.
+
+    Attributes:
+        names: Shape (n,), in the order of the file.
+        points: Shape (n, 3), mm, read-only, in ``space``.
+        space: LPS for patient data, LOCAL for a frame of its own, None where nobody said (such as a robot's base).
+        kinds: Shape (n,), what each point is, where the file says so ("marker", "lesion").
+        joints: Shape (n, 6), rad, read-only: how the robot stood at the touch of each, where the file says so.
+    """
+
+    names: tuple[str, ...]
+    points: NDArray[np.float64]
+    space: Space | None
+    kinds: tuple[str, ...] | None = None
+    joints: NDArray[np.float64] | None = None
+
+    @brief
+    def __repr__(self) -> str:
+        named = ", ".join(self.names[:MOST_NAMED]) + (", ..." if len(self.names) > MOST_NAMED else "")
+        return f"{len(self.names)} points, {self.space or 'no space stated'}: {named}"
+
+    def __post_init__(self) -> None:
+        for name in ("points", "joints"):
+            if getattr(self, name) is not None:
+                array = np.array(getattr(self, name), dtype=np.float64)
+                array.setflags(write=False)
+                object.__setattr__(self, name, array)
+
+
+def read_points(
+    path: Path,
+    *,
+    default_space: Space | None = None,
+    default_unit: Unit | None = None,
+) -> NamedPoints:
+    """The points of one file, in mm; in LPS where the file or the caller names a patient space.
+
+    Args:
+        path: A .csv, .mrk.json or .fcsv file.
+        default_space: The space of a file that states none: the case's, or None for a robot's base.
+        default_unit: The unit of a file that states none; None refuses such a file.
+
+    Raises:
+        InputError: If it cannot be read, contradicts the caller, or its points fail the guard.
+    """
+    _reader(path, str(path))  # an unknown ending is refused before anything is read
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    return parse_points(data, path, default_space=default_space, default_unit=default_unit)
+
+
+def parse_points(
+    data: bytes,
+    path: Path,
+    *,
+    default_space: Space | None = None,
+    default_unit: Unit | None = None,
+) -> NamedPoints:
+    """The same of a file that has been read; it is not opened again.
+
+    Args:
+        data: The whole file.
+        path: Its name, whose ending says the format.
+        default_space: As in `read_points`.
+        default_unit: As in `read_points`.
+
+    Raises:
+        InputError: As `read_points`, but for reading.
+    """
+    name = str(path)
+    raw = _reader(path, name)(data, name)
+    unit = raw.unit or default_unit
+    if unit is None:
+        raise InputError("no unit of length", where=name, allowed="x_mm,y_mm,z_mm in the header")
+    if raw.space is not None and default_space is Space.LOCAL:
+        message = f"points in {raw.space}, but the case has a local frame"
+        raise InputError(message, where=name, allowed="points in the case's own space, as CSV")
+    space = raw.space or default_space
+    points = np.array(raw.points, dtype=np.float64).reshape(-1, 3)
+    with np.errstate(over="ignore"):  # beyond the range of floats is infinite, which the guard refuses
+        points = points * unit.mm if space is None else to_lps(points, space) * unit.mm
+    guarded = guard_points(points, raw.names, where=name)
+    joints = None
+    if raw.joints_deg is not None:
+        joints = joint_readings(raw.joints_deg, "deg", where=name, names=raw.names)
+    return NamedPoints(tuple(raw.names), guarded, Space.LPS if space is Space.RAS else space, raw.kinds, joints)
+
+
+def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
+    reader = next((read for suffix, read in _READERS.items() if path.name.lower().endswith(suffix)), None)
+    if reader is None:
+        raise InputError(f"unknown point file {path.name!r}", where=where, allowed=", ".join(_READERS))
+    return reader
+
+
+def write_points(path: Path, points: NamedPoints) -> None:
+    """A CSV with ``name,x_mm,y_mm,z_mm``, and joints, that reads back to the same numbers; whole, or not at all.
+
+    The space is not written: a CSV speaks in the space of its case.
+
+    Raises:
+        InputError: If the place cannot be written to.
+    """
+    joints = points.joints is not None
+    header = ["name", *(["kind"] if points.kinds else []), "x_mm", "y_mm", "z_mm"]
+    header += JOINTS_DEG if joints else []
+    labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)
+    numbers = points.points if points.joints is None else np.hstack([points.points, np.degrees(points.joints)])
+    rows = [[*label, *map(repr, row)] for label, row in zip(labels, numbers.tolist(), strict=True)]
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    except OSError as error:
+        raise InputError(f"cannot be written ({error})", where=path, allowed="a folder to write to") from error
+    part = Path(name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([header, *rows])
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error})", where=path, allowed="a file name of a folder") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class RawPoints(NamedTuple):
+    """Points as their file states them; the guard has not seen them yet.
+
+    Attributes:
+        names: One per point.
+        points: Three coordinates per point, in ``unit`` and ``space``.
+        unit: None if the file states none.
+        space: None if the file states none.
+        kinds: One per point, if the file has them.
+        joints_deg: Six joint angles per point, if the file says how the robot stood there.
+    """
+
+    names: list[str]
+    points: list[tuple[float, float, float]]
+    unit: Unit | None
+    space: Space | None
+    kinds: tuple[str, ...] | None = None
+    joints_deg: list[tuple[float, ...]] | None = None
+
+
+def parse_coordinate(text: str, where: str) -> float:
+    """A finite decimal number.
+
+    Raises:
+        InputError: If the text is anything else, such as a decimal comma, NaN or an empty field.
+    """
+    allowed = "a finite number with a decimal point"
+    if "_" in text:  # Python would read 1_0 as 10
+        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed)
+    try:
+        number = float(text)
+    except ValueError as error:
+        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed) from error
+    if not math.isfinite(number):
+        raise InputError(f"{text[:40]!r} is not finite", where=where, allowed=allowed)
+    return number
+
+
+AngleUnit = Literal["rad", "deg"]
+
+JOINTS_DEG = tuple(f"q{number}_deg" for number in range(1, 7))
+JOINTS_RAD = tuple(f"q{number}_rad" for number in range(1, 7))
+RTDE_JOINTS = tuple(f"actual_q_{number}" for number in range(6))
+RTDE_TOOL = tuple(f"actual_TCP_pose_{number}" for number in range(3))
+"""Where the controller has its tool, m, base frame."""
+TIMES = ("time_s", "timestamp")
+
+MOST_RAD = np.radians([363.0, 363.0, 363.0, 363.0, 363.0, 720.0])
+"""A UR's joint reads a whole turn to either side, and 3 degrees that its limits leave; wrist 3 may turn on."""
+
+WHOLE_TURN = 2.0 * np.pi + 0.05
+"""Six angles that all lie within it are none in degrees: an arm that lies stretched out, or radians."""
+_ALLOWED_JOINTS = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actual_q_0 to actual_q_5, one row a pose"
+
+
+class JointRecording(NamedTuple):
+    """Rows of a recording."""
+
+    names: tuple[str, ...]
+    """What their ``name`` says, or their numbers."""
+    q: Floats
+    """Shape (n, 6), rad."""
+    time_s: Floats | None
+    """Shape (n,); None where the file has no times."""
+    tool_base: Floats | None
+    """Where the controller had its tool, shape (n, 3), mm; None where the file does not say it."""
+
+
+def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, names: Sequence[str] = ()) -> Floats:
+    """Joint angles that an arm can have, shape (n, 6), rad.
+
+    Args:
+        values: Shape (n, 6), in the unit.
+        unit: That the file states.
+        where: The file, for the error.
+        names: Of the rows; none: their numbers.
+
+    Raises:
+        InputError: Not six finite angles each, beyond what a joint can read, or plainly in the other unit.
+    """
+    given = np.asarray(values)
+    if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != 6 or not np.isfinite(given).all():
+        what = f"joint angles {str(np.array(values, dtype=object).tolist())[:80]}"
+        raise InputError(what, where=where, allowed="six finite angles", code="joints")
+    q = np.array(np.radians(given) if unit == "deg" else given, dtype=np.float64)
+    beyond = np.abs(q) > MOST_RAD
+    if beyond.any():
+        row, joint = (int(i) for i in np.argwhere(beyond)[0])
+        name = names[row] if row < len(names) else f"row {row + 1}"
+        likely = (
+            unit == "rad" and np.abs(given).max() > 2 * WHOLE_TURN and (np.abs(given) <= np.degrees(MOST_RAD)).all()
+        )
+        guess = ": degrees?" if likely else ""
+        what = f"joint {joint + 1} of {name} at {given[row, joint]:g} {unit}, beyond what it can read{guess}"
+        limits = "363 degrees (6.34 rad) to either side, wrist 3 two turns"
+        raise InputError(what, where=where, allowed=limits, code="joints_beyond")
+    if unit == "deg" and plainly_radians(given):
+        what = f"every joint within {np.abs(given).max():.3g} degrees of zero: radians?"
+        raise InputError(what, where=where, allowed="degrees, as the names of the columns say", code="joints_unit")
+    return q
+
+
+def plainly_radians(angles_deg: ArrayLike) -> bool:
+    """Whether angles of an arm's joints, stated as degrees, are radians: none beyond 2 pi, and not all zero."""
+    most = float(np.abs(np.asarray(angles_deg, dtype=np.float64)).max(initial=0.0))
+    return 0.0 < most <= WHOLE_TURN
+
+
+def check_times(time_s: Floats, *, where: str | Path) -> None:
+    """Refuse times (n,) that run backwards.
+
+    Raises:
+        InputError: Names the row.
+    """
+    back = np.flatnonzero(np.diff(time_s) < 0.0)
+    if len(back):
+        row = int(back[0])
+        what = f"row {row + 2}: the time runs backwards, from {time_s[row]:g} to {time_s[row + 1]:g} s"
+        raise InputError(what, where=where, allowed="rows in the order of their times", code="times_backwards")
+
+
+def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecording:
+    """The joints of a CSV: a header, then a row a pose; other columns and lines with # do not count.
+
+    Separated by commas, or by spaces as RTDE's own client writes it.
+
+    Args:
+        data: The whole file.
+        path: Its name, for errors.
+        timed: Whether it must hold times.
+
+    Raises:
+        InputError: A column is missing, something is no number, or the angles or times are of no arm.
+    """
+    lines = [line for line in decode_text(data, str(path)).splitlines() if line.strip() and not line.startswith("#")]
+    comma = bool(lines) and "," in lines[0]
+    try:
+        rows = list(csv.reader(lines, strict=True)) if comma else [line.split() for line in lines]
+    except csv.Error as error:
+        raise InputError(f"is no CSV ({error})", where=path, allowed=_ALLOWED_JOINTS) from error
+    header = [cell.strip().strip('"') for cell in rows[0]] if rows else []
+    joints, unit = _joint_columns(header, path)
+    time = next((name for name in TIMES if name in header), None)
+    if timed and time is None:
+        raise InputError(f"lacks {' or '.join(TIMES)}", where=path, allowed=_ALLOWED_JOINTS, code="column_missing")
+    if len(rows) < 2:
+        raise InputError("holds no row", where=path, allowed=_ALLOWED_JOINTS)
+    tool = RTDE_TOOL if set(RTDE_TOOL) <= set(header) else ()
+    wanted = [*joints, *([time] if time else []), *tool]
+    table = np.array([row_numbers(row, header, wanted, f"{path}: row {i}") for i, row in enumerate(rows[1:], start=1)])
+    names = tuple(row[header.index("name")].strip() for row in rows[1:]) if "name" in header else ()
+    q = joint_readings(table[:, :6], unit, where=path, names=names)
+    times = table[:, 6] if time else None
+    if times is not None:
+        check_times(times, where=path)
+    names = names or tuple(str(i) for i in range(1, len(rows)))
+    return JointRecording(names, q, times, 1000.0 * table[:, -3:] if tool else None)
+
+
+def _joint_columns(header: Sequence[str], path: Path) -> tuple[tuple[str, ...], AngleUnit]:
+    """The columns of the joints, and the unit of their angles."""
+    kinds: tuple[tuple[tuple[str, ...], AngleUnit], ...] = (
+        (JOINTS_RAD, "rad"),
+        (JOINTS_DEG, "deg"),
+        (RTDE_JOINTS, "rad"),
+    )
+    columns, unit = max(kinds, key=lambda kind: sum(name in header for name in kind[0]))
+    missing = [name for name in columns if name not in header]
+    if missing:
+        what = "no joints" if len(missing) == len(columns) else f"lacks {', '.join(missing)}"
+        raise InputError(what, where=path, allowed=_ALLOWED_JOINTS, code="column_missing")
+    return columns, unit
+
+
+def row_numbers(row: Sequence[str], header: Sequence[str], wanted: Sequence[str], where: str) -> list[float]:
+    """The numbers of one row of a table in the columns that are wanted.
+
+    Raises:
+        InputError: More or fewer fields than the header has, or one that is no finite number.
+    """
+    if len(row) != len(header):
+        raise InputError(f"{len(row)} fields", where=where, allowed=f"{len(header)} fields, as in the header")
+    return [parse_coordinate(row[header.index(name)].strip(), f"{where}, {name}") for name in wanted]

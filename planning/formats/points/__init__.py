@@ -1,1 +1,0 @@
-"""Named points: CSV, and 3D Slicer's markups and fiducial lists."""

@@ -1,0 +1,266 @@
+"""Directions on which a needle that bends, to any side, may come into a margin.
+
+The shaft is nowhere further from its straight axis than the bound of its path's length, so a clearance of margin and
+bound is enough whatever side the bevel points to.
+
+One insertion of a needle that bends: where its bevel takes it, and what the arm feels.
+
+The tissues along one path, from the skin to the target.
+
+What lies along one path: the CT's Hounsfield units beside the structures that the case names there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.structure import Structure
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.formats.labels.naming import REST
+from puncture_twin.planning.geometry.containment import crossings, holds
+from puncture_twin.planning.needle.deflection import (
+    Bending,
+    BevelPath,
+    DeflectionBound,
+    Layer,
+    bevel_path,
+    shortest_bend,
+    step_for,
+    stiffest_resolved,
+)
+from puncture_twin.planning.needle.insertion_force import InsertionForce, insertion_force
+from puncture_twin.planning.search.candidates import Candidates, Verdict
+
+
+def with_bending(anatomy: Anatomy, found: Candidates, bound: DeflectionBound | None) -> Candidates:
+    """Reject what lacks the clearance to bend; nothing that was rejected becomes safe.
+
+    Args:
+        anatomy: The structures of ``found``.
+        found: Checked for a straight needle.
+        bound: How far the needle may bend; None bends nothing.
+    """
+    if bound is None:
+        return found
+    deflection = bound.at(found.path.length)
+    verdict = bent_verdict(found.verdict, anatomy.checked, found.clearance.distance, deflection)
+    return replace(found, verdict=verdict, deflection=deflection)
+
+
+def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance: Floats, deflection: Floats) -> Verdict:
+    """A verdict with those rejected whose clearance is less than a margin and the deflection.
+
+    Args:
+        verdict: Of n candidates.
+        structures: The k structures.
+        clearance: Shape (n, k), of the straight needle, mm.
+        deflection: Shape (n,), the greatest, mm.
+    """
+    demanding = np.flatnonzero([one.demands_margin for one in structures])
+    if not len(demanding):
+        return verdict
+    excess = clearance[:, demanding] - np.array([structures[column].margin_mm for column in demanding])
+    nearest = demanding[excess.argmin(axis=1)]
+    rows = np.flatnonzero((verdict.reason == Reason.NONE.value) & ~(excess.min(axis=1) >= deflection))
+    arrays = {field.name: getattr(verdict, field.name).copy() for field in fields(verdict)}
+    arrays["reason"][rows] = Reason.NEEDLE_BENDS.value
+    for row in rows:
+        one = structures[nearest[row]]
+        arrays["structure"][row], arrays["amount"][row] = one.name, clearance[row, nearest[row]]
+        arrays["detail"][row] = f"it may bend by {deflection[row]:.2f} mm, and the margin is {one.margin_mm:g} mm"
+    return Verdict(**arrays)
+
+
+class Insertion(NamedTuple):
+    """A bevel that never turns, along one path; N and mm."""
+
+    path: BevelPath
+    force: InsertionForce
+    buckling_free_n: float
+    buckling_pinned_n: float
+
+    @property
+    def tip_mm(self) -> float:
+        """By how much the tip misses a straight line, to the side to which the bevel points."""
+        return float(self.path.cut_mm[-1])
+
+    def lines(self, greatest_mm: float) -> list[str]:
+        """For a person.
+
+        Args:
+            greatest_mm: The bound that the search keeps.
+        """
+        peak, free, pinned = self.force.peak_n, self.buckling_free_n, self.buckling_pinned_n
+        kept = f"{greatest_mm:.2f} mm are kept as clearance"
+        return [
+            f"  needle bends   {self.tip_mm:8.2f} mm at the tip if its bevel never turns; {kept}",
+            f"  axial force    {peak:8.2f} N at most; the shaft buckles at {free:.1f} N, pinned at {pinned:.1f} N",
+        ]
+
+
+def insertion_along(
+    bending: Bending, anatomy: Anatomy, end_ct: Floats, outward_ct: Floats, path_length: float
+) -> Insertion:
+    """The insertion along one direction.
+
+    Args:
+        bending: Of the case.
+        anatomy: Its structures.
+        end_ct: Shape (3,), mm, where the path ends: the target.
+        outward_ct: Shape (3,), unit.
+        path_length: From there to the skin, mm.
+    """
+    layers = path_layers(bending, anatomy, end_ct, outward_ct, path_length)
+    stiffest = max(layer.tissue.stiffness_n_mm2 for layer in layers)
+    count = max(1, int(np.ceil(path_length / step_for(bending.shaft, stiffest))))
+    middles = (np.arange(count) + 0.5) * path_length / count
+    ends = np.array([layer.end_mm for layer in layers])
+    at = np.minimum(np.searchsorted(ends, middles), len(layers) - 1)
+    stiffness = np.array([layers[row].tissue.stiffness_n_mm2 for row in at])
+    path = bevel_path(bending.shaft, stiffness, np.full(count, bending.alpha), path_length / count)
+    shaft = bending.shaft
+    return Insertion(path, insertion_force(layers), shaft.buckling_n(pinned=False), shaft.buckling_n(pinned=True))
+
+
+STEP_MM = 0.5
+"""Between two samples of a path."""
+
+
+def check_tissues(case: Case, anatomy: Anatomy) -> None:
+    """Refuse tissues that match no structure, contradict each other, or are too stiff for so thin a needle.
+
+    Raises:
+        InputError: One of them.
+    """
+    if case.bending is None:
+        return
+    tissues, most = case.bending.tissues, stiffest_resolved(case.bending.shaft)
+    tissues.check([one.name for one in anatomy.structures], "tissue", case.path)
+    for pattern, tissue in tissues.of_pattern.items():
+        if tissue.stiffness_n_mm2 > most:
+            bend = shortest_bend(case.bending.shaft)
+            what = f"tissue.{pattern}: {tissue.stiffness_n_mm2:g} N/mm2 bends this shaft within {bend:.2g} mm"
+            allowed = f"at most {most:.3g} N/mm2 for it: beyond, no bound of its bending is known"
+            raise InputError(what, where=case.path, allowed=allowed)
+
+
+def path_layers(
+    bending: Bending, anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_length: float
+) -> tuple[Layer, ...]:
+    """What a needle passes, the skin first. In nested structures the smallest counts, by its box.
+
+    A surface is a capsule where it is entered. That of the rest is the skin: coming out of an organ there is none.
+
+    Args:
+        bending: Of the case.
+        anatomy: Its structures; only closed ones have an inside.
+        target_ct: Shape (3,), mm.
+        outward_ct: Shape (3,), unit.
+        path_length: Target to skin, mm.
+    """
+    count = max(1, round(path_length / STEP_MM))
+    edges = np.linspace(0.0, path_length, count + 1)
+    depths = path_length - 0.5 * (edges[1:] + edges[:-1])
+    names = np.full(count, REST, dtype=object)
+    for one in sorted((s for s in anatomy.structures if s.mesh.closed), key=_size, reverse=True):
+        names[inside_at(one, target_ct, outward_ct, depths)] = one.name
+    layers: list[Layer] = []
+    for name, group in groupby(range(count), key=lambda at: names[at]):
+        rows = list(group)
+        tissue = bending.tissues.of(str(name)) or bending.tissues.of_pattern[REST]
+        at_skin = not layers
+        if not at_skin and tissue == bending.tissues.of_pattern[REST]:
+            tissue = replace(tissue, capsule_n=0.0, capsule_mm=0.0)
+        layers.append(Layer(float(edges[rows[0]]), float(edges[rows[-1] + 1]), tissue))
+    return tuple(layers)
+
+
+def _size(structure: Structure) -> float:
+    """Volume of a structure's bounding box, mm^3."""
+    low, high = structure.mesh.bounds
+    return float(np.prod(high - low))
+
+
+PROFILE_STEP_MM = 1.0
+"""Between two samples: finer than the voxels of nearly every CT."""
+BEYOND_SKIN_MM = 30.0
+"""How far outside of the skin the path is followed."""
+
+
+class Stretch(NamedTuple):
+    """A part of a path along which the same structures are.
+
+    Attributes:
+        start_mm: From the target.
+        end_mm: From the target.
+        structures: Names of the closed structures that hold it.
+        hu_low: Least Hounsfield units of its samples, NaN where the image does not reach.
+        hu_median: Their median.
+        hu_high: Their greatest.
+    """
+
+    start_mm: float
+    end_mm: float
+    structures: tuple[str, ...]
+    hu_low: float
+    hu_median: float
+    hu_high: float
+
+
+def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_length: float) -> tuple[Stretch, ...]:
+    """Follow a path from the target to ``BEYOND_SKIN_MM`` outside of the skin; empty without a CT.
+
+    Args:
+        anatomy: With its scan.
+        target_ct: Shape (3,), LPS mm.
+        outward_ct: Shape (3,), unit.
+        path_length: Target to skin, mm; NaN without an entry: nothing is followed.
+    """
+    if anatomy.scan is None or not np.isfinite(path_length):
+        return ()
+    depths = np.arange(0.0, path_length + BEYOND_SKIN_MM, PROFILE_STEP_MM)
+    hu = anatomy.scan.hu_at(target_ct + depths[:, None] * outward_ct)
+    around = np.array([inside_at(s, target_ct, outward_ct, depths) for s in anatomy.checked if s.mesh.closed])
+    names = np.array([s.name for s in anatomy.checked if s.mesh.closed], dtype=object)
+    keys = [(*names[around[:, row]], "" if depth <= path_length else "outside") for row, depth in enumerate(depths)]
+    found, first = [], 0
+    for key, group in groupby(keys):
+        rows = slice(first, first + len(list(group)))
+        first = rows.stop
+        end = depths[rows][-1] + PROFILE_STEP_MM
+        found.append(Stretch(float(depths[rows][0]), float(end), tuple(filter(None, key)), *_range(hu[rows])))
+    return tuple(found)
+
+
+def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
+    """At which depths the path is inside a closed structure: the parity of the crossings before.
+
+    Args:
+        structure: Closed.
+        target_ct: Shape (3,), mm.
+        outward_ct: Shape (3,), unit.
+        depths: Shape (n,), from the target outward, mm.
+    """
+    points = target_ct + depths[:, None] * outward_ct
+    low, high = structure.mesh.bounds
+    if not np.any(np.all((low <= points) & (points <= high), axis=1)):
+        return np.zeros(len(depths), bool)
+    crossed = np.sort(crossings(structure.mesh, target_ct, outward_ct[None]).depth)
+    inside = holds(structure.mesh, target_ct)
+    return np.asarray((np.searchsorted(crossed, depths) % 2 == 1) != inside)
+
+
+def _range(hu: Floats) -> tuple[float, float, float]:
+    seen = hu[np.isfinite(hu)]
+    if not len(seen):
+        return float("nan"), float("nan"), float("nan")
+    return float(seen.min()), float(np.median(seen)), float(seen.max())

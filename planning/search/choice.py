@@ -1,0 +1,337 @@
+"""Which candidate a person wants: the best, one of a rank or window, of two angles, or of an entry into the skin.
+
+A list of directions in a file: points of entry, or angles; each row one direction.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.input_file import decode_text, read_input, unfinished_warnings
+from puncture_twin.planning.base.provenance import Input, content_input
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_coordinate, parse_points
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import reason_text
+from puncture_twin.planning.search.windows import find_windows
+
+NEAR_ENTRY_MM = 10.0
+"""How far from the skin entry of its path a point may be that is to be that entry: a hand's precision on a screen."""
+
+FILES = (".mrk.json", ".fcsv", ".csv")
+"""Endings of files that may hold an entry."""
+
+MOST_POINTS = 2
+"""Of such a file: both ends of a line."""
+
+LEAST_LEVER_MM = 1.0
+"""A point nearer to the target than this gives no direction."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a person wanted; with nothing stated the best candidate that the arm can approach.
+
+    Attributes:
+        angles: θ and β, rad.
+        rank: 1 is the best candidate.
+        window: 1 is the window of the best candidate: then the best of this window.
+        entry_mm: Where the needle is to enter the skin, in the case's space, as it is typed.
+        entry_file: A markups file that holds the entry instead; `with_file_read` reads it.
+        read: That file, once it has been read.
+    """
+
+    angles: tuple[float, float] | None = None
+    rank: int | None = None
+    window: int | None = None
+    entry_mm: tuple[float, float, float] | None = None
+    entry_file: Path | None = None
+    read: tuple[Input, ...] = ()
+
+    @property
+    def of_grid(self) -> bool:
+        """Whether a search's result has to be looked at."""
+        return self.angles is None and self.entry_mm is None and self.entry_file is None
+
+    def text(self, space: Space) -> str:
+        """How it was chosen, such as "rank 3"; an entry in the case's space."""
+        if self.angles is not None:
+            return "its angles"
+        if self.entry_file is not None and self.entry_mm is None:
+            return f"entry of {self.entry_file.name}"
+        if self.entry_mm is not None:
+            return f"entry ({', '.join(f'{mm:g}' for mm in self.entry_mm)}) mm {space}"
+        return f"window {self.window}" if self.window is not None else f"rank {self.rank or 1}"
+
+
+BEST = Choice()
+"""Nothing stated."""
+
+
+class Pick(NamedTuple):
+    """One candidate: a row of a search, or of a check of it alone."""
+
+    candidates: Candidates
+    row: int
+
+
+class Chosen(NamedTuple):
+    """Candidates, and those of their rows that are wanted, the most wanted first."""
+
+    candidates: Candidates
+    rows: Ints
+
+
+def best_pick(found: Candidates) -> Pick | None:
+    """The best candidate of a search; None where nothing is safe."""
+    return Pick(found, int(found.ranked[0])) if len(found.ranked) else None
+
+
+def choose(context: CaseContext, found: Candidates, choice: Choice) -> Chosen:
+    """The candidates that a choice leaves, in the order of preference.
+
+    Args:
+        context: Of the case.
+        found: The search of its grid.
+        choice: What a person wanted.
+
+    Raises:
+        InputError: A rank or window that there is not, or a point that is no skin entry.
+        NoAnswerError: Nothing is safe, or what was wanted is rejected: says why.
+    """
+    if not choice.of_grid:
+        return choose_stated(context, choice)
+    rows = found.ranked
+    if not len(rows):
+        raise NoAnswerError("no candidate is safe", counts=found.counts())
+    if choice.rank is not None:
+        _refuse_beyond(choice.rank, len(rows), "--rank", "safe candidates")
+        return Chosen(found, rows[choice.rank - 1 : choice.rank])
+    if choice.window is not None:
+        windows = find_windows(found)
+        _refuse_beyond(choice.window, len(windows.windows), "--window", "windows")
+        return Chosen(found, rows[windows.of_row[rows] == choice.window])
+    return Chosen(found, rows)
+
+
+def choose_stated(context: CaseContext, choice: Choice) -> Chosen:
+    """The one candidate of a choice by angles or by entry; takes no search.
+
+    Raises:
+        InputError: A point that is no skin entry.
+        NoAnswerError: It is rejected: says why.
+    """
+    checked = context.check(*chosen_angles(context.case, choice))
+    refuse_other_entry(context.case, checked, choice)
+    if not checked.safe[0]:
+        at = checked.at(0)
+        where = f"theta {at['theta_deg']:.4g} deg, beta {at['beta_deg']:.4g} deg"
+        raise NoAnswerError(f"{where} is rejected: {reason_text(checked, 0)}", counts=checked.counts())
+    return Chosen(checked, np.zeros(1, np.int64))
+
+
+def chosen_angles(case: Case, choice: Choice) -> tuple[float, float]:
+    """θ and β (rad) of a choice by angles or by entry.
+
+    Raises:
+        InputError: An entry on the target itself.
+    """
+    if choice.angles is not None:
+        return choice.angles
+    lever = _entry_ct(case, choice) - case.target_ct
+    reach = float(np.linalg.norm(lever))
+    if not reach >= LEAST_LEVER_MM:
+        raise InputError(f"{reach:.2g} mm from the target", where="--entry", allowed="a point on the skin")
+    theta, beta = angles((lever / reach) @ case.T_ct_entry[:3, :3])
+    return float(theta), float(beta)
+
+
+def parse_choice(
+    theta_deg: float | None, beta_deg: float | None, rank: int | None, window: int | None, entry: str | None
+) -> Choice:
+    """A choice from what a person typed.
+
+    Raises:
+        InputError: Two choices at once, one angle alone, or an entry that is not X,Y,Z.
+    """
+    if (theta_deg is None) != (beta_deg is None):
+        raise InputError("one angle alone gives no direction", where="--theta, --beta", allowed="both")
+    stated = {"--theta and --beta": theta_deg, "--rank": rank, "--window": window, "--entry": entry}
+    names = [name for name, value in stated.items() if value is not None]
+    if len(names) > 1:
+        raise InputError(f"{', '.join(names)} at once", where="choice", allowed="one of them")
+    angles = None if theta_deg is None or beta_deg is None else (np.radians(theta_deg), np.radians(beta_deg))
+    if entry is not None and entry.lower().endswith(FILES):
+        return Choice(entry_file=Path(entry))
+    return Choice(angles, rank, window, None if entry is None else _parse_point(entry))
+
+
+def with_file_read(case: Case, choice: Choice) -> Choice:
+    """The choice with the entry that its file holds: one point, or the end of a line whose other end is the target.
+
+    Raises:
+        InputError: A file that cannot be read, more points, or a line that does not end on the target.
+    """
+    path = choice.entry_file
+    if path is None or choice.entry_mm is not None:
+        return choice
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    points = parse_points(data, path, default_space=case.space).points
+    if len(points) > MOST_POINTS:
+        raise InputError(f"{len(points)} points", where=path, allowed="one point, or a line from entry to target")
+    away = np.linalg.norm(points - case.target_ct, axis=1)
+    if len(points) == MOST_POINTS and away.min() > NEAR_ENTRY_MM:
+        what = f"neither end is the target: {away.min():.1f} mm away from it"
+        raise InputError(what, where=path, allowed=f"a line with one end within {NEAR_ENTRY_MM:g} mm of the target")
+    x, y, z = to_lps(points[[int(np.argmax(away))]], case.space)[0].tolist()  # the change of signs undoes itself
+    return replace(choice, entry_mm=(x, y, z), read=(content_input("entry", str(path), data),))
+
+
+def _parse_point(text: str) -> tuple[float, float, float]:
+    where = "--entry"
+    numbers = [parse_coordinate(part.strip(), where) for part in text.split(",")]
+    if len(numbers) != 3:
+        raise InputError(f"{len(numbers)} numbers", where=where, allowed="X,Y,Z in mm, in the case's space")
+    return numbers[0], numbers[1], numbers[2]
+
+
+def _entry_ct(case: Case, choice: Choice) -> Floats:
+    return np.asarray(to_lps(np.array([choice.entry_mm]), case.space)[0])
+
+
+def _refuse_beyond(number: int, count: int, where: str, what: str) -> None:
+    if not 1 <= number <= count:
+        raise InputError(f"{number}: there are {count} {what}", where=where, allowed=f"1 to {count}")
+
+
+def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
+    """Refuse a point from which a straight path enters the skin somewhere else.
+
+    Raises:
+        InputError: Says where it does.
+    """
+    real = checked.path.entry_ct[0]
+    if choice.entry_mm is None or not np.isfinite(real).all():
+        return
+    apart = float(np.linalg.norm(real - _entry_ct(case, choice)))
+    if apart > NEAR_ENTRY_MM:
+        place = ", ".join(f"{mm:.1f}" for mm in to_lps(real[None], case.space)[0])
+        raise InputError(
+            f"the path from there to the target enters the skin {apart:.1f} mm away, at ({place}) mm {case.space}",
+            where="--entry",
+            allowed=f"a point on the skin, to {NEAR_ENTRY_MM:g} mm",
+        )
+
+
+ANGLES = ("theta_deg", "beta_deg")
+ALLOWED_ANGLES = "a header with theta_deg and beta_deg, and perhaps name; then as many fields in every line"
+GREATEST = (180.0, 360.0)
+"""Of the two angles, degrees."""
+
+
+class Listed(NamedTuple):
+    """One row.
+
+    Attributes:
+        number: 1 for the first.
+        name: As the file states it; "" without one.
+        point_mm: Where it states a point: in the case's space, mm.
+        choice: The direction; of a list of targets, whatever was chosen for all.
+    """
+
+    number: int
+    name: str
+    point_mm: tuple[float, float, float] | None
+    choice: Choice
+
+
+class ReadList(NamedTuple):
+    """A file's rows, the file, and what is odd about it."""
+
+    rows: tuple[Listed, ...]
+    input: Input
+    warnings: tuple[str, ...]
+
+
+def read_entries(path: Path, case: Case) -> ReadList:
+    """Entries as points (CSV in the case's space, or Slicer's lists), or a CSV of angles.
+
+    Raises:
+        InputError: A file that cannot be read, or a line that is none; names the line.
+    """
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    source = content_input("entries", str(path), data)
+    if path.suffix.lower() == ".csv" and set(ANGLES) & set(_header(data, path)):
+        return ReadList(_angle_rows(data, path), source, _unfinished(data, path))
+    rows = _points(data, path, case)
+    rows = tuple(one._replace(choice=Choice(entry_mm=one.point_mm)) for one in rows)
+    return ReadList(rows, source, _unfinished(data, path))
+
+
+def read_targets(path: Path, case: Case, choice: Choice) -> ReadList:
+    """Targets as points, in the case's space or in the file's own; the same choice for each.
+
+    Raises:
+        InputError: See `read_entries`.
+    """
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    rows = tuple(one._replace(choice=choice) for one in _points(data, path, case))
+    return ReadList(rows, content_input("targets", str(path), data), _unfinished(data, path))
+
+
+def _unfinished(data: bytes, path: Path) -> tuple[str, ...]:
+    """Of a list that is read line by line and may be cut within a number."""
+    return unfinished_warnings(data, path.name) if path.suffix.lower() in (".csv", ".fcsv") else ()
+
+
+def _points(data: bytes, path: Path, case: Case) -> tuple[Listed, ...]:
+    listed = parse_points(data, path, default_space=case.space)
+    typed = to_lps(listed.points, case.space).tolist()  # the change of signs undoes itself
+    named = enumerate(zip(listed.names, typed, strict=True), start=1)
+    return tuple(Listed(number, name, (x, y, z), Choice()) for number, (name, (x, y, z)) in named)
+
+
+def _header(data: bytes, path: Path) -> list[str]:
+    lines = decode_text(data, str(path)).splitlines()
+    return [field.strip() for field in (lines[0] if lines else "").split(",")]
+
+
+def _angle_rows(data: bytes, path: Path) -> tuple[Listed, ...]:
+    header = _header(data, path)
+    if sorted(header) not in (sorted(ANGLES), sorted((*ANGLES, "name"))):
+        raise InputError(f"columns {header}"[:200], where=f"{path}, header", allowed=ALLOWED_ANGLES)
+    reader = csv.reader(io.StringIO(decode_text(data, str(path)), newline=""), strict=True)
+    rows: list[Listed] = []
+    try:
+        next(reader)
+        for fields in reader:
+            if any(field.strip() for field in fields):
+                where = f"{path}, line {reader.line_num}"
+                rows.append(_angle_row(len(rows) + 1, header, fields, where))
+    except csv.Error as error:
+        raise InputError(f"{error}", where=f"{path}, line {reader.line_num}", allowed=ALLOWED_ANGLES) from error
+    if not rows:
+        raise InputError("no line", where=path, allowed=ALLOWED_ANGLES)
+    return tuple(rows)
+
+
+def _angle_row(number: int, header: list[str], fields: list[str], where: str) -> Listed:
+    if len(fields) != len(header):
+        raise InputError(f"{len(fields)} fields instead of {len(header)}", where=where, allowed=ALLOWED_ANGLES)
+    stated = dict(zip(header, (field.strip() for field in fields), strict=True))
+    theta, beta = (parse_coordinate(stated[name], where) for name in ANGLES)
+    for name, angle, most in zip(ANGLES, (theta, beta), GREATEST, strict=True):
+        if not 0.0 <= angle <= most:
+            raise InputError(f"{name} {angle:g}", where=where, allowed=f"0 to {most:g}")
+    return Listed(number, stated.get("name", ""), None, parse_choice(theta, beta, None, None, None))

@@ -1,0 +1,456 @@
+"""Skin and organs at all positions of the breath, and between them; what the gate lets through decides the verdict.
+
+The arm at every phase that the gate lets through: the target, the skin and what lies on it are elsewhere there.
+
+Skin and organs at every phase of the breath, if the needle is inserted at that phase.
+
+At the position s the target is at t + s b d, and a structure of weight w is displaced by s w b d. Seen from the
+structure, the needle starts at t + s b (1 - w) d: the surfaces stay where they are, and the engine prepared for them is
+asked for another target. What moves with the target (w = 1) is not measured again.
+
+The weight of every structure of a case that breathes: how much of the target's motion it follows; what to warn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
+from puncture_twin.planning.anatomy.skin_entry import SkinPaths
+from puncture_twin.planning.anatomy.structure import Structure
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
+from puncture_twin.planning.breathing.breathing import Breathing, fraction_within
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.settings import Obstacle
+from puncture_twin.planning.clearance.engine import ClearanceEngine, Clearances, measure
+from puncture_twin.planning.collision.workcell import GANTRY, OF_CASE_FILE, case_checker
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.needle.deflection import DeflectionBound
+from puncture_twin.planning.reach.standoff import axis_lengths, own_paths
+from puncture_twin.planning.search.bending import bent_verdict
+from puncture_twin.planning.search.candidates import ArmColumns, BreathingColumns, Candidates, Verdict
+from puncture_twin.planning.search.constraints import ArmReach, first_broken, with_reach
+
+LEAST_MM = 0.1
+"""Positions this near to each other are not parted: what is not shown to be clear there counts as too close."""
+
+
+class _Gap(NamedTuple):
+    """Between the positions low and high: m candidates, k structures, what both leave over the margins, (m, k), mm."""
+
+    rows: Ints
+    columns: Ints
+    low: float
+    high: float
+    at_low: Floats
+    at_high: Floats
+    deflection: Floats
+
+    def of(self, rows: Bools, columns: Bools) -> _Gap:
+        """Of some candidates and structures."""
+        part = np.ix_(rows, columns)
+        ends = self.at_low[part], self.at_high[part]
+        return _Gap(self.rows[rows], self.columns[columns], self.low, self.high, *ends, self.deflection[rows])
+
+
+def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
+    """The verdict with those rejected that no measurement shows to be clear between two positions.
+
+    Args:
+        body: The case.
+        verdict: Of the candidates, with what is rejected at the two positions.
+        low: The one position.
+        high: The other, of the same candidates.
+    """
+    deflection = np.fmax(low.deflection, high.deflection)
+    columns = np.arange(len(body.demanding))
+    return _checked(body, verdict, _Gap(low.rows, columns, low.s, high.s, low.excess, high.excess, deflection))
+
+
+def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
+    moves = body.moves_mm(gap.low, gap.high)[gap.columns]
+    least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]
+    short = (least < 0) & (moves > 0) & (verdict.reason[gap.rows] == Reason.NONE.value)[:, None]
+    rows, columns = short.any(axis=1), short.any(axis=0)
+    if not rows.any():
+        return verdict
+    gap, least, middle = gap.of(rows, columns), least[np.ix_(rows, columns)], (gap.low + gap.high) / 2
+    if moves[columns].max() <= LEAST_MM:
+        nearest = _names(body, gap, least)
+        return rejected_at(
+            verdict, gap.rows, _too_close(nearest, np.full(len(nearest), np.nan)), body.breathing, middle
+        )
+    excess = body.excess_at(gap.rows, middle, gap.columns)
+    left = excess - gap.deflection[:, None]
+    bad = left.min(axis=1) < 0
+    column = left[bad].argmin(axis=1)
+    amount = excess[bad][np.arange(len(column)), column] + body.margins[gap.columns[column]]
+    close = _too_close(_names(body, gap, left)[bad], amount)
+    verdict = rejected_at(verdict, gap.rows[bad], close, body.breathing, middle)
+    verdict = _checked(body, verdict, gap._replace(high=middle, at_high=excess))
+    return _checked(body, verdict, gap._replace(low=middle, at_low=excess))
+
+
+def _names(body: BreathingBody, gap: _Gap, left: Floats) -> Texts:
+    """The structure that leaves each candidate least."""
+    names = np.array([body.anatomy.checked[column].name for column in body.demanding], dtype=object)
+    return np.asarray(names[gap.columns[left.argmin(axis=1)]])
+
+
+def _too_close(names: Texts, amount: Floats) -> Verdict:
+    blank, reason = np.full(len(names), "", dtype=object), np.full(len(names), Reason.TOO_CLOSE.value, dtype=object)
+    return Verdict(reason, names, np.full(len(names), np.nan), amount, blank)
+
+
+def with_breathing(
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, bound: DeflectionBound | None = None
+) -> Candidates:
+    """Check what is safe through the whole breath, and reject what is not while the gate lets the needle through.
+
+    Args:
+        case: The case; nothing is done where it declares no breathing.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
+        found: Checked where the CT shows the body.
+        bound: How far the needle may bend; None bends nothing.
+
+    Raises:
+        InputError: See `moving_weights`.
+    """
+    breathing = case.breathing
+    if breathing is None:
+        return found
+    body = BreathingBody(case, breathing, anatomy, engine, moving_weights(case, breathing, anatomy), bound, found)
+    rows, within = np.flatnonzero(found.safe), int(breathing.in_window.sum())
+    phases = [body.at(rows, s) for s in breathing.positions.tolist()]
+    verdict = through = found.verdict
+    for at, phase in enumerate(phases):
+        through = rejected_at(through, rows, phase.verdict, breathing, phase.s)
+        if at:
+            through = checked_between(body, through, phases[at - 1], phase)
+        verdict = through if at < within else verdict  # the gate's window is the first of them
+    blank = np.full(len(found), np.nan)
+    worst, clearance = blank.copy(), blank.copy()
+    excess = np.array([phase.least_excess for phase in phases[:within]])
+    worst[rows] = breathing.positions[excess.argmin(axis=0)]
+    clearance[rows] = np.min([phase.clearance.min(axis=1, initial=np.inf) for phase in phases[:within]], axis=0)
+    safe_all = np.asarray(through.reason == Reason.NONE.value) & breathing.whole
+    columns = BreathingColumns(safe_all, worst, clearance, breathing.window_text)
+    return replace(found, verdict=verdict, breathing=columns)
+
+
+def with_breathing_reach(case: Case, anatomy: Anatomy, found: Candidates, reach: ArmReach) -> Candidates:
+    """Reject what the arm cannot reach and insert along at a phase that the gate lets through.
+
+    Args:
+        case: The case; nothing is done where it declares no breathing.
+        anatomy: Its structures.
+        found: Checked with the arm where the CT shows the body.
+        reach: Who checked it.
+    """
+    breathing = case.breathing
+    if breathing is None:
+        return found
+    weights = moving_weights(case, breathing, anatomy)
+    for s in breathing.positions[breathing.in_window].tolist():
+        if np.any(breathing.moved_ct(s)) and found.safe.any():
+            found = _at_phase(case, breathing, anatomy, weights, found, reach, s)
+    return found
+
+
+def _at_phase(
+    case: Case,
+    breathing: Breathing,
+    anatomy: Anatomy,
+    weights: MovingWeights,
+    found: Candidates,
+    reach: ArmReach,
+    s: float,
+) -> Candidates:
+    rows, moved = np.flatnonzero(found.safe), breathing.moved_ct(s)
+    displaced = _displaced(anatomy, weights, breathing, s)
+    solids = _with_moved_solids(case, anatomy, weights, breathing, s, reach.T_base_ct)
+    there = ArmReach(case_checker(solids, displaced, reach.T_base_ct), reach.T_base_ct)
+    paths = own_paths(case, anatomy.skin, found.outward_ct, (1 - weights.skin) * moved)
+    path = replace(found.path, length=paths.path_length, skin_angle=paths.skin_angle)
+    shifted = replace(found, path=path, arm=ArmColumns.unknown(len(found)))
+    answered = with_reach(replace(case, target_ct=case.target_ct + moved), shifted, there)
+    at_phase = answered.verdict.of(rows)
+    return replace(found, verdict=rejected_at(found.verdict, rows, at_phase, breathing, s))
+
+
+def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float) -> Anatomy:
+    """The anatomy with what an arm may touch, the skin and what lies outside of the body, where the breath puts it."""
+    inside, outside = np.split(weights.structures, [len(anatomy.structures)])
+    del inside  # an arm does not come to it
+    return replace(
+        anatomy,
+        skin=replace(anatomy.skin, mesh=_moved(anatomy.skin.mesh, breathing.moved_ct(s, weights.skin))),
+        surroundings=tuple(
+            _moved_structure(one, breathing.moved_ct(s, float(weight)))
+            for one, weight in zip(anatomy.surroundings, outside, strict=True)
+        ),
+    )
+
+
+def _with_moved_solids(
+    case: Case, anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float, T_base_ct: Floats
+) -> Case:
+    """The case with its obstacles and gantry, which the arm's checker takes from there, where their weights say."""
+    names = [one.name for one in anatomy.checked]
+    of = dict(zip(names, weights.structures.tolist(), strict=True))
+
+    def moved(obstacle: Obstacle) -> Obstacle:
+        by_ct = breathing.moved_ct(s, of[obstacle.name])
+        by = T_base_ct[:3, :3] @ by_ct if obstacle.frame == "base" else by_ct
+        return replace(obstacle, center_mm=obstacle.center_mm + by)
+
+    gantry = case.gantry
+    if gantry is not None:
+        gantry = replace(gantry, T_ct_gantry=pose(np.eye(3), breathing.moved_ct(s, of[GANTRY])) @ gantry.T_ct_gantry)
+    return replace(case, obstacles=tuple(moved(one) for one in case.obstacles), gantry=gantry)
+
+
+def _moved_structure(structure: Structure, by_ct: Floats) -> Structure:
+    return replace(structure, mesh=_moved(structure.mesh, by_ct))
+
+
+def _moved(mesh: TriangleMesh, by_ct: Floats) -> TriangleMesh:
+    return mesh.transformed(pose(np.eye(3), by_ct)) if np.any(by_ct) else mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """What some candidates are at one position of the breath.
+
+    Attributes:
+        s: The position.
+        rows: Shape (m,), which candidates.
+        verdict: Of these m.
+        clearance: Shape (m, k), to the k structures with a margin, mm.
+        excess: Shape (m, k), the same less the margins.
+        deflection: Shape (m,), how far the needle may bend, mm; 0 where it does not.
+    """
+
+    s: float
+    rows: Ints
+    verdict: Verdict
+    clearance: Floats
+    excess: Floats
+    deflection: Floats
+
+    @property
+    def safe(self) -> Bools:
+        """Shape (m,)."""
+        return np.asarray(self.verdict.reason == Reason.NONE.value)
+
+    @property
+    def least_excess(self) -> Floats:
+        """Shape (m,), mm; minus infinity where something else than a clearance rejects."""
+        near = np.isin(self.verdict.reason, CLEARANCES) | self.safe
+        return np.asarray(np.where(near, self.excess.min(axis=1, initial=np.inf), -np.inf))
+
+    def of(self, which: Bools) -> Phase:
+        """Of some of the candidates; ``which`` of shape (m,)."""
+        rows = np.flatnonzero(which)
+        arrays = (self.clearance[rows], self.excess[rows], self.deflection[rows])
+        return Phase(self.s, self.rows[rows], self.verdict.of(rows), *arrays)
+
+
+CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE_BENDS.value)
+"""Reasons whose number is a clearance, the only one that is told of a phase."""
+
+
+@dataclass(frozen=True, eq=False)
+class BreathingBody:
+    """A case that breathes, ready to be asked for any position.
+
+    Attributes:
+        case: The case.
+        breathing: Of the case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
+        weights: Of skin and structures.
+        bound: How far the needle may bend; None bends nothing.
+        found: The candidates, checked where the CT shows the body.
+    """
+
+    case: Case
+    breathing: Breathing
+    anatomy: Anatomy
+    engine: ClearanceEngine
+    weights: MovingWeights
+    bound: DeflectionBound | None
+    found: Candidates
+
+    @cached_property
+    def lengths(self) -> Floats:
+        """How far the axes of the n candidates are checked against the k structures, shape (n, k), mm.
+
+        Up to the farthest place at which the flange waits at any position.
+        """
+        case, checked, outward = self.case, self.anatomy.checked, self.found.outward_ct
+        at = [axis_lengths(case, checked, self.paths(outward, s)) for s in self.breathing.positions.tolist()]
+        return np.asarray(np.max(at, axis=0))
+
+    def paths(self, outward_ct: Floats, s: float) -> SkinPaths:
+        """The skin along paths (n, 3) at a position; entries in the moved skin's own coordinates."""
+        moved = (1 - self.weights.skin) * self.breathing.moved_ct(s)
+        return own_paths(self.case, self.anatomy.skin, outward_ct, moved)
+
+    @property
+    def demanding(self) -> Ints:
+        """Columns of the structures with a margin."""
+        return np.flatnonzero([one.demands_margin for one in self.anatomy.checked])
+
+    @property
+    def margins(self) -> Floats:
+        """Of these, shape (k,), mm."""
+        return np.array([self.anatomy.checked[column].margin_mm for column in self.demanding], dtype=np.float64)
+
+    def moves_mm(self, low: float, high: float) -> Floats:
+        """How far each structure with a margin moves against the target between two positions, shape (k,)."""
+        weights = self.weights.structures[self.demanding]
+        return np.asarray(abs(high - low) * self.breathing.amplitude_mm * np.abs(1 - weights))
+
+    def at(self, rows: Ints, s: float) -> Phase:
+        """Some candidates, ``rows`` (m,), at a position, as if inserted there."""
+        case, checked, outward = self.case, self.anatomy.checked, self.found.outward_ct[rows]
+        moved = self.breathing.moved_ct(s)
+        paths = self.paths(outward, s)
+        shifts = moved[None] * (1 - self.weights.structures)[:, None]
+        clearances = self._clearances(rows, shifts)
+        limit = case.search.max_skin_angle
+        verdict = first_broken(paths, clearances, checked, needle=case.needle, max_skin_angle=limit)
+        deflection = np.zeros(len(rows)) if self.bound is None else self.bound.at(paths.path_length)
+        if self.bound is not None:
+            verdict = bent_verdict(verdict, checked, clearances.clearance, deflection)
+        clearance = clearances.clearance[:, self.demanding]
+        return Phase(s, rows, verdict, clearance, clearance - self.margins, deflection)
+
+    def excess_at(self, rows: Ints, s: float, columns: Ints) -> Floats:
+        """What the surfaces of some structures leave over their margins at a position, shape (m, c), mm.
+
+        Args:
+            rows: Shape (m,), which candidates.
+            s: The position.
+            columns: Shape (c,), which of the structures with a margin.
+        """
+        case, which = self.case, self.demanding[columns]
+        distance, weights = np.empty((len(rows), len(columns))), self.weights.structures[which]
+        for weight in np.unique(weights):
+            group = np.flatnonzero(weights == weight)
+            origin = case.target_ct + (1 - weight) * self.breathing.moved_ct(s)
+            part, length = self.engine.of(which[group]), self.lengths[np.ix_(rows, which[group])]
+            distance[:, group] = part.measure(origin, self.found.outward_ct[rows], length, shown=False).distance
+        return np.asarray(distance - case.needle.radius_mm - self.margins[columns])
+
+    def _clearances(self, rows: Ints, shifts_ct: Floats) -> Clearances:
+        """To all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
+        checked, found, radius = self.anatomy.checked, self.found, self.case.needle.radius_mm
+        clearance = found.clearance.distance[rows].copy()
+        depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
+        moved = [one.demands_margin and (one.outside or by.any()) for one, by in zip(checked, shifts_ct, strict=True)]
+        for shift in np.unique(shifts_ct[moved], axis=0):
+            columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & moved)
+            structures, length = tuple(checked[column] for column in columns), self.lengths[np.ix_(rows, columns)]
+            target, outward, part = self.case.target_ct + shift, found.outward_ct[rows], self.engine.of(columns)
+            at = measure(part, structures, target, outward, length=length, radius=radius)
+            clearance[:, columns], depth[:, columns], violated[:, columns] = at.clearance, at.depth, at.violated
+        return Clearances(clearance, depth, violated)
+
+
+def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:
+    """A verdict with what is rejected at one phase; what is rejected already keeps its reason.
+
+    Args:
+        verdict: Of n candidates.
+        rows: Shape (m,), those that were checked at the phase.
+        at_phase: Of these m.
+        breathing: For the words.
+        s: The phase's position.
+    """
+    new = (at_phase.reason != Reason.NONE.value) & (verdict.reason[rows] == Reason.NONE.value)
+    arrays = {field.name: getattr(verdict, field.name).copy() for field in fields(verdict)}
+    near = np.isin(at_phase.reason[new], CLEARANCES)
+    arrays["structure"][rows[new]], arrays["depth"][rows[new]] = at_phase.structure[new], at_phase.depth[new]
+    arrays["amount"][rows[new]] = np.where(near, at_phase.amount[new], np.nan)
+    arrays["reason"][rows[new]] = Reason.UNSAFE_WHEN_BREATHING.value
+    for row, reason, more in zip(rows[new], at_phase.reason[new], at_phase.detail[new], strict=True):
+        arrays["detail"][row] = f"at {breathing.phase_text(s)}: {REASON_TEXT[Reason(reason)]}{more and f', {more}'}"
+    return Verdict(**arrays)
+
+
+SAFE_WHEN = (
+    "breathing: a safe direction is safe {when}: checked at {count} positions, and clearances between them; a needle "
+    "in place moves with the organ and bends"
+)
+PLANS = "breathing: plans and rehearsals go to the target where the CT shows it (s = {s:g}), the patient at rest there"
+OPEN = "breathing: the gate is open {part:.0%} of the time, if the breath follows the curve"
+OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside of the gate (s <= {gate:g})"
+
+
+class MovingWeights(NamedTuple):
+    """Weights of the skin, and of the k checked structures, shape (k,)."""
+
+    skin: float
+    structures: Floats
+
+
+def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> MovingWeights:
+    """The weights that a case states for its structures.
+
+    The target's own structure moves with the target, and obstacles and the gantry, which the case file describes, not
+    at all.
+
+    Raises:
+        InputError: A structure without a weight, a pattern that matches none, or another weight for the target's own.
+    """
+    skin = case.skin_section.name
+    stated = breathing.weights.of_pattern
+    fixed = {one.name: _by_itself(case, one) for one in anatomy.checked}
+    needed = [skin, *(name for name, weight in fixed.items() if weight is None)]
+    others = [name for name in fixed if name not in needed]
+    breathing.weights.check(needed, "breathing.weights", case.path, others=others)
+    own = stated.get(case.target_structure, 1.0)
+    if own != 1.0:
+        message = f"breathing.weights: '{case.target_structure}' holds the target, and {own:g} is not its weight"
+        raise InputError(message, where=case.path, allowed="1, or no weight for it: the amplitude is the target's")
+    of = breathing.weights.of
+    weights = [of(name) if weight is None else stated.get(name, weight) for name, weight in fixed.items()]
+    return MovingWeights(float(of(skin) or 0.0), np.array(weights, dtype=np.float64))
+
+
+def _by_itself(case: Case, structure: Structure) -> float | None:
+    """The weight of what needs no statement; None of all else."""
+    if structure.name in {case.target_structure, BEYOND_IMAGE}:  # which the breath has widened already
+        return 1.0
+    return 0.0 if structure.source == OF_CASE_FILE else None
+
+
+def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
+    """The warnings of a case; none where it declares no breathing.
+
+    Raises:
+        InputError: See `moving_weights`.
+    """
+    breathing = case.breathing
+    if breathing is None:
+        return ()
+    moving_weights(case, breathing, anatomy)
+    count = int(breathing.in_window.sum())
+    said = [SAFE_WHEN.format(when=breathing.window_text, count=count)]
+    if breathing.gate is not None:
+        said.append(OPEN.format(part=fraction_within(breathing.gate, breathing.exponent)))
+    said.append(PLANS.format(s=breathing.scanned_at))
+    if breathing.gate is not None and breathing.scanned_at > breathing.gate:
+        said.append(OUTSIDE_GATE.format(s=breathing.scanned_at, gate=breathing.gate))
+    return tuple(said)

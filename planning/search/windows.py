@@ -1,0 +1,137 @@
+"""Windows: connected sets of safe directions, each with its area and its best candidate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.case.entry import AngleGrid
+from puncture_twin.planning.search.candidates import Candidates
+
+SQUARE_DEGREES = float(np.degrees(1.0) ** 2)
+"""Of a steradian."""
+
+
+MOST_WINDOWS = 10
+"""So many are listed to people."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """One connected set of safe directions.
+
+    Attributes:
+        number: 1 for the window that holds the best candidate, then by the rank of each one's best.
+        best: Row of its best candidate.
+        directions: How many directions of the grid it holds.
+        square_deg: Its solid angle, square degrees.
+        entry_cm2: Area of skin through which its paths enter, cm2.
+        widest_cone: Largest safe cone of its candidates, rad; NaN where none is known.
+    """
+
+    number: int
+    best: int
+    directions: int
+    square_deg: float
+    entry_cm2: float
+    widest_cone: float
+
+    @property
+    def wide_deg(self) -> float:
+        """Across a cone of the same solid angle, degrees."""
+        return 2.0 * float(np.degrees(np.arccos(1.0 - self.square_deg / SQUARE_DEGREES / (2.0 * np.pi))))
+
+    @property
+    def text(self) -> str:
+        """Its size for a person."""
+        return f"{self.entry_cm2:.1f} cm2 on the skin, {self.wide_deg:.0f} deg wide"
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """All windows of a search.
+
+    Attributes:
+        of_row: Shape (n,), the number of each candidate's window; 0 for a rejected candidate.
+        windows: In the order of their numbers.
+    """
+
+    of_row: Ints
+    windows: tuple[Window, ...]
+
+    @property
+    def largest(self) -> Window | None:
+        """The window with the most skin; None where nothing is safe."""
+        return max(self.windows, key=lambda one: one.entry_cm2, default=None)
+
+    @property
+    def headline(self) -> str:
+        """The first thing that a search says of what is safe."""
+        one = self.largest
+        if one is None:
+            return "no window: nothing is safe"
+        return f"the largest window: {one.text}, {one.number} of {len(self.windows)}"
+
+    def rows(self, number: int) -> Ints:
+        """The candidates of one window."""
+        return np.flatnonzero(self.of_row == number)
+
+
+def find_windows(found: Candidates) -> Windows:
+    """The windows of ranked candidates; without a grid every candidate is one of its own, without area."""
+    label = _connected(found.grid, found.safe)
+    ranked = found.ranked
+    firsts = ranked[np.sort(np.unique(label[ranked], return_index=True)[1])]
+    number = np.zeros(len(found), np.int64)
+    for one, row in enumerate(firsts, start=1):
+        number[(label == label[row]) & found.safe] = one
+    cell = np.zeros(len(found)) if found.grid is None else found.grid.solid_angle()
+    skin = _entry_area(found, cell)
+    parts = (_window(one, found, number == one, int(row), cell, skin) for one, row in enumerate(firsts, start=1))
+    return Windows(number, tuple(parts))
+
+
+def nearest_row(found: Candidates, outward_ct: Floats) -> int | None:
+    """The row of a search beside which a direction, shape (3,), lies; None where it is beyond the grid by a step."""
+    row = int(np.argmax(found.outward_ct @ outward_ct))
+    near = found.outward_ct[row]
+    apart = float(np.arctan2(np.linalg.norm(np.cross(near, outward_ct)), near @ outward_ct))
+    return None if found.grid is None or apart > found.grid.step else row
+
+
+def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
+    """A label for each row; safe neighbours share theirs, the least of their rows.
+
+    A label is a row of the same set. Where neighbours differ, the row that one names takes the other's label if that is
+    less, and all rows take the label of the row that they name (Shiloach and Vishkin, J. Algorithms 3, 1982).
+    """
+    if grid is None:
+        return np.arange(len(safe))
+    pairs = grid.neighbours()
+    one, other = pairs[safe[pairs].all(axis=1)].T
+    label: Ints = np.arange(len(safe))
+    while not np.array_equal(label[one], label[other]):
+        least, ends = np.minimum(label[one], label[other]), (label[one], label[other])
+        for end in ends:
+            np.minimum.at(label, end, least)
+        label = label[label]
+    return label
+
+
+def _entry_area(found: Candidates, cell: Floats) -> Floats:
+    """Skin that each direction's cell covers, mm2: the sphere's patch, seen at the angle at which the path enters."""
+    area = cell * found.path.length**2 / np.cos(found.path.skin_angle)
+    return np.asarray(np.where(found.safe, area, 0.0))
+
+
+def _window(number: int, found: Candidates, rows: Bools, best: int, cell: Floats, skin: Floats) -> Window:
+    return Window(
+        number=number,
+        best=best,
+        directions=int(rows.sum()),
+        square_deg=float(cell[rows].sum()) * SQUARE_DEGREES,
+        entry_cm2=float(skin[rows].sum()) / 100.0,
+        widest_cone=float(np.fmax.reduce(found.safe_cone[rows])),
+    )

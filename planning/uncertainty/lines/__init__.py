@@ -1,1 +1,0 @@
-"""The chance to touch beyond first order: the needle is displaced along lines, and where it touches is found."""

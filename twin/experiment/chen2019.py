@@ -1,0 +1,444 @@
+"""What a rigid motion leaves of all points: per axis of the CT, against a declaration, and by one strain.
+
+With z the stacked residuals in CT axes, A the motion's design and C the declaration's covariance:
+
+    chi^2 = z' P z,   P = C^-1 - C^-1 A (A' C^-1 A)^-1 A' C^-1,   3 p - 6 degrees of freedom for p points,
+
+and a strain that moves the points by k b takes (b' M z)^2 / (b' M b) off the sum of squares, M = I - A (A' A)^-1 A'.
+
+Many experiments drawn from a declaration, and where the paper's own one stands among them.
+
+One number that the paper's own points show: a skew of the CT's y against z, found from markers, tried on lesions.
+
+What somebody declares of the experiment's errors, and carton and touches drawn from it; mm and rad.
+
+The pose of the carton does not matter: touches err alike in all directions, so that they are drawn in the CT's axes.
+
+Every error that Chen et al. 2019 print (Tables 3, 5, 6, 7), from touches of either setup; many at once.
+
+What Chen et al. 2019 measured: Tables 1, 2 and 4, mm.
+
+Chen G. et al., "Robot-Assisted Puncture Positioning Methods under CT Navigation", J. Xi'an Jiaotong Univ. 53(4),
+2019, DOI 10.7652/xjtuxb201904013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.optimize import minimize_scalar
+from scipy.special import chdtrc
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.fits.least_squares import design, fit_affine, fit_rigid, fit_triad
+
+Point = tuple[float, float, float]
+
+TABLE_1: Mapping[str, Point] = MappingProxyType(
+    {
+        "A": (10, 20, 147),
+        "B": (110, 120, 147),
+        "C": (60, -10, 80),
+        "D": (90, -10, 20),
+        "E": (20, 150, 147),
+        "L": (50, 150, 39),
+        "M": (50, 130, 63),
+        "H": (50, 120, 76),
+    }
+)
+"""Markers A-E and lesions L, M, H in the CT frame."""
+
+TABLE_2: Mapping[str, Point] = MappingProxyType(
+    {
+        "A": (417.67, -291.23, 534.59),
+        "B": (557.74, -272.83, 534.57),
+        "C": (423.48, -231.41, 604.06),
+        "L": (543.02, -336.48, 641.60),
+        "M": (527.05, -324.48, 617.63),
+        "H": (519.10, -318.38, 604.58),
+    }
+)
+"""The same, touched by the robot, first placement of the box (setup 1), base frame."""
+
+TABLE_4: Mapping[str, Point] = MappingProxyType(
+    {
+        "A": (465.15, -298.26, 533.71),
+        "B": (602.02, -332.68, 533.97),
+        "C": (492.55, -244.10, 602.28),
+        "D": (518.62, -227.75, 661.64),
+        "E": (540.74, -404.60, 533.96),
+        "M": (554.23, -370.12, 617.50),
+    }
+)
+"""Second placement (setup 2), base frame."""
+
+
+NAMES = tuple(TABLE_1)
+"""Of all points, in the order of the rows below."""
+
+READ: Floats = np.array(list(TABLE_1.values()), dtype=np.float64)
+"""Table 1, shape (8, 3): what was read in the CT."""
+READ.setflags(write=False)
+
+SETUPS: tuple[Mapping[str, Point], ...] = (TABLE_2, TABLE_4)
+"""What was touched in either setup."""
+
+TRIADS = ((0, "ABC", "L"), (0, "ABC", "M"), (0, "ABC", "H"), (1, "ABC", "M"), (1, "ABE", "M"), (1, "ACD", "M"))
+"""Setup, markers and lesion of Tables 3 and 5."""
+
+AFFINE = ((1, "ABCE", "M"), (1, "ABCDE", "M"))
+"""Of Table 6, where least squares of twelve parameters are meant."""
+
+
+def rows_of(names: str) -> list[int]:
+    """Rows of points in `READ` by their names."""
+    return [NAMES.index(name) for name in names]
+
+
+def measured() -> tuple[Floats, ...]:
+    """What the paper touched in each setup, shape (1, 8, 3), mm, base frame; NaN where a point was not touched."""
+    return tuple(
+        np.array([[touched.get(name, (np.nan, np.nan, np.nan)) for name in NAMES]], dtype=np.float64)
+        for touched in SETUPS
+    )
+
+
+def printed_errors(touched: tuple[Floats, ...]) -> dict[str, Floats]:
+    """Every printed error of n experiments, by name, each of shape (n,), mm.
+
+    Args:
+        touched: Of each setup, shape (n, 8, 3), rows as `NAMES`, mm.
+    """
+    found = {}
+    for setup, markers, lesion in TRIADS:
+        rows = rows_of(markers)
+        T = fit_triad(np.broadcast_to(READ[rows], (len(touched[setup]), 3, 3)), touched[setup][:, rows])
+        found[f"{lesion} by {'-'.join(markers)}, setup {setup + 1}"] = _misses(T, touched[setup], lesion)[:, 0]
+        if (setup, lesion) == (0, "M"):
+            found["mean residual of A-B-C, setup 1"] = _misses(T, touched[setup], markers).mean(axis=1)
+    for setup, markers, lesion in AFFINE:
+        T = np.array([fit_affine(READ[rows_of(markers)], one[rows_of(markers)]) for one in touched[setup]])
+        found[f"{lesion} by {'-'.join(markers)} (affine), setup {setup + 1}"] = _misses(T, touched[setup], lesion)[:, 0]
+    return found
+
+
+def _misses(T: Floats, touched: Floats, names: str) -> Floats:
+    rows = rows_of(names)
+    fitted = READ[rows] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+    return np.asarray(np.linalg.norm(fitted - touched[:, rows], axis=2))
+
+
+POINTS = tuple("".join(touched) for touched in SETUPS)
+"""Names of the points of each setup."""
+
+FREEDOM = sum(3 * len(names) - 6 for names in POINTS)
+"""24: of both setups together."""
+
+STRAINS: Mapping[str, tuple[int, int]] = MappingProxyType(
+    {
+        "scale of x": (0, 0),
+        "scale of y": (1, 1),
+        "scale of z": (2, 2),
+        "x against y": (0, 1),
+        "x against z": (0, 2),
+        "y against z": (1, 2),
+    }
+)
+"""What one number may be wrong with a CT's frame: an axis that moves along another, or along itself."""
+
+
+def rigid_residuals(touched: tuple[Floats, ...]) -> tuple[Floats, ...]:
+    """Of each setup: touched minus fitted by all its points, CT axes, shape (n, p, 3), from touches (n, 8, 3), mm."""
+    found = []
+    for names, points in zip(POINTS, touched, strict=True):
+        rows = rows_of(names)
+        T = fit_rigid(np.broadcast_to(READ[rows], (len(points), len(rows), 3)), points[:, rows])
+        fitted = READ[rows] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        found.append((points[:, rows] - fitted) @ T[:, :3, :3])
+    return tuple(found)
+
+
+def axis_squares(residuals: tuple[Floats, ...]) -> Floats:
+    """Sums of squares per axis of the CT, both setups, shape (n, 3), mm^2."""
+    return np.asarray(sum(np.sum(one**2, axis=1) for one in residuals))
+
+
+def chi_squared(residuals: tuple[Floats, ...], declaration: Declaration) -> Floats:
+    """Of both setups against a declaration, shape (n,); `FREEDOM` degrees. Both touch one carton: C is not diagonal."""
+    rows = np.array([row for names in POINTS for row in rows_of(names)])
+    axes = (3 * rows[:, None] + np.arange(3)).ravel()
+    cov = declaration.carton_covariance(READ)[np.ix_(axes, axes)] + declaration.touch_mm**2 * np.eye(len(axes))
+    A, weights = block_diag(*(_design(names) for names in POINTS)), np.linalg.inv(cov)
+    P = weights - weights @ A @ np.linalg.solve(A.T @ weights @ A, A.T @ weights)
+    z = np.concatenate([one.reshape(len(one), -1) for one in residuals], axis=1)
+    return np.asarray(np.einsum("na,ab,nb->n", z, P, z))
+
+
+def _design(names: str) -> Floats:
+    points = READ[rows_of(names)]
+    return design(points, points.mean(axis=0))
+
+
+def strain_gains(residuals: tuple[Floats, ...]) -> dict[str, Floats]:
+    """Fraction of both setups' sum of squares that each strain alone takes away, shape (n,) each."""
+    whole = axis_squares(residuals).sum(axis=1)
+    gains = {}
+    for name, (moved, along) in STRAINS.items():
+        # one number for both setups: numerator and denominator add up before the square
+        dot, norm = np.zeros(len(whole)), 0.0
+        for names, one in zip(POINTS, residuals, strict=True):
+            points = READ[rows_of(names)] - READ[rows_of(names)].mean(axis=0)
+            b = np.zeros(points.shape)
+            b[:, moved] = points[:, along]
+            A = design(points, np.zeros(3))
+            left = b.ravel() - A @ np.linalg.lstsq(A, b.ravel(), rcond=None)[0]
+            dot, norm = dot + one.reshape(len(one), -1) @ left, norm + float(left @ left)
+        gains[name] = dot**2 / norm / whole
+    return gains
+
+
+REJECTED = 1e-6
+"""A declaration under which the paper's residuals are less likely is not its."""
+
+MARGINAL = (5.0, 95.0)
+JOINT = (2.5, 97.5)
+"""Percentiles between which a printed error, and a joint statistic, lies where a declaration is right."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A number of the paper among as many draws of it.
+
+    Attributes:
+        name: Of the number.
+        paper: The paper's, by its own points.
+        percentile: Of the draws below it, 0 to 100.
+        low: 5th percentile of the draws.
+        median: Of the draws.
+        high: 95th percentile of the draws.
+    """
+
+    name: str
+    paper: float
+    percentile: float
+    low: float
+    median: float
+    high: float
+
+    def within(self, bounds: tuple[float, float]) -> bool:
+        """Whether it is as usual as that."""
+        return bool(bounds[0] <= self.percentile <= bounds[1])
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The paper's experiment under one declaration.
+
+    Attributes:
+        declaration: What was drawn from.
+        draws: So many.
+        printed: Each printed error, mm.
+        joint: Sums of squares per axis of the CT (mm^2), and chi-squared, over all points of both setups.
+        probability: Of a chi-squared as large as the paper's, by the law with 24 degrees.
+        best_strain: Fraction of draws in which some strain takes away as much as the paper's best one does.
+    """
+
+    declaration: Declaration
+    draws: int
+    printed: tuple[Standing, ...]
+    joint: tuple[Standing, ...]
+    probability: float
+    best_strain: float
+
+    @property
+    def rejected(self) -> bool:
+        """Whether all points together contradict the declaration."""
+        return self.probability < REJECTED
+
+    @property
+    def agrees(self) -> bool:
+        """Whether every printed error and every joint statistic is as usual as it should be."""
+        return all(one.within(MARGINAL) for one in self.printed) and all(one.within(JOINT) for one in self.joint)
+
+
+def run_draws(declaration: Declaration, draws: int, rng: np.random.Generator) -> Experiment:
+    """Draw carton, readings and touches of both setups, and compute every number of the paper from them."""
+    carton = declaration.draw_carton(READ, draws, rng)  # one box: both setups touch the same points
+    touched = tuple(declaration.draw_touches(carton, rng) for _ in SETUPS)
+    paper, drawn = rigid_residuals(measured()), rigid_residuals(touched)
+    chi = float(chi_squared(paper, declaration)[0])
+    return Experiment(
+        declaration,
+        draws,
+        _standings(printed_errors(measured()), printed_errors(touched)),
+        _standings(_joint(paper, declaration), _joint(drawn, declaration)),
+        float(chdtrc(FREEDOM, chi)),
+        float(np.mean(_best(drawn) >= _best(paper)[0])),
+    )
+
+
+def paper_strains() -> Mapping[str, float]:
+    """Fraction of the paper's sum of squares that each strain of the CT's frame alone takes away."""
+    return MappingProxyType({name: float(gain[0]) for name, gain in strain_gains(rigid_residuals(measured())).items()})
+
+
+def _joint(residuals: tuple[Floats, ...], declaration: Declaration) -> dict[str, Floats]:
+    squares = axis_squares(residuals)
+    named = {f"squares along {axis}": squares[:, column] for column, axis in enumerate("xyz")}
+    return {**named, "chi-squared": chi_squared(residuals, declaration)}
+
+
+def _best(residuals: tuple[Floats, ...]) -> Floats:
+    return np.asarray(np.max(list(strain_gains(residuals).values()), axis=0))
+
+
+def _standings(paper: Mapping[str, Floats], drawn: Mapping[str, Floats]) -> tuple[Standing, ...]:
+    rows = []
+    for name, values in drawn.items():
+        low, median, high = np.percentile(values, (5, 50, 95))
+        at = float(paper[name][0])
+        rows.append(Standing(name, at, 100.0 * float(np.mean(values < at)), float(low), float(median), float(high)))
+    return tuple(rows)
+
+
+MARKERS, SETUP = "ABCDE", 1
+"""From which the skew is found: the markers of the second setup, no lesion among them."""
+
+WIDEST = 0.3
+"""tan of 17 degrees: no scanner is farther out of square."""
+
+
+@dataclass(frozen=True)
+class LesionErrors:
+    """What the paper's triads miss a lesion by, mm.
+
+    Attributes:
+        name: Lesion, markers and setup.
+        as_read: As the paper prints it.
+        square: With the skew taken off the CT's readings.
+    """
+
+    name: str
+    as_read: float
+    square: float
+
+
+@dataclass(frozen=True)
+class SkewFinding:
+    """The skew, and what it does.
+
+    Attributes:
+        angle: rad, of y against z.
+        lesions: Each lesion that the paper's triads reach for.
+    """
+
+    angle: float
+    lesions: tuple[LesionErrors, ...]
+
+
+def find_skew() -> SkewFinding:
+    """Find the skew from the markers of setup 2 alone, and take it off before every triad of both setups."""
+    names = rows_of(MARKERS)
+    touched = _touched(SETUP)
+
+    def squares(k: float) -> float:
+        square = unskewed(READ, k)[names]
+        return float(np.sum((apply(fit_rigid(square, touched[names]), square) - touched[names]) ** 2))
+
+    k = float(minimize_scalar(squares, bounds=(-WIDEST, WIDEST), method="bounded", options={"xatol": 1e-9}).x)
+    lesions = tuple(
+        LesionErrors(
+            f"{lesion} by {'-'.join(markers)}, setup {setup + 1}",
+            _miss(READ, setup, markers, lesion),
+            _miss(unskewed(READ, k), setup, markers, lesion),
+        )
+        for setup, markers, lesion in TRIADS
+    )
+    return SkewFinding(float(np.arctan(k)), lesions)
+
+
+def unskewed(points: Floats, k: float) -> Floats:
+    """Points (n, 3) with y moved by k along z, mm."""
+    moved = points.copy()
+    moved[:, 1] += k * points[:, 2]
+    return moved
+
+
+def _miss(read: Floats, setup: int, markers: str, lesion: str) -> float:
+    touched, row = _touched(setup), rows_of(lesion)[0]
+    T = fit_triad(read[rows_of(markers)], touched[rows_of(markers)])
+    return float(np.linalg.norm(apply(T, read[row]) - touched[row]))
+
+
+def _touched(setup: int) -> Floats:
+    found = np.full(READ.shape, np.nan)
+    for name, point in SETUPS[setup].items():
+        found[rows_of(name)[0]] = point
+    return found
+
+
+BED = 0
+"""The CT's axis along the bed: the slices lie across it."""
+
+PLANES = ((0, 1), (0, 2), (1, 2))
+"""Pairs of CT axes that may be askew: the first along the second."""
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """Errors of one experiment.
+
+    Attributes:
+        name: What it is called in a table.
+        slice_mm: Slice spacing: a uniform error of half of it each way along the bed.
+        pixel_mm: The same across the bed.
+        reading_mm: Standard deviation of a reading in the CT, per axis, besides.
+        skew: Standard deviation of each plane's angle, rad: one draw for the whole CT.
+        touch_mm: Standard deviation of a touch, per axis.
+    """
+
+    name: str
+    slice_mm: float = 0.0
+    pixel_mm: float = 0.0
+    reading_mm: float = 0.0
+    skew: float = 0.0
+    touch_mm: float = 0.0
+
+    def draw_carton(self, read: Floats, count: int, rng: np.random.Generator) -> Floats:
+        """Where points (p, 3) that were read truly are, shape (count, p, 3)."""
+        cells = rng.uniform(-0.5, 0.5, (count, *read.shape)) * self._cell()
+        found = read + cells + rng.normal(0.0, 1.0, (count, *read.shape)) * self.reading_mm
+        for first, second in PLANES:
+            tangents = np.tan(rng.normal(0.0, 1.0, count) * self.skew)
+            found[..., first] += tangents[:, None] * (read - read.mean(axis=0))[:, second]
+        return np.asarray(found)
+
+    def draw_touches(self, true: Floats, rng: np.random.Generator) -> Floats:
+        """Touches of true points (..., 3), same shape."""
+        return np.asarray(true + rng.normal(0.0, 1.0, true.shape) * self.touch_mm)
+
+    def carton_covariance(self, read: Floats) -> Floats:
+        """Of true points against their readings (p, 3), shape (3 p, 3 p), mm^2; skews to first order."""
+        cov = np.diag(np.tile(self._cell() ** 2 / 12 + self.reading_mm**2, len(read)))
+        for first, second in PLANES:
+            moved = np.zeros(read.shape)
+            moved[:, first] = (read - read.mean(axis=0))[:, second]
+            cov += self.skew**2 * np.outer(moved.ravel(), moved.ravel())
+        return np.asarray(cov)
+
+    def _cell(self) -> Floats:
+        cell = np.full(3, self.pixel_mm)
+        cell[BED] = self.slice_mm
+        return cell
+
+
+AS_STATED = Declaration("as the paper states", slice_mm=5.0, pixel_mm=1.0, touch_mm=0.1)
+"""Slices of 5 mm, pixels read to 1 mm, a control error of 0.1 mm."""
+
+AS_FOUND = Declaration("as its touches show", reading_mm=0.5, skew=float(np.radians(2.0)), touch_mm=0.35)
+"""A CT out of square, readings and touches as the distances between its points show (docs/reference/validation.md)."""

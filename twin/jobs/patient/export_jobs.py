@@ -1,0 +1,135 @@
+"""A plan for MoveIt and ROS 2: the scene, the goals, the arm with its needle and a sender, as one set.
+
+A chosen path of a case for 3D Slicer; the arm is not needed, and without it there is no transform.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.export.exporter import Exported
+from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
+from puncture_twin.planning.export.slicer import NAMES, SLICER, Drawn, entry_area, slicer_files
+from puncture_twin.planning.plan.plan_check import with_case_arm
+from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
+from puncture_twin.planning.plan.recheck import check_plan, with_case_warnings
+from puncture_twin.planning.search.choice import Choice, choose, choose_stated, with_file_read
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.twin.jobs.patient.main_job import plan_case
+
+NOTES = (
+    "scene, goals, arm with needle and a sender: read the sender before it is run; it asks before each phase",
+    "send 'insertion' only when the operator says so; no controller of ROS stops at tissue",
+    "nothing here has been run against a controller or MoveIt: the messages were compared with their definitions",
+    "the URDF names the meshes of this installation by absolute addresses",
+)
+
+
+def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, choice: Choice) -> Exported:
+    """Check a plan against its case again, or make it; write the four files.
+
+    Args:
+        context: The case.
+        plan_path: The plan; None plans what is chosen, into the same folder.
+        out: Where they go.
+        choice: Of the candidate, where there is no plan yet.
+
+    Raises:
+        InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
+        NoAnswerError: No plan.
+    """
+    note = context.watcher.note
+    if plan_path is None:
+        plan_case(context, out, choice)
+        plan_path = out / "plan.json"
+    found = read_output(plan_path, max_bytes=MAX_PLAN_BYTES)
+    if found.note:
+        note(f"warning: {found.note}")
+    source, plan = found.input("plan"), parse_plan(found.data, plan_path)
+    check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+    plan = with_case_warnings(with_case_arm(plan, context.case), context)
+    names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
+    texts = moveit_files(plan, context.case, context.anatomy, source=plan_path)
+    made_from = {source.path: source.sha256}
+    with writing(out, f"export {names[0]}", inputs=inputs, names=names, made_from=made_from, note=note) as draft:
+        for name, text in texts.items():
+            with atomic(draft.folder / name) as temporary:
+                temporary.write_text(text, encoding="ascii")
+    path = draft.final(tuple(draft.folder / name for name in names))[0]
+    return Exported(path, MOVEIT, NOTES, inputs, plan)
+
+
+NO_APPROACH = "the directions were checked; no approach of the arm was planned"
+
+
+@dataclass(frozen=True)
+class SlicerExport:
+    """What was written.
+
+    Attributes:
+        files: Where they lie.
+        path: The direction that the line shows.
+        notes: What whoever opens them should know, one sentence each.
+        warnings: Of the case.
+        inputs: Every file that decided them.
+    """
+
+    files: tuple[Path, ...]
+    path: str
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+    inputs: tuple[Input, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values."""
+        return {
+            "format": SLICER,
+            "path": self.path,
+            "notes": list(self.notes),
+            "warnings": list(self.warnings),
+            "inputs": inputs_document(self.inputs),
+            "files": [str(file) for file in self.files],
+        }
+
+    def text(self) -> str:
+        """As lines."""
+        lines = [*self.notes, *(f"warning: {one}" for one in self.warnings)]
+        return "\n".join(
+            [f"{SLICER}: {self.path}", *(f"  {file}" for file in self.files), *(f"  {one}" for one in lines)]
+        )
+
+
+def export_to_slicer(context: CaseContext, out: Path, choice: Choice) -> SlicerExport:
+    """Search, and write the chosen path, the safe entry area, markers, transform and scene as one set.
+
+    Raises:
+        InputError: There is nothing of what was chosen, or the case has no patient space.
+        NoAnswerError: Nothing is safe, or what was chosen is not.
+    """
+    case, stages = context.case, context.stages
+    choice = with_file_read(case, choice)
+    inputs = (*choice.read, *case.inputs)
+    if not choice.of_grid:
+        choose_stated(context, choice)  # before the search is made for nothing
+    with writing(
+        out, f"export {SLICER}", inputs=inputs, seconds=stages.seconds, names=NAMES, note=context.watcher.note
+    ) as draft:
+        found = context.search()
+        chosen = choose(context, found, choice)
+        row = int(chosen.rows[0])
+        at = chosen.candidates.at(row)
+        name = f"path theta {at['theta_deg']:.6g} beta {at['beta_deg']:.6g}"
+        drawn = Drawn(name, chosen.candidates.path.entry_ct[row], entry_area(found), context.placement)
+        made = slicer_files(case, drawn)
+        for file, text in made.texts.items():
+            (draft.folder / file).write_text(text, encoding="utf-8")
+    files = draft.final(tuple(draft.folder / file for file in made.texts))
+    return SlicerExport(
+        files, name, (NO_APPROACH, f"arm: {found.arm_note}", *made.notes), tuple(context.anatomy.warnings), inputs
+    )

@@ -1,0 +1,230 @@
+"""What each source of the needle's error costs, and what a change of scan, markers or arm leaves of it, drawn.
+
+``rooms.png``: where the tips of many rooms ended, and how often, beside what was predicted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy.special import chdtri
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.uncertainty.hit import hit_in_ball
+from puncture_twin.twin.report.palette import PNG_LEVEL
+
+WIDTH_INCHES, HEAD_INCHES, ROW_INCHES, DPI = 13.2, 1.6, 0.25, 110
+LEAST_ROWS = 16
+"""Of changes; more of them make the picture higher."""
+
+ROOM_FOR_NUMBERS = 1.12
+"""Beside the longest bar."""
+
+ALONE, BETTER, WORSE = "#0072b2", "#009e73", "#d55e00"
+"""Okabe and Ito's blue, green and vermilion; better and worse lie on two sides of a line besides."""
+
+SHOWN_MM = 0.005
+
+
+def draw_budget(facts: Mapping[str, Any], path: Path) -> None:
+    """Write the picture.
+
+    Args:
+        facts: As ``register --json`` has them under ``budget``.
+        path: The PNG to write; it appears whole or not at all.
+    """
+    with atomic(path) as temporary:
+        temporary.write_bytes(budget_png(facts))
+
+
+def budget_png(facts: Mapping[str, Any]) -> bytes:
+    """The picture as a PNG.
+
+    Args:
+        facts: As of `draw_budget`.
+    """
+    inches = (WIDTH_INCHES, HEAD_INCHES + ROW_INCHES * max(LEAST_ROWS, len(facts["changes"])))
+    figure = Figure(figsize=inches, dpi=DPI, facecolor="white", layout="constrained")
+    sources, what_if = figure.subplots(1, 2)
+    _sources(sources, facts)
+    _changes(what_if, facts)
+    best = facts["best"]
+    figure.suptitle(
+        f"expected tip error {facts['expected_mm']:.2f} mm (rms); least with {best['text']}: "
+        f"{best['expected_mm']:.2f} mm",
+        fontsize=11.5,
+    )
+    FigureCanvasAgg(figure)
+    held = BytesIO()
+    figure.savefig(held, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
+    return held.getvalue()
+
+
+def _sources(axes: Axes, facts: Mapping[str, Any]) -> None:
+    rows = [one for one in facts["sources"] if one["alone_mm"] >= SHOWN_MM]
+    axes.barh([one["text"] for one in rows], [one["alone_mm"] for one in rows], color=ALONE)
+    for at, one in enumerate(rows):
+        axes.text(one["alone_mm"], at, f" {one['alone_mm']:.2f}", va="center", fontsize=9)
+    axes.invert_yaxis()
+    axes.set_xlim(right=ROOM_FOR_NUMBERS * max(one["alone_mm"] for one in rows))
+    axes.set_xlabel("the tip's error (rms), were there no other source, mm")
+    axes.set_title("each source alone: their squares add up", fontsize=10)
+    _plain(axes)
+
+
+def _changes(axes: Axes, facts: Mapping[str, Any]) -> None:
+    now, rows = facts["expected_mm"], facts["changes"]
+    left = [one["expected_mm"] for one in rows]
+    axes.hlines(range(len(rows)), now, left, color=[BETTER if mm <= now else WORSE for mm in left], linewidth=2)
+    axes.scatter(left, range(len(rows)), color=[BETTER if mm <= now else WORSE for mm in left], zorder=3)
+    axes.axvline(now, color="black", linewidth=1)
+    axes.text(now, -0.9, " as it is", fontsize=9, va="center")
+    axes.set_yticks(range(len(rows)), [one["text"] for one in rows])
+    axes.set_ylim(len(rows) - 0.4, -1.4)
+    axes.set_xlabel("the tip's error (rms) with this one change, mm")
+    axes.set_title("what if: one change, all else as it is", fontsize=10)
+    _plain(axes)
+
+
+def _plain(axes: Axes) -> None:
+    axes.set_xlim(left=0)
+    axes.grid(axis="x", alpha=0.3)
+    axes.tick_params(labelsize=9)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+
+
+FIGURE_INCHES, DISTRIBUTION_DPI = (17.2, 4.7), 110
+EDGES = MappingProxyType({"left": 0.036, "right": 0.994, "bottom": 0.175, "top": 0.865, "wspace": 0.19})
+"""Of the four plots, in the picture: to find out what room their words need takes longer than to draw them."""
+
+MOST_POINTS = 4000
+"""Of a cloud: more hide one another."""
+
+WITHIN, BEYOND, PREDICTED = "#0072b2", "#d55e00", "#000000"
+"""Okabe and Ito's blue and vermilion; what lies beyond is a cross too."""
+
+BINS = 40
+REGION = 0.95
+CROWDED = 0.6
+"""Radii of the ellipse that stay free around it."""
+
+LEVELS = np.linspace(0.05, 0.95, 19)
+"""Predicted chances at which the rooms are counted: so far from the target the tip should be within this often."""
+
+TWO_SIDED = 1.96
+"""Standard errors that hold 95 % of what chance alone does."""
+
+
+def needle_frame(outward_ct: Floats) -> Floats:
+    """R_needle_ct, shape (3, 3), of a needle that comes along a unit vector (3,): two lateral axes, then depth."""
+    depth = -outward_ct
+    helper = np.eye(3)[np.argmin(np.abs(depth))]
+    x = np.cross(helper, depth)
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(depth, x), depth])
+
+
+def draw_rooms_picture(found: Any, path: Path) -> None:
+    """Write the picture.
+
+    Args:
+        found: A `Distribution` of one room or more.
+        path: The PNG to write; it appears whole or not at all.
+    """
+    R = needle_frame(found.puncture.outward_ct)
+    error, cov = found.error_ct @ R.T, R @ found.cov_ct @ R.T
+    figure = Figure(figsize=FIGURE_INCHES, dpi=DISTRIBUTION_DPI, facecolor="white")
+    side, along, sizes, chances = figure.subplots(1, 4, gridspec_kw=dict(EDGES))
+    _cloud(side, error, cov, found.in_region, (0, 1), ("lateral x, mm", "lateral y, mm"))
+    side.set_title("tip in the patient, seen along the needle", fontsize=10)
+    _cloud(along, error, cov, found.in_region, (0, 2), ("lateral x, mm", "depth, mm (down: too deep)"))
+    along.invert_yaxis()
+    along.set_title("seen from the side", fontsize=10)
+    figure.legend(*along.get_legend_handles_labels(), fontsize=7.5, loc="lower left", ncols=4)
+    _histogram(sizes, found)
+    _reliability(chances, found)
+    figure.suptitle(
+        f"{len(found):,} rooms, seed {found.seed}: {100 * found.in_region.mean():.1f} % inside of the predicted 95 % "
+        f"ellipsoid; rms {found.realised_rms_mm:.2f} mm, predicted {found.predicted_rms_mm:.2f} mm",
+        fontsize=11.5,
+    )
+    with atomic(Path(path)) as temporary:
+        FigureCanvasAgg(figure)
+        figure.savefig(temporary, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
+
+
+def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int, int], names: tuple[str, str]) -> None:
+    """The errors on two axes, and the shadow of the 95 % ellipsoid there."""
+    shown = np.arange(len(error)) < MOST_POINTS
+    for rows, colour, marker, text in (
+        (shown & within, WITHIN, ".", "tip inside of the ellipsoid"),
+        (shown & ~within, BEYOND, "x", "outside of it, in some direction"),
+    ):
+        points = error[rows][:, list(pair)]
+        axes.scatter(points[:, 0], points[:, 1], s=14, c=colour, marker=marker, linewidths=0.8, alpha=0.6, label=text)
+    turns = np.linspace(0, 2 * np.pi, 241)
+    values, vectors = np.linalg.eigh(cov[np.ix_(pair, pair)])
+    ring = vectors @ (np.sqrt(chdtri(3, 1 - REGION) * np.maximum(values, 0))[:, None] * [np.cos(turns), np.sin(turns)])
+    axes.plot(*ring, color=PREDICTED, lw=1.6, label="predicted 95 % ellipsoid")
+    axes.plot([0], [0], marker="+", color=PREDICTED, ms=11, mew=1.6, ls="none", label="true target")
+    reach = (1 + CROWDED) * max(float(np.abs(ring).max()), float(np.abs(error[:, list(pair)]).max()) / (1 + CROWDED))
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+    axes.set_aspect("equal")
+    axes.set_xlabel(names[0])
+    axes.set_ylabel(names[1])
+    axes.grid(visible=True, color="0.9")
+    axes.set_axisbelow(True)
+
+
+def _histogram(axes: Axes, found: Any) -> None:
+    """How far the tips ended from the true target, over the predicted density."""
+    sizes = found.tip_error_mm
+    top = 1.02 * max(float(sizes.max()), 2.5 * found.predicted_rms_mm)
+    edges = np.linspace(0, top, BINS + 1)
+    axes.hist(sizes, bins=list(edges), color=WITHIN, alpha=0.55, label="rooms")
+    fine = np.linspace(0, top, 4 * BINS + 1)
+    reached = np.array([hit_in_ball(found.cov_ct[None], radius)[0] if radius > 0 else 0.0 for radius in fine.tolist()])
+    density = np.diff(reached) * len(found) * 4
+    axes.plot((fine[1:] + fine[:-1]) / 2, density, color=PREDICTED, lw=1.6, label="predicted")
+    median = float(np.median(sizes))
+    axes.axvline(median, color=BEYOND, ls="--", lw=1.5, label=f"median {median:.2f} mm")
+    axes.set_xlim(0, top)
+    axes.set_xlabel("true tip to true target, mm")
+    axes.set_ylabel("rooms")
+    axes.set_title("tip error", fontsize=10)
+    axes.legend(fontsize=8)
+
+
+def _reliability(axes: Axes, found: Any) -> None:
+    """How often it happened over how often it was predicted: the tip within a radius, the target hit, each touch."""
+    sizes = np.sort(found.tip_error_mm)
+    radii = np.geomspace(0.02, 5.0, 400) * found.predicted_rms_mm
+    predicted = np.array([hit_in_ball(found.cov_ct[None], radius)[0] for radius in radii.tolist()])
+    within = np.searchsorted(sizes, np.interp(LEVELS, predicted, radii), side="right") / len(found)
+    fine = np.linspace(0, 1, 101)
+    spread = TWO_SIDED * np.sqrt(fine * (1 - fine) / len(found))
+    axes.fill_between(fine, fine - spread, fine + spread, color="0.85", lw=0, label="what chance alone does, 95 %")
+    axes.plot([0, 1], [0, 1], color=PREDICTED, lw=1.0)
+    axes.scatter(LEVELS, within, s=16, c=WITHIN, label="tip within a radius", zorder=3)
+    axes.scatter([found.p_hit], [found.hit.mean()], s=60, c=BEYOND, marker="*", label="target hit", zorder=4)
+    axes.scatter(
+        found.p_touch, found.touched.mean(axis=0), s=26, c=BEYOND, marker="x", label="a structure touched", zorder=4
+    )
+    axes.set_xlim(-0.02, 1.02)
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_aspect("equal")
+    axes.set_xlabel("predicted chance")
+    axes.set_ylabel("fraction of rooms in which it happened")
+    axes.set_title("how often it happened", fontsize=10)
+    axes.legend(fontsize=7.5, loc="upper left")

@@ -1,0 +1,605 @@
+"""A motion of the tip under one of the controllers, taken over from the position motors while the arm is at rest.
+
+A spring and a damper at the needle's tip, by joint torques (Hogan 1985).
+
+    tau = ID(q, qd, qdd_ref) + J' (K e + D de/dt + K_i K int e dt)
+
+e is the reference's tip minus the measured one: position, then the rotation between them, in base axes. Without
+contact the model's torque alone follows the reference and the spring corrects what the masses err by; in contact the
+tip yields by F / K. The integral takes the rest away, and with it, in 1/K_i seconds, the compliance: it stands still
+while contact is felt, where the compliance is to be kept.
+
+Stiffness and damping at the tip, and the rule by which a stiffness is refused before it diverges.
+
+Along one mode of effective mass m the loop of stiffness K = m w^2 and damping 2 zeta w m, integrated with the step dt,
+is stable while (w dt)^2 + 4 zeta w dt < 4; for zeta = .8 that is w dt < .96. What is allowed is `MOST_RATIO`.
+
+Source: Hogan 1985, "Impedance control"; Albu-Schaeffer, Ott, Frese, Hirzinger 2003, "Cartesian impedance control of
+redundant robots": damping by factors of mass and stiffness at once ("double diagonalisation"). Their other design, from
+the roots of both, is not positive where position and rotation are coupled, and an arm with a long needle oscillates.
+
+What the tip shall do: a joint motion at every step of the controller, with its speeds and accelerations.
+
+The arm under a controller or its own motors, step by step: what it felt and where its tip went.
+
+The controller's own model of the arm: its inverse dynamics and mass matrix, right for any mount.
+
+PyBullet evaluates inverse dynamics as if the body's base were not turned in the world: gravity enters in world axes and
+leaves in base axes. The model therefore stands in a world of its own, its URDF base unturned, under a gravity that was
+turned instead: g_urdf = R_urdf_base g_base.
+
+The needle's tip as the controller computes it: pose and Jacobian, in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from puncture_twin.planning.arm.kinematics import jacobians, link_frames
+from puncture_twin.planning.arm.links import model_urdf
+from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.geometry.rigid import skew
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.twin.world.arm import Arm, load_arm
+from puncture_twin.twin.world.client import (
+    MM_PER_M,
+    TIME_STEP_S,
+    physics_client,
+    pybullet,
+    set_time_step,
+    step,
+    to_m,
+    to_mm,
+)
+from puncture_twin.twin.world.execution import RECORD_S, Execution, Recorder, felt_force
+from puncture_twin.twin.world.workcell import SimulatedWorkcell
+
+TipControl = Literal["impedance", "admittance", "position"]
+"""A spring at the tip by joint torques, or by moved goals of the position motors; or those motors alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Insertion:
+    """A straight motion of the tip.
+
+    Attributes:
+        model: The arm.
+        tool: What its flange carries.
+        down_base: Shape (3,), unit vector of gravity, base frame.
+        trajectory: From rest to rest.
+        hold_s: How long its end is held.
+    """
+
+    model: UrModel
+    tool: Tool
+    down_base: Floats
+    trajectory: Trajectory
+    hold_s: float
+
+
+class Inserted(NamedTuple):
+    """What happened, and how far the tip was from where it should be, as the encoders say, at most, mm."""
+
+    execution: Execution
+    off_path_mm: float
+
+
+def insert(
+    workcell: SimulatedWorkcell,
+    insertion: Insertion,
+    control: TipControl,
+    joint_offsets: Floats,
+    *,
+    start_s: float = 0.0,
+    resistance: Resistance | None = None,
+) -> Inserted:
+    """Run an insertion from where the arm is.
+
+    Args:
+        workcell: An open room, its arm at rest at the trajectory's start.
+        insertion: What is wanted.
+        control: How the tip follows it.
+        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
+        start_s: Time of its first step.
+        resistance: Of tissue; None for none.
+
+    Raises:
+        InputError: No time step carries the stiffness at some pose of the path.
+    """
+    model, tip_m = insertion.model, float(to_m(insertion.tool.needle_length_mm))
+    with rigid_model(model, insertion.tool, insertion.down_base) as rigid:
+        controller = _controller(rigid, control, insertion.trajectory.q)
+        reference = reference_of(model, tip_m, insertion.trajectory, controller.dt, insertion.hold_s)
+        recorder = Recorder(workcell, reference.q, joint_offsets, controller.dt, start_s)
+        around = Surroundings(joint_offsets, resistance, watch=recorder.see)
+        done = run(workcell.arm, controller, reference, lambda q: tips(model, tip_m, q[None]), around)
+    off_m = np.linalg.norm(tips(model, tip_m, done.q).position_m - reference.position_m, axis=1)
+    return Inserted(recorder.execution(), float(to_mm(off_m.max())))
+
+
+def _controller(rigid: RigidModel, control: TipControl, q_path: Floats) -> Controller:
+    """The controller with the longest step that the whole path allows."""
+    if control == "position":
+        return Motors()
+    if control == "admittance":
+        return Admittance(rigid.kinematics, rigid.tip_m, VirtualMass(), TIME_STEP_S)
+    stiffness = Stiffness()
+    J = tips(rigid.kinematics, rigid.tip_m, q_path).J
+    dt = min(allowed_step(stiffness, row, rigid.mass_matrix(q)) for q, row in zip(q_path, J, strict=True))
+    return Impedance(rigid, stiffness, dt, keep_compliance=False)
+
+
+MOST_DECAY = 2.0
+"""Of D dt / M: from there on the explicit step of the virtual mass overshoots more than it takes away."""
+
+
+@dataclass(frozen=True)
+class VirtualMass:
+    """What the tip pretends to be: M x'' + D x' + K x = F."""
+
+    mass_kg: float = 1.0
+    damping_ns_m: float = 63.0
+    stiffness_n_m: float = 1e3
+
+
+class Admittance:
+    """The controller: it keeps the virtual mass's place and speed, shape (3,) each, m and m/s, base frame.
+
+    Args:
+        model: The arm, nominal.
+        tip_m: Flange to tip.
+        virtual: The mass.
+        dt: Its step, s.
+
+    Raises:
+        InputError: The virtual mass would diverge with this step.
+    """
+
+    def __init__(self, model: UrModel, tip_m: float, virtual: VirtualMass, dt: float) -> None:
+        decay = virtual.damping_ns_m * dt / virtual.mass_kg
+        if not decay < MOST_DECAY:
+            raise InputError(
+                f"D dt / M = {decay:.2f} would diverge", where="admittance", allowed=f"below {MOST_DECAY:g}"
+            )
+        self.dt = dt
+        self._model, self._tip_m, self._virtual = model, tip_m, virtual
+        self._place, self._velocity = np.zeros(3), np.zeros(3)
+
+    def act(self, measured: Measured, reference: Reference, row: int) -> Goals:
+        """Goals of the position motors for the next step."""
+        self._yield(measured.force_n)
+        J = tips(self._model, self._tip_m, measured.q[None]).J[0]
+        moved = np.linalg.solve(J, np.concatenate([self._place, np.zeros(3)]))
+        speed = np.linalg.solve(J, np.concatenate([self._velocity, np.zeros(3)]))
+        return Goals(reference.q[row] + moved, reference.speed[row] + speed)
+
+    def _yield(self, force_n: Floats) -> None:
+        of = self._virtual
+        pull = force_n - of.damping_ns_m * self._velocity - of.stiffness_n_m * self._place
+        self._velocity = self._velocity + self.dt / of.mass_kg * pull
+        self._place = self._place + self.dt * self._velocity
+
+
+REFRESH_STEPS = 5
+"""Between two evaluations of the tip's mass and the damping that follows from it: the pose changes slowly."""
+
+CONTACT_N = 0.5
+"""A force at the tip above which there is contact."""
+
+
+class Impedance:
+    """The controller: it keeps the integral of its error and the damping of its pose.
+
+    Args:
+        model: Of the arm's masses.
+        stiffness: At the tip.
+        dt: Its step, s.
+        keep_compliance: Whether the integral stands still while contact is felt.
+    """
+
+    def __init__(self, model: RigidModel, stiffness: Stiffness, dt: float, *, keep_compliance: bool = True) -> None:
+        self.dt = dt
+        self._model, self._stiffness = model, stiffness
+        self._keep_compliance = keep_compliance
+        self._K = stiffness.diagonal
+        self._integral, self._D = np.zeros(6), np.zeros((6, 6))
+        self._steps = 0
+
+    def act(self, measured: Measured, reference: Reference, row: int) -> Torques:
+        """Torques for the next step.
+
+        Raises:
+            InputError: The stiffness would diverge at this pose.
+        """
+        tip = tips(self._model.kinematics, self._model.tip_m, measured.q[None])
+        J = tip.J[0]
+        if self._steps % REFRESH_STEPS == 0:
+            M = self._model.mass_matrix(measured.q)
+            refuse_unstable(self._stiffness, J, M, self.dt)
+            self._D = damping(self._stiffness, J, M)
+        self._steps += 1
+        turn = rotation_error(reference.R_base_tip[row], tip.R_base_tip[0])
+        error = np.concatenate([reference.position_m[row] - tip.position_m[0], turn])
+        if not (self._keep_compliance and np.linalg.norm(measured.force_n) > CONTACT_N):
+            self._integral = self._integral + self.dt * error
+        spring = self._K * (error + self._stiffness.integral_per_s * self._integral)
+        wrench = spring + self._D @ (reference.twist[row] - J @ measured.speed)
+        feedforward = self._model.inverse_dynamics(measured.q, measured.speed, reference.acceleration[row])
+        return Torques(feedforward + J.T @ wrench)
+
+
+def rotation_error(R_reference: Floats, R: Floats) -> Floats:
+    """From R to the reference, shape (3,), rad: sin(angle) along the axis, half the sum of r_i x r_reference_i.
+
+    Source: Luh, Walker, Paul 1980, "Resolved-acceleration control of mechanical manipulators".
+    """
+    skewed = R_reference @ R.T
+    return 0.5 * np.array([skewed[2, 1] - skewed[1, 2], skewed[0, 2] - skewed[2, 0], skewed[1, 0] - skewed[0, 1]])
+
+
+MOST_RATIO = 0.8
+"""Of sqrt(K / m) dt over every mode of the tip: five sixths of where the loop diverges."""
+
+STEPS_S = (RECORD_S / 17, RECORD_S / 34, RECORD_S / 68)
+"""Of a controller, the longest first: about 1, .5 and .25 ms, and records fall on steps."""
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """A spring at the tip.
+
+    Attributes:
+        translation_n_m: K across and along the needle, N/m.
+        rotation_nm_rad: Of the needle's direction and roll, N m/rad.
+        damping_ratio: zeta of every mode.
+        integral_per_s: K_i: what is left of an error is gone after so many times 1/K_i; 0 keeps the compliance.
+    """
+
+    translation_n_m: float = 2e4
+    rotation_nm_rad: float = 300.0
+    damping_ratio: float = 0.8
+    integral_per_s: float = 5.0
+
+    @property
+    def diagonal(self) -> Floats:
+        """Shape (6,): of tip position, then of rotation."""
+        return np.repeat([self.translation_n_m, self.rotation_nm_rad], 3)
+
+
+SLOWEST = 1e-6
+"""Of the fastest mode: a slower one is damped as if it were so fast. At a singular pose the tip cannot move along it,
+its mass is infinite, and J' takes whatever its damping is to nothing."""
+
+
+def damping(stiffness: Stiffness, J: Floats, M: Floats) -> Floats:
+    """D that gives every mode of the tip the same damping ratio, shape (6, 6).
+
+    With Lambda the tip's mass and B its factor such that Lambda = B B', K = B diag(w^2) B': D = 2 zeta B diag(w) B'.
+    From Lambda^-1 = J M^-1 J' alone: with U diag(w^2) U' = K^1/2 Lambda^-1 K^1/2, B = K^1/2 U diag(1/w).
+    """
+    root = np.sqrt(stiffness.diagonal)
+    squares, U = np.linalg.eigh(root[:, None] * (J @ np.linalg.solve(M, J.T)) * root)
+    modes = root[:, None] * U
+    w = np.sqrt(np.maximum(squares, SLOWEST**2 * squares[-1]))
+    return np.asarray(2.0 * stiffness.damping_ratio * (modes / w) @ modes.T)
+
+
+def stability_ratio(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> float:
+    """sqrt(K / m) dt of the fastest mode: the largest eigenvalue of Lambda^-1 K = J M^-1 J' K."""
+    root = np.sqrt(stiffness.diagonal)[:, None] * J
+    fastest = np.linalg.eigvalsh(root @ np.linalg.solve(M, root.T))[-1]
+    return float(np.sqrt(fastest) * dt)
+
+
+def allowed_step(stiffness: Stiffness, J: Floats, M: Floats) -> float:
+    """The longest of `STEPS_S` that the stiffness is stable with at a pose; arguments as of `refuse_unstable`.
+
+    Raises:
+        InputError: None is.
+    """
+    stable = [dt for dt in STEPS_S if stability_ratio(stiffness, J, M, dt) < MOST_RATIO]
+    if not stable:
+        refuse_unstable(stiffness, J, M, STEPS_S[-1])
+    return stable[0]
+
+
+def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> None:
+    """Refuse a stiffness that this time step cannot carry at this pose.
+
+    Args:
+        stiffness: At the tip.
+        J: Jacobian of the tip, shape (6, 6).
+        M: Mass matrix of the joints, shape (6, 6).
+        dt: Time step, s.
+
+    Raises:
+        InputError: sqrt(K / m) dt is `MOST_RATIO` or more.
+    """
+    ratio = stability_ratio(stiffness, J, M, dt)
+    if not ratio < MOST_RATIO:
+        raise InputError(
+            f"a stiffness of {stiffness.translation_n_m:g} N/m at steps of {1e3 * dt:g} ms would diverge: "
+            f"sqrt(K/m) dt = {ratio:.2f}",
+            where="impedance",
+            allowed=f"below {MOST_RATIO}: less stiffness or a shorter step",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """One row a step of the controller.
+
+    Attributes:
+        q: Shape (n, 6), rad.
+        speed: Shape (n, 6), rad/s.
+        acceleration: Shape (n, 6), rad/s^2.
+        position_m: Shape (n, 3), of the tip, base frame.
+        R_base_tip: Shape (n, 3, 3).
+        twist: Shape (n, 6), m/s and rad/s.
+    """
+
+    q: Floats
+    speed: Floats
+    acceleration: Floats
+    position_m: Floats
+    R_base_tip: Floats
+    twist: Floats
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float, hold_s: float = 0.0) -> Reference:
+    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then held.
+
+    Args:
+        model: The arm.
+        tip_m: Flange to tip.
+        trajectory: From rest to rest.
+        dt: The controller's step, s.
+        hold_s: How long its end is held.
+    """
+    moving = int(np.ceil(trajectory.duration_s / dt)) + 1
+    times = np.minimum(dt * np.arange(moving + round(hold_s / dt)), trajectory.duration_s)
+    if len(trajectory.q) == 1:
+        still = np.zeros((len(times), 6))
+        return _reference(model, tip_m, np.tile(trajectory.q[0], (len(times), 1)), still, still)
+    spline = CubicSpline(trajectory.times_s, trajectory.q, bc_type="clamped")
+    at_rest = (times >= trajectory.duration_s)[:, None]
+    return _reference(
+        model, tip_m, spline(times), np.where(at_rest, 0.0, spline(times, 1)), np.where(at_rest, 0.0, spline(times, 2))
+    )
+
+
+def _reference(model: UrModel, tip_m: float, q: Floats, speed: Floats, acceleration: Floats) -> Reference:
+    tip = tips(model, tip_m, q)
+    return Reference(q, speed, acceleration, tip.position_m, tip.R_base_tip, (tip.J @ speed[..., None])[..., 0])
+
+
+class Tip(NamedTuple):
+    """The tip at n configurations, base frame."""
+
+    position_m: Floats
+    """Shape (n, 3)."""
+    R_base_tip: Floats
+    """Shape (n, 3, 3), the flange's axes; z points along the needle to its tip."""
+    J: Floats
+    """Shape (n, 6, 6): tip velocity (m/s), then angular velocity (rad/s), from joint speeds (rad/s)."""
+
+
+def tips(model: UrModel, tip_m: float, q: Floats) -> Tip:
+    """The tip and its Jacobian.
+
+    Args:
+        model: The arm, nominal.
+        tip_m: Flange to tip, along the flange's z.
+        q: Shape (n, 6), rad.
+    """
+    frames, J = np.empty((len(q), 7, 4, 4)), np.empty((len(q), 6, 6))
+    link_frames(model.lengths, np.array(q, order="C"), frames)
+    jacobians(frames, J)
+    flange = frames[:, 6]
+    arm_m = tip_m * flange[:, :3, 2]
+    # v_tip = v_flange + w x r
+    J[:, :3] = J[:, :3] / MM_PER_M - skew(arm_m) @ J[:, 3:]
+    return Tip(flange[:, :3, 3] / MM_PER_M + arm_m, flange[:, :3, :3], J)
+
+
+TIP_LINK = "needle"
+
+
+class Measured(NamedTuple):
+    """What a controller is told at one step."""
+
+    q: Floats
+    """Shape (6,), rad, what the encoders say."""
+    speed: Floats
+    """Shape (6,), rad/s."""
+    force_n: Floats
+    """Shape (3,), of contact at the tip, base frame."""
+
+
+class Torques(NamedTuple):
+    """For the next step, the motors off."""
+
+    torque_nm: Floats
+    """Shape (6,)."""
+
+
+class Goals(NamedTuple):
+    """Of the position motors."""
+
+    q: Floats
+    """Shape (6,), rad, encoders."""
+    speed: Floats
+    """Shape (6,), rad/s."""
+
+
+class Controller(Protocol):
+    """Moves the joints from one step to the next."""
+
+    dt: float
+
+    def act(self, measured: Measured, reference: Reference, row: int) -> Torques | Goals:
+        """What the joints shall do in the next step."""
+
+
+class Push(NamedTuple):
+    """A force on the needle, which is rigid here: where it acts along the shaft decides its moment on the arm."""
+
+    force_n: Floats
+    """Shape (3,), base frame."""
+    point_m: Floats
+    """Shape (3,), base frame."""
+
+
+Resistance = Callable[[Tip], Sequence[Push]]
+"""What tissue presses on the needle with, now that its tip is there (one row). It may remember where the tip was."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One row a step: at its start, and the force of the step before.
+
+    Attributes:
+        dt: Between rows, s.
+        q: Shape (n, 6), rad, encoders.
+        tip_m: Shape (n, 3), where the tip truly was, base frame.
+        force_n: Shape (n, 3), N, on the tip.
+        stopped: Whether it ended before its reference did.
+    """
+
+    dt: float
+    q: Floats
+    tip_m: Floats
+    force_n: Floats
+    stopped: bool
+
+
+Stop = Callable[[Measured], bool]
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What acts on the arm besides its controller.
+
+    Attributes:
+        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
+        resistance: Of tissue; None for none.
+        stop: Ends the run where it says so; None never does.
+        watch: Called after each step.
+    """
+
+    joint_offsets: Floats
+    resistance: Resistance | None = None
+    stop: Stop | None = None
+    watch: Callable[[int], None] | None = None
+
+
+def run(
+    arm: Arm, controller: Controller, reference: Reference, tip_of: Callable[[Floats], Tip], around: Surroundings
+) -> Run:
+    """Follow a reference from where the arm is.
+
+    Args:
+        arm: Of an open room whose world is the base frame.
+        controller: Its step becomes that of the physics.
+        reference: What is wanted, a row a step.
+        tip_of: The true tip of true joints.
+        around: What else acts.
+    """
+    set_time_step(arm.client, controller.dt)
+    arm.release()  # motors that hold on would work against torques; goals switch them on again
+    q, places, forces = [], [], []
+    for row in range(len(reference)):
+        state = arm.state()
+        tip = tip_of(state.q)
+        force = felt_force(arm, TIP_LINK)
+        for push in () if around.resistance is None else around.resistance(tip):
+            arm.push(TIP_LINK, push.force_n, push.point_m)
+            force = force + push.force_n
+        measured = Measured(state.q - around.joint_offsets, state.speed, force)
+        q.append(measured.q)
+        places.append(tip.position_m[0])
+        forces.append(force)
+        if around.stop is not None and around.stop(measured):
+            break
+        _give(arm, controller.act(measured, reference, row), around.joint_offsets)
+        step(arm.client)
+        if around.watch is not None:
+            around.watch(row)
+    return Run(controller.dt, np.array(q), np.array(places), np.array(forces), len(q) < len(reference))
+
+
+def _give(arm: Arm, action: Torques | Goals, joint_offsets: Floats) -> None:
+    if isinstance(action, Torques):
+        arm.torque(action.torque_nm)
+    else:
+        arm.command(action.q + joint_offsets, action.speed)
+
+
+class Motors:
+    """The reference's joints are the motors' goals, whatever is measured."""
+
+    dt = TIME_STEP_S
+
+    def act(self, measured: Measured, reference: Reference, row: int) -> Goals:
+        """Goals of the next step."""
+        del measured
+        return Goals(reference.q[row], reference.speed[row])
+
+
+@dataclass(frozen=True)
+class RigidModel:
+    """What the controller knows of the arm's masses; it never moves.
+
+    Attributes:
+        kinematics: Lengths of the arm.
+        tip_m: Flange to tip, along the flange's z.
+        arm: The body that is evaluated, alone in a client of its own.
+    """
+
+    kinematics: UrModel
+    tip_m: float
+    arm: Arm
+
+    def inverse_dynamics(self, q: Floats, speed: Floats, acceleration: Floats) -> Floats:
+        """Torques that give accelerations: tau = M(q) qdd + c(q, qd) + g(q); all of shape (6,), rad, s, N m."""
+        client, body = self.arm.client, self.arm.body
+        return np.array(
+            pybullet.calculateInverseDynamics(
+                body, q.tolist(), speed.tolist(), acceleration.tolist(), physicsClientId=client
+            )
+        )
+
+    def mass_matrix(self, q: Floats) -> Floats:
+        """M(q), shape (6, 6), kg m^2."""
+        return np.array(pybullet.calculateMassMatrix(self.arm.body, q.tolist(), physicsClientId=self.arm.client))
+
+
+@contextmanager
+def rigid_model(model: UrModel, tool: Tool, down_base: Floats) -> Iterator[RigidModel]:
+    """Open the model of an arm, and close it again.
+
+    Args:
+        model: The arm.
+        tool: What its flange carries.
+        down_base: Shape (3,), unit vector of gravity in the controller's base frame: any mount is a direction.
+
+    Raises:
+        InputError: There is no body of that arm.
+    """
+    T_base_root = model_urdf(model).T_base_root
+    with physics_client(down=T_base_root[:3, :3].T @ down_base) as client:
+        # T_world_urdf = T_world_base T_base_urdf = identity
+        arm = load_arm(client, model, tool, np.asarray(np.linalg.inv(T_base_root), np.float64))
+        yield RigidModel(model, tool.needle_length_mm / 1000.0, arm)
