@@ -145,42 +145,42 @@ def blank_row(planned: PlannedCase, exit_code: int | None, reason: str | None) -
     return row | stated | {"exit_code": exit_code, "reason": reason, "directions": 0, "safe": 0, "page": False}
 
 
-def found_row(planned: PlannedCase, context: CaseContext, found: Candidates) -> dict[str, Any]:
+def found_row(planned: PlannedCase, context: CaseContext, candidates: Candidates) -> dict[str, Any]:
     """The row of a case that was searched."""
-    safe = int(found.safe.sum())
-    row = blank_row(planned, 0 if safe else 1, None if safe else no_safe_reason(found))
-    row |= {"directions": len(found), "safe": safe, "arm": context.arm, "reach_fraction": _reach(found)}
-    windows = find_windows(found).windows
+    safe = int(candidates.safe.sum())
+    row = blank_row(planned, 0 if safe else 1, None if safe else no_safe_reason(candidates))
+    row |= {"directions": len(candidates), "safe": safe, "arm": context.arm, "reach_fraction": _reach(candidates)}
+    windows = find_windows(candidates).windows
     row |= {"windows": len(windows), "safe_square_deg": sum(one.square_deg for one in windows)}
     row |= {"safe_entry_cm2": sum(one.entry_cm2 for one in windows)}
-    return row | _best(found) if safe else row
+    return row | _best(candidates) if safe else row
 
 
-def no_safe_reason(found: Candidates) -> str:
+def no_safe_reason(candidates: Candidates) -> str:
     """With what most directions fell to."""
-    counts = found.counts()
+    counts = candidates.counts()
     return f"{NO_SAFE} (most: {next(iter(counts))})" if counts else NO_SAFE
 
 
-def _best(found: Candidates) -> dict[str, Any]:
-    row = int(found.ranked[0])
-    chances = found.chances
+def _best(candidates: Candidates) -> dict[str, Any]:
+    row = int(candidates.ranked[0])
+    chances = candidates.chances
     return {
-        "best_theta_deg": float(np.degrees(found.theta[row])),
-        "best_beta_deg": float(np.degrees(found.beta[row])),
-        "best_clearance_mm": or_null(found.least_clearance[row]),
-        "best_path_length_mm": or_null(found.path.length[row]),
-        "best_skin_angle_deg": or_null(float(np.degrees(found.path.skin_angle[row]))),
-        **{f"best_entry_{axis}_mm": or_null(found.path.entry_ct[row, k]) for k, axis in enumerate("xyz")},
+        "best_theta_deg": float(np.degrees(candidates.theta[row])),
+        "best_beta_deg": float(np.degrees(candidates.beta[row])),
+        "best_clearance_mm": or_null(candidates.least_clearance[row]),
+        "best_path_length_mm": or_null(candidates.path.length[row]),
+        "best_skin_angle_deg": or_null(float(np.degrees(candidates.path.skin_angle[row]))),
+        **{f"best_entry_{axis}_mm": or_null(candidates.path.entry_ct[row, k]) for k, axis in enumerate("xyz")},
         "best_p_hit": None if chances is None else or_null(chances.hit[row]),
         "best_p_touch_any": None if chances is None else or_null(chances.touch_any[row]),
     }
 
 
-def _reach(found: Candidates) -> float | None:
+def _reach(candidates: Candidates) -> float | None:
     """Which fraction of the directions that the organs leave the arm reaches; None where nobody asked it."""
-    checked = found.arm.reachable >= 0
-    return float((found.arm.reachable[checked] == 1).mean()) if checked.any() else None
+    checked = candidates.arm.reachable >= 0
+    return float((candidates.arm.reachable[checked] == 1).mean()) if checked.any() else None
 
 
 MAX_TABLE_BYTES = 2_000_000_000

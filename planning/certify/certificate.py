@@ -376,14 +376,14 @@ def _map(certificate: Any) -> str:
     return polar_map(Sectors(certificate.leaves.theta, shifted, code), legend)
 
 
-def with_safe_cone(case: Case, found: Candidates, certificate: Certificate) -> Candidates:
+def with_safe_cone(case: Case, candidates: Candidates, certificate: Certificate) -> Candidates:
     """The candidates with their safe cones, ranked again.
 
     Args:
         case: The case of both.
-        found: A search's result.
+        candidates: A search's result.
         certificate: The case's certified map.
     """
-    cone, rows = np.full(len(found), np.nan), np.flatnonzero(found.safe)
-    cone[rows] = certificate.safe_cone(found.outward_ct[rows])
-    return ranked(case, replace(found, safe_cone=cone, cone_source=CONE_CERTIFIED))
+    cone, rows = np.full(len(candidates), np.nan), np.flatnonzero(candidates.safe)
+    cone[rows] = certificate.safe_cone(candidates.outward_ct[rows])
+    return ranked(case, replace(candidates, safe_cone=cone, cone_source=CONE_CERTIFIED))

@@ -156,8 +156,8 @@ def _listed(search: Candidates, windows: Windows) -> Iterator[str]:
         yield f"  {one.number}: {one.square_deg:.1f} square degrees, best at {_angles(search, one.best)}"
 
 
-def _angles(found: Candidates, row: int) -> str:
-    at = found.at(row)
+def _angles(candidates: Candidates, row: int) -> str:
+    at = candidates.at(row)
     return f"theta {at['theta_deg']:g} deg, beta {at['beta_deg']:g} deg"
 
 

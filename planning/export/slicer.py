@@ -254,16 +254,16 @@ class EntryArea:
     safe_cone_deg: Floats
 
 
-def entry_area(found: Candidates) -> EntryArea:
+def entry_area(candidates: Candidates) -> EntryArea:
     """The area of a search; without triangles where no four neighbouring directions are safe."""
-    windows = find_windows(found).of_row
-    faces = np.zeros((0, 3), np.int64) if found.grid is None else _faces(found, found.grid, windows)
+    windows = find_windows(candidates).of_row
+    faces = np.zeros((0, 3), np.int64) if candidates.grid is None else _faces(candidates, candidates.grid, windows)
     rows, corners = np.unique(faces, return_inverse=True)
-    cones = np.nan_to_num(np.degrees(found.safe_cone[rows]))
-    return EntryArea(found.path.entry_ct[rows], corners.reshape(-1, 3).astype(np.int64), windows[rows], cones)
+    cones = np.nan_to_num(np.degrees(candidates.safe_cone[rows]))
+    return EntryArea(candidates.path.entry_ct[rows], corners.reshape(-1, 3).astype(np.int64), windows[rows], cones)
 
 
-def _faces(found: Candidates, grid: AngleGrid, windows: Ints) -> Ints:
+def _faces(candidates: Candidates, grid: AngleGrid, windows: Ints) -> Ints:
     """Two triangles for each cell of the grid whose four corners are safe, in one window and near to each other."""
     rows = np.arange(len(grid)).reshape(len(grid.theta), len(grid.beta))
     if grid.full_circle:
@@ -272,9 +272,9 @@ def _faces(found: Candidates, grid: AngleGrid, windows: Ints) -> Ints:
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     whole = (windows[faces] > 0).all(axis=1) & (windows[faces] == windows[faces[:, :1]]).all(axis=1)
     faces = faces[whole]
-    corners = found.path.entry_ct[faces]
+    corners = candidates.path.entry_ct[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    span = np.sqrt(2.0) * grid.step * found.path.length[faces].max(axis=1)
+    span = np.sqrt(2.0) * grid.step * candidates.path.length[faces].max(axis=1)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     return np.asarray(faces[(edges <= STEEPEST * span) & (area > 0)])
 

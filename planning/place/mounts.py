@@ -251,13 +251,13 @@ class WantedDirections:
         return WantedDirections(self.outward_ct[chosen], self.standoff_mm[chosen], weight)
 
 
-def wanted_directions(case: Case, found: Candidates) -> WantedDirections:
+def wanted_directions(case: Case, candidates: Candidates) -> WantedDirections:
     """The safe rows of a search, in their order."""
-    rows = np.flatnonzero(found.safe)
-    weight = ring_weights(found.theta, case.search.step)[rows]
+    rows = np.flatnonzero(candidates.safe)
+    weight = ring_weights(candidates.theta, case.search.step)[rows]
     return WantedDirections(
-        found.outward_ct[rows],
-        standoffs(case.needle, found.path.length[rows], found.path.skin_angle[rows]),
+        candidates.outward_ct[rows],
+        standoffs(case.needle, candidates.path.length[rows], candidates.path.skin_angle[rows]),
         weight / weight.sum() if len(rows) else weight,
     )
 

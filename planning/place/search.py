@@ -145,7 +145,7 @@ class PlaceSearch:
 def search_placements(
     case: Case,
     anatomy: Anatomy,
-    found: Candidates,
+    candidates: Candidates,
     placement: Placement | None,
     *,
     jobs: int = 1,
@@ -158,7 +158,7 @@ def search_placements(
     Args:
         case: The validated case.
         anatomy: Its structures.
-        found: Its directions, checked against the organs alone.
+        candidates: Its directions, checked against the organs alone.
         placement: Where the case itself has the arm.
         jobs: Processes.
         progress: Called with (stage, done, total).
@@ -167,10 +167,10 @@ def search_placements(
         InputError: Bounds that contradict the case, or an own arm or tool with a shape that hangs on nothing.
         NoAnswerError: No direction is safe for the organs, or in none the needle could start.
     """
-    if not found.safe.any():
-        raise NoAnswerError("no direction is safe for the organs, so no placement can help", counts=found.counts())
+    if not candidates.safe.any():
+        raise NoAnswerError("no direction is safe for the organs, so no placement can help", counts=candidates.counts())
     T_ct_bed = bed_frame(case)
-    check = _placement_check(case, anatomy, found)
+    check = _placement_check(case, anatomy, candidates)
     CellChecker(check.model, check.tool)  # refuses shapes that hang on nothing before minutes are spent
     near, beyond = _parted(anatomy)
     surroundings = Surroundings(
@@ -245,7 +245,7 @@ def _parted(anatomy: Anatomy) -> tuple[Anatomy, list[Box]]:
     return replace(anatomy, surroundings=tuple(one for one in solids if one.name != BEYOND_IMAGE)), boxes
 
 
-def _placement_check(case: Case, anatomy: Anatomy, found: Candidates) -> PlacementCheck:
+def _placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> PlacementCheck:
     """The case's workcell, patient-fixed and arm-fixed apart, and its directions."""
     carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
     boxes = case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
@@ -258,7 +258,7 @@ def _placement_check(case: Case, anatomy: Anatomy, found: Candidates) -> Placeme
         carried=tuple(box for box in boxes if box.name in carried),
         padding_mm=ARM_PADDING_MM,
         target_ct=case.target_ct,
-        wanted=wanted_directions(case, found),
+        wanted=wanted_directions(case, candidates),
         home=home_configuration(case),
     )
 

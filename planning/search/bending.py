@@ -41,19 +41,19 @@ from puncture_twin.planning.needle.insertion_force import InsertionForce, insert
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 
 
-def with_bending(anatomy: Anatomy, found: Candidates, bound: DeflectionBound | None) -> Candidates:
+def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBound | None) -> Candidates:
     """Reject what lacks the clearance to bend; nothing that was rejected becomes safe.
 
     Args:
         anatomy: The structures of ``found``.
-        found: Checked for a straight needle.
+        candidates: Checked for a straight needle.
         bound: How far the needle may bend; None bends nothing.
     """
     if bound is None:
-        return found
-    deflection = bound.at(found.path.length)
-    verdict = bent_verdict(found.verdict, anatomy.checked, found.clearance.distance, deflection)
-    return replace(found, verdict=verdict, deflection=deflection)
+        return candidates
+    deflection = bound.at(candidates.path.length)
+    verdict = bent_verdict(candidates.verdict, anatomy.checked, candidates.clearance.distance, deflection)
+    return replace(candidates, verdict=verdict, deflection=deflection)
 
 
 def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance: Floats, deflection: Floats) -> Verdict:

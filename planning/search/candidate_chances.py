@@ -33,7 +33,7 @@ from puncture_twin.planning.uncertainty.hit import Proximity, touch_bound
 def with_chances(
     case: Case,
     anatomy: Anatomy,
-    found: Candidates,
+    candidates: Candidates,
     model: ChanceModel | None,
     axes: AxisDistances | None = None,
 ) -> Candidates:
@@ -42,7 +42,7 @@ def with_chances(
     Args:
         case: Declares errors; else nothing is computed.
         anatomy: Its structures.
-        found: Checked against organs and arm.
+        candidates: Checked against organs and arm.
         model: None where the pose's error is not known: the chances are blank.
         axes: What the engine measured of the candidates; None measures those that are left again.
 
@@ -50,42 +50,44 @@ def with_chances(
         InputError: A limit that nothing can be compared with.
     """
     if case.errors is None:
-        return found
+        return candidates
     check_limits(case, anatomy, model is not None)
     names = tuple(anatomy.checked[column].name for column in demanding(anatomy.checked))
-    rows = np.flatnonzero(found.safe & np.isfinite(found.arm.q_insertion).all(axis=1))
-    chances = Chances.unknown(names, len(found))
+    rows = np.flatnonzero(candidates.safe & np.isfinite(candidates.arm.q_insertion).all(axis=1))
+    chances = Chances.unknown(names, len(candidates))
     if model is None or not len(rows):
-        return replace(found, chances=chances)
+        return replace(candidates, chances=chances)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
         measured = None if axes is None else axes.at(part)
-        chances = chances.put(part, model.chances(found.outward_ct[part], found.arm.q_insertion[part], measured))
-    return limited(case, refined_near_limits(replace(found, chances=chances), model))
+        chances = chances.put(
+            part, model.chances(candidates.outward_ct[part], candidates.arm.q_insertion[part], measured)
+        )
+    return limited(case, refined_near_limits(replace(candidates, chances=chances), model))
 
 
-def limited(case: Case, found: Candidates) -> Candidates:
+def limited(case: Case, candidates: Candidates) -> Candidates:
     """Reject what is too unlikely to hit, or too likely to touch."""
-    chances, least = found.chances, case.search.min_hit
+    chances, least = candidates.chances, case.search.min_hit
     assert chances is not None
     if least is not None:
-        rows = np.flatnonzero(found.safe & ~(chances.hit >= least))  # what is not known is not enough
+        rows = np.flatnonzero(candidates.safe & ~(chances.hit >= least))  # what is not known is not enough
         target = np.full(len(rows), case.target_structure, dtype=object)
-        found = _rejected(found, rows, Reason.HIT_UNLIKELY, target, chances.hit[rows])
+        candidates = _rejected(candidates, rows, Reason.HIT_UNLIKELY, target, chances.hit[rows])
     limits = np.array([touch_limit(case, name) for name in chances.structures])
     touch = np.where(np.isnan(chances.touch), np.inf, chances.touch)  # nor is it little enough
     with np.errstate(invalid="ignore"):  # without a limit both may be infinite
         beyond = np.where(touch > limits, touch - limits, -np.inf)
-    rows = np.flatnonzero(found.safe & (beyond > 0).any(axis=1))
+    rows = np.flatnonzero(candidates.safe & (beyond > 0).any(axis=1))
     worst = beyond[rows].argmax(axis=1) if len(rows) else rows
     names = np.array(chances.structures, dtype=object)[worst]
-    return _rejected(found, rows, Reason.TOUCH_LIKELY, names, chances.touch[rows, worst])
+    return _rejected(candidates, rows, Reason.TOUCH_LIKELY, names, chances.touch[rows, worst])
 
 
-def _rejected(found: Candidates, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Candidates:
+def _rejected(candidates: Candidates, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Candidates:
     """With some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
-    arrays = {field.name: getattr(found.verdict, field.name).copy() for field in fields(found.verdict)}
+    arrays = {field.name: getattr(candidates.verdict, field.name).copy() for field in fields(candidates.verdict)}
     arrays["reason"][rows], arrays["structure"][rows], arrays["amount"][rows] = reason.value, structure, amount
-    return replace(found, verdict=Verdict(**arrays))
+    return replace(candidates, verdict=Verdict(**arrays))
 
 
 BEST = 200
@@ -100,61 +102,64 @@ ROWS_AT_ONCE = 4096
 """Of candidates: a table of gradients of 60 structures stays below 20 MB."""
 
 
-def refined_near_limits(found: Candidates, model: ChanceModel) -> Candidates:
+def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidates:
     """Refine the chances to touch that first order puts near a limit or beyond, or that may be if the needle leans."""
-    chances, limits = found.chances, model.limits
+    chances, limits = candidates.chances, model.limits
     assert chances is not None
     if not np.isfinite(limits).any():
-        return found
-    greatest = np.fmax(chances.touch, _touch_bounds(found, model))
+        return candidates
+    greatest = np.fmax(chances.touch, _touch_bounds(candidates, model))
     rows = np.flatnonzero((greatest >= REFINED_FROM * limits).any(axis=1) & np.isfinite(chances.hit))
-    return with_refined(found, model, rows) if len(rows) else found
+    return with_refined(candidates, model, rows) if len(rows) else candidates
 
 
-def _touch_bounds(found: Candidates, model: ChanceModel) -> Floats:
+def _touch_bounds(candidates: Candidates, model: ChanceModel) -> Floats:
     """Shape (n, k), of the safe candidates' chances to touch; NaN for others."""
     error, columns = model.error, model.columns
     surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])
-    bounds, rows = np.full((len(found), len(columns)), np.nan), np.flatnonzero(found.safe)
+    bounds, rows = np.full((len(candidates), len(columns)), np.nan), np.flatnonzero(candidates.safe)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
-        length = float(own_lengths(model.case, model.anatomy, found.outward_ct[part])[:, columns].max())
-        slack, cov_ct = found.clearance.distance[part][:, columns], error.covariance_ct(found.arm.q_insertion[part])
-        bounds[part] = touch_bound(slack, found.outward_ct[part], cov_ct, length, surface_mm, error.freedom)
+        length = float(own_lengths(model.case, model.anatomy, candidates.outward_ct[part])[:, columns].max())
+        slack, cov_ct = (
+            candidates.clearance.distance[part][:, columns],
+            error.covariance_ct(candidates.arm.q_insertion[part]),
+        )
+        bounds[part] = touch_bound(slack, candidates.outward_ct[part], cov_ct, length, surface_mm, error.freedom)
     return bounds
 
 
-def with_refined(found: Candidates, model: ChanceModel, rows: Ints) -> Candidates:
+def with_refined(candidates: Candidates, model: ChanceModel, rows: Ints) -> Candidates:
     """Refine some rows."""
-    chances = found.chances
+    chances = candidates.chances
     assert chances is not None
     names = [field.name for field in fields(chances) if field.name != "structures"]
     first = Chances(chances.structures, **{name: getattr(chances, name)[rows] for name in names})
-    better = refined_chances(model, found.outward_ct[rows], found.arm.q_insertion[rows], first)
-    return replace(found, chances=chances.put(rows, better))
+    better = refined_chances(model, candidates.outward_ct[rows], candidates.arm.q_insertion[rows], first)
+    return replace(candidates, chances=chances.put(rows, better))
 
 
-def with_best_refined(found: Candidates, model: ChanceModel | None) -> Candidates:
+def with_best_refined(candidates: Candidates, model: ChanceModel | None) -> Candidates:
     """Refine what is shown: the best of all, and the best of every window.
 
     Those that break a limit then are rejected, and the rest ranked again, until no new one is among them.
 
     Args:
-        found: Ranked, with chances.
+        candidates: Ranked, with chances.
         model: As in `with_chances`.
     """
-    if model is None or found.chances is None:
-        return found
-    while len(rows := _shown(found)):
-        found = ranked(model.case, limited(model.case, with_refined(found, model, rows)))
-    return found
+    if model is None or candidates.chances is None:
+        return candidates
+    while len(rows := _shown(candidates)):
+        candidates = ranked(model.case, limited(model.case, with_refined(candidates, model, rows)))
+    return candidates
 
 
-def _shown(found: Candidates) -> Ints:
+def _shown(candidates: Candidates) -> Ints:
     """Rows that people are shown, and whose chances are of first order yet."""
-    assert found.chances is not None
-    best = [window.best for window in find_windows(found).windows]
-    shown = np.unique(np.append(found.ranked[:BEST], best)).astype(np.int64)
-    return shown[~found.chances.refined[shown] & np.isfinite(found.chances.hit[shown])]
+    assert candidates.chances is not None
+    best = [window.best for window in find_windows(candidates).windows]
+    shown = np.unique(np.append(candidates.ranked[:BEST], best)).astype(np.int64)
+    return shown[~candidates.chances.refined[shown] & np.isfinite(candidates.chances.hit[shown])]
 
 
 NORMALS = 4096
@@ -194,17 +199,17 @@ def joint_touch_chance(
     return chances
 
 
-def with_joint_chances(found: Candidates, model: ChanceModel | None) -> Candidates:
+def with_joint_chances(candidates: Candidates, model: ChanceModel | None) -> Candidates:
     """Add, for the best candidates, the chance to touch anything, all structures linearised together.
 
     The candidates are ranked; ``model`` as in `with_chances`.
     """
-    rows = found.ranked[:BEST]
-    if model is None or found.chances is None or not len(rows):
-        return found
-    needles = model.needles(found.outward_ct[rows], found.arm.q_insertion[rows])
-    joint = found.chances.touch_joint.copy()
+    rows = candidates.ranked[:BEST]
+    if model is None or candidates.chances is None or not len(rows):
+        return candidates
+    needles = model.needles(candidates.outward_ct[rows], candidates.arm.q_insertion[rows])
+    joint = candidates.chances.touch_joint.copy()
     joint[rows] = joint_touch_chance(
         needles.near, needles.cov_ct, model.case.needle.radius_mm, needles.freedom, needles.surface_mm
     )
-    return replace(found, chances=replace(found.chances, touch_joint=joint))
+    return replace(candidates, chances=replace(candidates.chances, touch_joint=joint))

@@ -93,17 +93,17 @@ class Chosen(NamedTuple):
     rows: Ints
 
 
-def best_pick(found: Candidates) -> Pick | None:
+def best_pick(candidates: Candidates) -> Pick | None:
     """The best candidate of a search; None where nothing is safe."""
-    return Pick(found, int(found.ranked[0])) if len(found.ranked) else None
+    return Pick(candidates, int(candidates.ranked[0])) if len(candidates.ranked) else None
 
 
-def choose(context: CaseContext, found: Candidates, choice: Choice) -> Chosen:
+def choose(context: CaseContext, candidates: Candidates, choice: Choice) -> Chosen:
     """The candidates that a choice leaves, in the order of preference.
 
     Args:
         context: Of the case.
-        found: The search of its grid.
+        candidates: The search of its grid.
         choice: What a person wanted.
 
     Raises:
@@ -112,17 +112,17 @@ def choose(context: CaseContext, found: Candidates, choice: Choice) -> Chosen:
     """
     if not choice.of_grid:
         return choose_stated(context, choice)
-    rows = found.ranked
+    rows = candidates.ranked
     if not len(rows):
-        raise NoAnswerError("no candidate is safe", counts=found.counts())
+        raise NoAnswerError("no candidate is safe", counts=candidates.counts())
     if choice.rank is not None:
         _refuse_beyond(choice.rank, len(rows), "--rank", "safe candidates")
-        return Chosen(found, rows[choice.rank - 1 : choice.rank])
+        return Chosen(candidates, rows[choice.rank - 1 : choice.rank])
     if choice.window is not None:
-        windows = find_windows(found)
+        windows = find_windows(candidates)
         _refuse_beyond(choice.window, len(windows.windows), "--window", "windows")
-        return Chosen(found, rows[windows.of_row[rows] == choice.window])
-    return Chosen(found, rows)
+        return Chosen(candidates, rows[windows.of_row[rows] == choice.window])
+    return Chosen(candidates, rows)
 
 
 def choose_stated(context: CaseContext, choice: Choice) -> Chosen:

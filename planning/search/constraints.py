@@ -99,28 +99,28 @@ def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -
     return worst
 
 
-def closest_miss(found: Candidates) -> int | None:
+def closest_miss(candidates: Candidates) -> int | None:
     """Row of the rejected candidate that came closest: one that the organs allow, and passed most of what follows.
 
     Without such a row, the least lack of clearance among those that lack only that; None for no rows at all.
     """
     late = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY, Reason.UNSAFE_WHEN_BREATHING, Reason.NEEDLE_BENDS)
     of_arm = (Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
-    allowed = _first_of(found, (*late, *of_arm))
+    allowed = _first_of(candidates, (*late, *of_arm))
     if allowed is not None:
         return allowed
-    lacking = np.flatnonzero(found.verdict.reason == Reason.TOO_CLOSE.value)
+    lacking = np.flatnonzero(candidates.verdict.reason == Reason.TOO_CLOSE.value)
     if len(lacking):
-        demanded = ~np.isnan(found.clearance.margins)
-        lack = (found.clearance.margins - found.clearance.distance)[:, demanded].max(axis=1)
+        demanded = ~np.isnan(candidates.clearance.margins)
+        lack = (candidates.clearance.margins - candidates.clearance.distance)[:, demanded].max(axis=1)
         return int(lacking[np.argmin(lack[lacking])])
-    return _first_of(found, (Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION))
+    return _first_of(candidates, (Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION))
 
 
-def _first_of(found: Candidates, reasons: tuple[Reason, ...]) -> int | None:
+def _first_of(candidates: Candidates, reasons: tuple[Reason, ...]) -> int | None:
     """The first row of the first reason that any row has; None where none has."""
     for reason in reasons:
-        rows = np.flatnonzero(found.verdict.reason == reason.value)
+        rows = np.flatnonzero(candidates.verdict.reason == reason.value)
         if len(rows):
             return int(rows[0])
     return None
@@ -134,13 +134,13 @@ class ArmReach:
     T_base_ct: Floats
 
 
-def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Count | None = None) -> Candidates:
+def with_reach(case: Case, candidates: Candidates, reach: ArmReach, progress: Count | None = None) -> Candidates:
     """Check the arm for every candidate that the organs allow; progress counts the checked ones."""
-    rows = np.flatnonzero(found.safe)
-    requests = reach_requests(case, found, rows, reach.T_base_ct)
+    rows = np.flatnonzero(candidates.safe)
+    requests = reach_requests(case, candidates, rows, reach.T_base_ct)
     answers = assess_reach_all(reach.checker, requests, progress)
-    verdict = {field.name: getattr(found.verdict, field.name).copy() for field in fields(found.verdict)}
-    reachable, margin, q_insertion = (getattr(found.arm, field.name).copy() for field in fields(found.arm))
+    verdict = {field.name: getattr(candidates.verdict, field.name).copy() for field in fields(candidates.verdict)}
+    reachable, margin, q_insertion = (getattr(candidates.arm, field.name).copy() for field in fields(candidates.arm))
     for row, request, answer in zip(rows, requests, answers, strict=True):
         reachable[row] = int(answer.reachable)
         margin[row] = answer.margin
@@ -152,7 +152,7 @@ def with_reach(case: Case, found: Candidates, reach: ArmReach, progress: Count |
             inserted = answer.depth_mm  # the tip's distance from the target is what is left of the standoff
             verdict["depth"][row] = np.nan if inserted is None else request.standoff_mm - inserted
     return replace(
-        found, verdict=Verdict(**verdict), arm=ArmColumns(reachable, margin, q_insertion), arm_note=ARM_CHECKED
+        candidates, verdict=Verdict(**verdict), arm=ArmColumns(reachable, margin, q_insertion), arm_note=ARM_CHECKED
     )
 
 

@@ -247,39 +247,39 @@ def prepare(
     return CaseContext(case, anatomy, placement, measurer, reach, chance, watcher, stages)
 
 
-def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates) -> Iterator[Finding]:
+def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Iterator[Finding]:
     """What else would be safe for the organs; ``found`` are the case's directions, ranked."""
-    more = hangs_on_beyond(case, anatomy, found)
+    more = hangs_on_beyond(case, anatomy, candidates)
     if more:
         said = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
         yield Finding("hangs_on_beyond_image", Severity.NOTE, said, {"directions": more})
     if case.needle.lengths_mm:
-        yield _catalogue(case, anatomy, engine, found)
+        yield _catalogue(case, anatomy, engine, candidates)
 
 
-def hangs_on_beyond(case: Case, anatomy: Anatomy, found: Candidates) -> int:
+def hangs_on_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) -> int:
     """How many directions are kept from being safe by that alone by which a body is wider beyond its image."""
-    clearance, named = found.clearance, found.verdict.structure == BEYOND_IMAGE
+    clearance, named = candidates.clearance, candidates.verdict.structure == BEYOND_IMAGE
     others = ~np.isnan(clearance.margins) & (np.array(clearance.structures) != BEYOND_IMAGE)
     rows = np.flatnonzero(named & (clearance.distance[:, others] >= clearance.margins[others]).all(axis=1))
     if not len(rows) or case.ct.beyond_mm == 0.0:
         return 0
     narrow = replace(case, ct=replace(case.ct, beyond_mm=0.0))
-    (solid,), outward = beyond_images(narrow, anatomy.skin, anatomy.scan).structures, found.outward_ct[rows]
+    (solid,), outward = beyond_images(narrow, anatomy.skin, anatomy.scan).structures, candidates.outward_ct[rows]
     lengths = axis_lengths(case, [solid], own_paths(case, anatomy.skin, outward))
     axes = FastEngine([solid.mesh]).measure(case.target_ct, outward, lengths, shown=False)
     return int((axes.distance >= case.needle.radius_mm + solid.margin_mm).sum())
 
 
-def _catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates) -> Finding:
+def _catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Finding:
     """How many directions are safe with each needle, and the shortest that fits the best path of each window."""
-    directions = Directions(found.theta, found.beta, found.outward_ct, found.grid)
+    directions = Directions(candidates.theta, candidates.beta, candidates.outward_ct, candidates.grid)
     safe = {
         length: organ_candidates(replace(case, needle=case.needle.of_length(length)), anatomy, engine, directions).safe
         for length in sorted(case.needle.lengths_mm)
     }
     said = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
-    best = [window.best for window in find_windows(found).windows]
+    best = [window.best for window in find_windows(candidates).windows]
     shortest = [next((length for length, rows in safe.items() if rows[row]), np.nan) for row in best]
     fits = ", ".join(f"{length:g} mm" for length in shortest)
     numbers = {"lengths_mm": list(safe), "safe": [float(rows.sum()) for rows in safe.values()], "shortest_mm": shortest}

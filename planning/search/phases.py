@@ -111,7 +111,7 @@ def _too_close(names: Texts, amount: Floats) -> Verdict:
 
 
 def with_breathing(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, found: Candidates, bound: DeflectionBound | None = None
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates, bound: DeflectionBound | None = None
 ) -> Candidates:
     """Check what is safe through the whole breath, and reject what is not while the gate lets the needle through.
 
@@ -119,7 +119,7 @@ def with_breathing(
         case: The case; nothing is done where it declares no breathing.
         anatomy: Its structures.
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        found: Checked where the CT shows the body.
+        candidates: Checked where the CT shows the body.
         bound: How far the needle may bend; None bends nothing.
 
     Raises:
@@ -127,43 +127,43 @@ def with_breathing(
     """
     breathing = case.breathing
     if breathing is None:
-        return found
-    body = BreathingBody(case, breathing, anatomy, engine, moving_weights(case, breathing, anatomy), bound, found)
-    rows, within = np.flatnonzero(found.safe), int(breathing.in_window.sum())
+        return candidates
+    body = BreathingBody(case, breathing, anatomy, engine, moving_weights(case, breathing, anatomy), bound, candidates)
+    rows, within = np.flatnonzero(candidates.safe), int(breathing.in_window.sum())
     phases = [body.at(rows, s) for s in breathing.positions.tolist()]
-    verdict = through = found.verdict
+    verdict = through = candidates.verdict
     for at, phase in enumerate(phases):
         through = rejected_at(through, rows, phase.verdict, breathing, phase.s)
         if at:
             through = checked_between(body, through, phases[at - 1], phase)
         verdict = through if at < within else verdict  # the gate's window is the first of them
-    blank = np.full(len(found), np.nan)
+    blank = np.full(len(candidates), np.nan)
     worst, clearance = blank.copy(), blank.copy()
     excess = np.array([phase.least_excess for phase in phases[:within]])
     worst[rows] = breathing.positions[excess.argmin(axis=0)]
     clearance[rows] = np.min([phase.clearance.min(axis=1, initial=np.inf) for phase in phases[:within]], axis=0)
     safe_all = np.asarray(through.reason == Reason.NONE.value) & breathing.whole
     columns = BreathingColumns(safe_all, worst, clearance, breathing.window_text)
-    return replace(found, verdict=verdict, breathing=columns)
+    return replace(candidates, verdict=verdict, breathing=columns)
 
 
-def with_breathing_reach(case: Case, anatomy: Anatomy, found: Candidates, reach: ArmReach) -> Candidates:
+def with_breathing_reach(case: Case, anatomy: Anatomy, candidates: Candidates, reach: ArmReach) -> Candidates:
     """Reject what the arm cannot reach and insert along at a phase that the gate lets through.
 
     Args:
         case: The case; nothing is done where it declares no breathing.
         anatomy: Its structures.
-        found: Checked with the arm where the CT shows the body.
+        candidates: Checked with the arm where the CT shows the body.
         reach: Who checked it.
     """
     breathing = case.breathing
     if breathing is None:
-        return found
+        return candidates
     weights = moving_weights(case, breathing, anatomy)
     for s in breathing.positions[breathing.in_window].tolist():
-        if np.any(breathing.moved_ct(s)) and found.safe.any():
-            found = _at_phase(case, breathing, anatomy, weights, found, reach, s)
-    return found
+        if np.any(breathing.moved_ct(s)) and candidates.safe.any():
+            candidates = _at_phase(case, breathing, anatomy, weights, candidates, reach, s)
+    return candidates
 
 
 def _at_phase(
@@ -171,20 +171,20 @@ def _at_phase(
     breathing: Breathing,
     anatomy: Anatomy,
     weights: MovingWeights,
-    found: Candidates,
+    candidates: Candidates,
     reach: ArmReach,
     s: float,
 ) -> Candidates:
-    rows, moved = np.flatnonzero(found.safe), breathing.moved_ct(s)
+    rows, moved = np.flatnonzero(candidates.safe), breathing.moved_ct(s)
     displaced = _displaced(anatomy, weights, breathing, s)
     solids = _with_moved_solids(case, anatomy, weights, breathing, s, reach.T_base_ct)
     there = ArmReach(case_checker(solids, displaced, reach.T_base_ct), reach.T_base_ct)
-    paths = own_paths(case, anatomy.skin, found.outward_ct, (1 - weights.skin) * moved)
-    path = replace(found.path, length=paths.path_length, skin_angle=paths.skin_angle)
-    shifted = replace(found, path=path, arm=ArmColumns.unknown(len(found)))
+    paths = own_paths(case, anatomy.skin, candidates.outward_ct, (1 - weights.skin) * moved)
+    path = replace(candidates.path, length=paths.path_length, skin_angle=paths.skin_angle)
+    shifted = replace(candidates, path=path, arm=ArmColumns.unknown(len(candidates)))
     answered = with_reach(replace(case, target_ct=case.target_ct + moved), shifted, there)
     at_phase = answered.verdict.of(rows)
-    return replace(found, verdict=rejected_at(found.verdict, rows, at_phase, breathing, s))
+    return replace(candidates, verdict=rejected_at(candidates.verdict, rows, at_phase, breathing, s))
 
 
 def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float) -> Anatomy:

@@ -51,45 +51,45 @@ class Order:
     pareto: NDArray[np.bool_]
 
 
-def ranked(case: Case, found: Candidates) -> Candidates:
+def ranked(case: Case, candidates: Candidates) -> Candidates:
     """Give cost, rank and Pareto mark to the safe candidates."""
-    rows = np.flatnonzero(found.safe)
+    rows = np.flatnonzero(candidates.safe)
     order = rank(
-        min_clearance=found.least_clearance[rows],
-        path_length=found.path.length[rows],
-        skin_angle=found.path.skin_angle[rows],
-        tissue=found.path.tissue[rows],
-        reach_margin=found.arm.margin[rows],
-        safe_cone=found.safe_cone[rows],
+        min_clearance=candidates.least_clearance[rows],
+        path_length=candidates.path.length[rows],
+        skin_angle=candidates.path.skin_angle[rows],
+        tissue=candidates.path.tissue[rows],
+        reach_margin=candidates.arm.margin[rows],
+        safe_cone=candidates.safe_cone[rows],
         shaft=case.needle.shaft_mm,
         max_skin_angle=case.search.max_skin_angle,
         weights=case.ranking,
-        touch_chance=None if found.chances is None else found.chances.touch_any[rows],
+        touch_chance=None if candidates.chances is None else candidates.chances.touch_any[rows],
     )
-    blank = Ranking.none(len(found))
+    blank = Ranking.none(len(candidates))
     cost, ranks, pareto = blank.cost.copy(), blank.rank.copy(), blank.pareto.copy()
     cost[rows], ranks[rows], pareto[rows] = order.cost, order.rank, order.pareto
-    return replace(found, ranking=Ranking(cost, ranks, pareto))
+    return replace(candidates, ranking=Ranking(cost, ranks, pareto))
 
 
-def ranked_by(found: Candidates, cost: Floats) -> Candidates:
+def ranked_by(candidates: Candidates, cost: Floats) -> Candidates:
     """The safe candidates ranked by a cost of the caller's, smaller is better; equal costs keep their order.
 
     Args:
-        found: Candidates.
+        candidates: Candidates.
         cost: Shape (n,); rejected candidates' entries are not looked at.
 
     Raises:
         InputError: Another shape, or a safe candidate whose cost is not finite.
     """
-    rows = np.flatnonzero(found.safe)
-    if cost.shape != (len(found),) or cost.dtype.kind not in "iufb" or not np.isfinite(cost[rows]).all():
-        allowed = f"shape ({len(found)},), real numbers, finite for the {len(rows)} safe candidates"
+    rows = np.flatnonzero(candidates.safe)
+    if cost.shape != (len(candidates),) or cost.dtype.kind not in "iufb" or not np.isfinite(cost[rows]).all():
+        allowed = f"shape ({len(candidates)},), real numbers, finite for the {len(rows)} safe candidates"
         raise InputError(f"a cost of shape {cost.shape}, {cost.dtype}", where="rerank", allowed=allowed, code="cost")
-    ranks = np.zeros(len(found), np.int32)
+    ranks = np.zeros(len(candidates), np.int32)
     ranks[rows[np.argsort(cost[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
-    ranking = Ranking(np.where(found.safe, cost, np.nan), ranks, found.ranking.pareto)
-    return replace(found, ranking=ranking)
+    ranking = Ranking(np.where(candidates.safe, cost, np.nan), ranks, candidates.ranking.pareto)
+    return replace(candidates, ranking=ranking)
 
 
 def rank(
@@ -161,17 +161,17 @@ DIAGONAL = np.sqrt(2.0)
 """Of a cell, in steps, at the equator; nearer to the poles cells are narrower."""
 
 
-def with_grid_cone(found: Candidates) -> Candidates:
+def with_grid_cone(candidates: Candidates) -> Candidates:
     """The candidates with the safe cone of each safe one; those of no regular grid as they are.
 
     Args:
-        found: Candidates with their verdicts by the organs alone: what an arm reaches makes no path safer.
+        candidates: Candidates with their verdicts by the organs alone: what an arm reaches makes no path safer.
     """
-    if found.grid is None:
-        return found
-    cone = np.full(len(found), np.nan)
-    cone[found.safe] = grid_cone(found.grid, found.safe)
-    return replace(found, safe_cone=cone, cone_source=CONE_OF_GRID)
+    if candidates.grid is None:
+        return candidates
+    cone = np.full(len(candidates), np.nan)
+    cone[candidates.safe] = grid_cone(candidates.grid, candidates.safe)
+    return replace(candidates, safe_cone=cone, cone_source=CONE_OF_GRID)
 
 
 def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:

@@ -1,6 +1,7 @@
 """The batch search: a case in, one checked row per direction out.
 
-What skin and organs allow: path, clearance and verdict of every direction, without the arm.
+`search` is the list of its stages; `organ_candidates` the first of them: path, clearance and verdict of every
+direction for skin and organs, without the arm.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ def search(
 ) -> Candidates:
     """Check every direction against the organs, those that pass against the arm, and rank what is left.
 
+    One table grows, a row per direction: each stage fills its columns and rejects, with a reason, only rows that
+    every stage before it left.
+
     Args:
         case: The validated case.
         anatomy: Its structures.
@@ -47,17 +51,69 @@ def search(
         progress: Called with (candidates checked, candidates to check) while the arm is checked.
     """
     axes = None if chance is None else organ_distances(case, anatomy, engine, directions)
-    found = with_grid_cone(organ_candidates(case, anatomy, engine, directions, axes))
+    candidates = organ_candidates(case, anatomy, engine, directions, axes)  # skin entry, clearance, bending, breathing
+    candidates = with_grid_cone(candidates)
     if reach is not None:
-        found = with_breathing_reach(case, anatomy, with_reach(case, found, reach, progress), reach)
-    found = ranked(case, with_chances(case, anatomy, found, chance, axes))
-    return with_joint_chances(with_best_refined(found, chance), chance)
+        candidates = with_reach(case, candidates, reach, progress)
+        candidates = with_breathing_reach(case, anatomy, candidates, reach)
+    candidates = with_chances(case, anatomy, candidates, chance, axes)
+    candidates = ranked(case, candidates)
+    candidates = with_best_refined(candidates, chance)  # ranks anew what it rejects
+    return with_joint_chances(candidates, chance)
 
 
 def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> AxisDistances:
     """How far the needle's axis is from every structure in every direction."""
     outward = directions.outward_ct
     return engine.measure(case.target_ct, outward, own_lengths(case, anatomy, outward))
+
+
+def organ_candidates(
+    case: Case,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    directions: Directions,
+    axes: AxisDistances | None = None,
+) -> Candidates:
+    """Check every direction against skin and organs alone, bent and breathing as declared; nothing is ranked yet.
+
+    Args:
+        case: The validated case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
+        directions: What to check.
+        axes: What `organ_distances` says of them; None measures them here.
+    """
+    needle, outward, checked = case.needle, directions.outward_ct, anatomy.checked
+    paths = own_paths(case, anatomy.skin, outward)
+    lengths = axis_lengths(case, checked, paths)
+    clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes)
+    demanding, count = np.array([s.demands_margin for s in checked], bool), len(directions)
+    candidates = Candidates(
+        theta=directions.theta,
+        beta=directions.beta,
+        outward_ct=outward,
+        verdict=first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle),
+        path=Path(
+            entry_ct=paths.entry_ct,
+            length=paths.path_length,
+            skin_angle=paths.skin_angle,
+            tissue=tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length),
+        ),
+        clearance=Clearance(
+            structures=tuple(s.name for s in checked),
+            margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
+            distance=clearances.clearance,
+            least=clearances.clearance[:, demanding].min(axis=1, initial=np.inf),
+        ),
+        arm=ArmColumns.unknown(count),
+        ranking=Ranking.none(count),
+        safe_cone=np.full(count, np.nan),
+        grid=directions.grid,
+    )
+    bound = None if case.bending is None else case.bending.bound(needle.longest_path_mm)
+    candidates = with_bending(anatomy, candidates, bound)
+    return with_breathing(case, anatomy, engine, candidates, bound)
 
 
 def tissue_crossed(
@@ -91,51 +147,3 @@ def inside_length(structure: Structure, target_ct: Floats, outward_ct: Floats, p
     inside = np.bincount(found.ray, weights=signed, minlength=len(outward_ct))
     ends_inside = (found.count % 2 == 0) == starts_inside
     return np.asarray(np.maximum(inside + np.where(ends_inside, limit, 0.0), 0.0))
-
-
-def organ_candidates(
-    case: Case,
-    anatomy: Anatomy,
-    engine: ClearanceEngine,
-    directions: Directions,
-    axes: AxisDistances | None = None,
-) -> Candidates:
-    """Check every direction against skin and organs alone, bent and breathing as declared; nothing is ranked yet.
-
-    Args:
-        case: The validated case.
-        anatomy: Its structures.
-        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        directions: What to check.
-        axes: What `organ_distances` says of them; None measures them here.
-    """
-    needle, outward, checked = case.needle, directions.outward_ct, anatomy.checked
-    paths = own_paths(case, anatomy.skin, outward)
-    lengths = axis_lengths(case, checked, paths)
-    clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes)
-    verdicts = first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle)
-    demanding, count = np.array([s.demands_margin for s in checked], bool), len(directions)
-    found = Candidates(
-        theta=directions.theta,
-        beta=directions.beta,
-        outward_ct=outward,
-        verdict=verdicts,
-        path=Path(
-            entry_ct=paths.entry_ct,
-            length=paths.path_length,
-            skin_angle=paths.skin_angle,
-            tissue=tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length),
-        ),
-        clearance=Clearance(
-            structures=tuple(s.name for s in checked),
-            margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
-            distance=clearances.clearance,
-            least=clearances.clearance[:, demanding].min(axis=1, initial=np.inf),
-        ),
-        arm=ArmColumns.unknown(count),
-        ranking=Ranking.none(count),
-        safe_cone=np.full(count, np.nan),
-        grid=directions.grid,
-    )
-    bound = None if case.bending is None else case.bending.bound(needle.longest_path_mm)
-    return with_breathing(case, anatomy, engine, with_bending(anatomy, found, bound), bound)

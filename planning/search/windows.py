@@ -79,26 +79,26 @@ class Windows:
         return np.flatnonzero(self.of_row == number)
 
 
-def find_windows(found: Candidates) -> Windows:
+def find_windows(candidates: Candidates) -> Windows:
     """The windows of ranked candidates; without a grid every candidate is one of its own, without area."""
-    label = _connected(found.grid, found.safe)
-    ranked = found.ranked
+    label = _connected(candidates.grid, candidates.safe)
+    ranked = candidates.ranked
     firsts = ranked[np.sort(np.unique(label[ranked], return_index=True)[1])]
-    number = np.zeros(len(found), np.int64)
+    number = np.zeros(len(candidates), np.int64)
     for one, row in enumerate(firsts, start=1):
-        number[(label == label[row]) & found.safe] = one
-    cell = np.zeros(len(found)) if found.grid is None else found.grid.solid_angle()
-    skin = _entry_area(found, cell)
-    parts = (_window(one, found, number == one, int(row), cell, skin) for one, row in enumerate(firsts, start=1))
+        number[(label == label[row]) & candidates.safe] = one
+    cell = np.zeros(len(candidates)) if candidates.grid is None else candidates.grid.solid_angle()
+    skin = _entry_area(candidates, cell)
+    parts = (_window(one, candidates, number == one, int(row), cell, skin) for one, row in enumerate(firsts, start=1))
     return Windows(number, tuple(parts))
 
 
-def nearest_row(found: Candidates, outward_ct: Floats) -> int | None:
+def nearest_row(candidates: Candidates, outward_ct: Floats) -> int | None:
     """The row of a search beside which a direction, shape (3,), lies; None where it is beyond the grid by a step."""
-    row = int(np.argmax(found.outward_ct @ outward_ct))
-    near = found.outward_ct[row]
+    row = int(np.argmax(candidates.outward_ct @ outward_ct))
+    near = candidates.outward_ct[row]
     apart = float(np.arctan2(np.linalg.norm(np.cross(near, outward_ct)), near @ outward_ct))
-    return None if found.grid is None or apart > found.grid.step else row
+    return None if candidates.grid is None or apart > candidates.grid.step else row
 
 
 def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
@@ -120,18 +120,18 @@ def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
     return label
 
 
-def _entry_area(found: Candidates, cell: Floats) -> Floats:
+def _entry_area(candidates: Candidates, cell: Floats) -> Floats:
     """Skin that each direction's cell covers, mm2: the sphere's patch, seen at the angle at which the path enters."""
-    area = cell * found.path.length**2 / np.cos(found.path.skin_angle)
-    return np.asarray(np.where(found.safe, area, 0.0))
+    area = cell * candidates.path.length**2 / np.cos(candidates.path.skin_angle)
+    return np.asarray(np.where(candidates.safe, area, 0.0))
 
 
-def _window(number: int, found: Candidates, rows: Bools, best: int, cell: Floats, skin: Floats) -> Window:
+def _window(number: int, candidates: Candidates, rows: Bools, best: int, cell: Floats, skin: Floats) -> Window:
     return Window(
         number=number,
         best=best,
         directions=int(rows.sum()),
         square_deg=float(cell[rows].sum()) * SQUARE_DEGREES,
         entry_cm2=float(skin[rows].sum()) / 100.0,
-        widest_cone=float(np.fmax.reduce(found.safe_cone[rows])),
+        widest_cone=float(np.fmax.reduce(candidates.safe_cone[rows])),
     )

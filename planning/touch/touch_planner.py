@@ -253,10 +253,10 @@ def _open(task: _Task) -> _Open:
     return _Open(tuple(rows), tuple(kept), left_out)
 
 
-def _free(checkers: ApproachCheckers, tip_mm: float, found: Candidates) -> tuple[Floats, str]:
+def _free(checkers: ApproachCheckers, tip_mm: float, candidates: Candidates) -> tuple[Floats, str]:
     """Of the insertion's own branch those that are free, else of the others; and what most often is in the way."""
     reasons: list[str] = []
-    for q in (found.alike, found.others):
+    for q in (candidates.alike, candidates.others):
         said = [why_not(checkers, tip_mm, one) for one in q]
         free = q[[not reason for reason in said]]
         if len(free):

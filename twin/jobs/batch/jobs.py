@@ -173,9 +173,9 @@ def _elsewhere(scheduler: str | None) -> RunTasks | None:
     return on_scheduler(scheduler)
 
 
-def write_case_page(context: CaseContext, found: Candidates, folder: Path) -> None:
+def write_case_page(context: CaseContext, candidates: Candidates, folder: Path) -> None:
     """A case's map, scene, slices and page, as `search` writes them."""
-    with_pictures(Run(context, found, ()), folder)
+    with_pictures(Run(context, candidates, ()), folder)
 
 
 def run_summary(out: Path, counts: RunCounts) -> dict[str, Any]:

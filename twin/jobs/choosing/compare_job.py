@@ -129,10 +129,10 @@ def _read(path: Path) -> tuple[Input, Plan]:
     return found.input("plan"), parse_plan(found.data, path)
 
 
-def _chosen_side(context: CaseContext, found: Candidates, choice: Choice) -> Side:
-    explained = explain_choice(context, choice, found)
+def _chosen_side(context: CaseContext, candidates: Candidates, choice: Choice) -> Side:
+    explained = explain_choice(context, choice, candidates)
     row = explained.candidates
-    grid = _on_grid(found, row.outward_ct[0], safe=explained.safe)
+    grid = _on_grid(candidates, row.outward_ct[0], safe=explained.safe)
     return Side(choice.text(context.case.space), row.outward_ct[0], row.path.entry_ct[0], explained, grid)
 
 
@@ -140,25 +140,25 @@ def _stated_side(path: Path, plan: Plan) -> Side:
     return Side(f"{path}", plan.outward_ct, plan.entry_ct, plan=plan)
 
 
-def _planned_side(context: CaseContext, found: Candidates, path: Path, plan: Plan) -> Side:
+def _planned_side(context: CaseContext, candidates: Candidates, path: Path, plan: Plan) -> Side:
     """A plan that holds; its chances are those of the configuration in which it ends."""
     check_plan(plan, context, path, seed=context.case.rehearsal.seed)
     explained = context.explain(plan.theta, plan.beta)
     explained = replace(explained, doubt=context.doubt_at(plan.outward_ct, plan.insertion.q[-1]))
-    grid = _on_grid(found, plan.outward_ct, safe=True)
+    grid = _on_grid(candidates, plan.outward_ct, safe=True)
     return replace(_stated_side(path, plan), explained=explained, grid=grid)
 
 
-def _on_grid(found: Candidates, outward_ct: Floats, *, safe: bool) -> OnGrid:
+def _on_grid(candidates: Candidates, outward_ct: Floats, *, safe: bool) -> OnGrid:
     """What the search says of a direction, or of the one of its grid beside it."""
-    row = nearest_row(found, outward_ct)
-    if row is None or not (safe and found.safe[row]):
+    row = nearest_row(candidates, outward_ct)
+    if row is None or not (safe and candidates.safe[row]):
         return OnGrid(None, float("nan"), None)
-    windows = find_windows(found)
+    windows = find_windows(candidates)
     window = windows.windows[int(windows.of_row[row]) - 1]
-    if np.linalg.norm(found.outward_ct[row] - outward_ct) > SAME_DIRECTION:
+    if np.linalg.norm(candidates.outward_ct[row] - outward_ct) > SAME_DIRECTION:
         return OnGrid(None, float("nan"), window)
-    return OnGrid(int(found.ranking.rank[row]), float(found.safe_cone[row]), window)
+    return OnGrid(int(candidates.ranking.rank[row]), float(candidates.safe_cone[row]), window)
 
 
 NEAREST = 5

@@ -53,7 +53,7 @@ def check_candidate(context: CaseContext, choice: Choice) -> Explanation:
     return explain_choice(context, choice, context.search() if choice.of_grid else None)
 
 
-def explain_choice(context: CaseContext, choice: Choice, found: Candidates | None) -> Explanation:
+def explain_choice(context: CaseContext, choice: Choice, candidates: Candidates | None) -> Explanation:
     """Explain a choice, safe or not, with the search of the case where it is of one.
 
     Raises:
@@ -61,8 +61,8 @@ def explain_choice(context: CaseContext, choice: Choice, found: Candidates | Non
         NoAnswerError: Nothing is safe, so that there are no ranks.
     """
     if choice.of_grid:
-        assert found is not None
-        chosen, rows = choose(context, found, choice)
+        assert candidates is not None
+        chosen, rows = choose(context, candidates, choice)
         return context.explain(chosen.theta[rows[0]], chosen.beta[rows[0]])
     choice = with_file_read(context.case, choice)
     explained = context.explain(*chosen_angles(context.case, choice))

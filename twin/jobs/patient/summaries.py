@@ -70,20 +70,20 @@ def _declared(registration: Registration) -> dict[str, Any]:
     }
 
 
-def window_summary(found: Candidates, window: Window) -> dict[str, Any]:
+def window_summary(candidates: Candidates, window: Window) -> dict[str, Any]:
     """A window by its best candidate, as plain values: mm and degrees."""
     row = window.best
     return {
-        "rank": int(found.ranking.rank[row]),
-        **found.at(row),
-        "cost": finite(found.ranking.cost[row]),
-        "min_clearance_mm": finite(found.least_clearance[row]),
-        "path_length_mm": finite(found.path.length[row]),
-        "skin_angle_deg": finite(np.degrees(found.path.skin_angle[row])),
-        "tissue_mm": finite(found.path.tissue[row]),
-        "reach_margin": finite(found.arm.margin[row]),
-        "safe_cone_deg": finite(np.degrees(found.safe_cone[row])),
-        "pareto": bool(found.ranking.pareto[row]),
+        "rank": int(candidates.ranking.rank[row]),
+        **candidates.at(row),
+        "cost": finite(candidates.ranking.cost[row]),
+        "min_clearance_mm": finite(candidates.least_clearance[row]),
+        "path_length_mm": finite(candidates.path.length[row]),
+        "skin_angle_deg": finite(np.degrees(candidates.path.skin_angle[row])),
+        "tissue_mm": finite(candidates.path.tissue[row]),
+        "reach_margin": finite(candidates.arm.margin[row]),
+        "safe_cone_deg": finite(np.degrees(candidates.safe_cone[row])),
+        "pareto": bool(candidates.ranking.pareto[row]),
         "window": window.number,
         "window_directions": window.directions,
         "window_square_deg": window.square_deg,

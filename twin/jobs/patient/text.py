@@ -97,12 +97,12 @@ def _expected(run: Run, error_mm: float | None) -> str:
     return f"expected tip error: {error_mm:.2f} mm (rms), in the plan's configuration of the arm{straight}"
 
 
-def _otherwise(found: Candidates, plan: Plan) -> list[str]:
+def _otherwise(candidates: Candidates, plan: Plan) -> list[str]:
     """That the table's row of the plan's direction is of another configuration, where that tells."""
-    row = np.flatnonzero((found.theta == plan.theta) & (found.beta == plan.beta))
-    if found.chances is None or not len(row):
+    row = np.flatnonzero((candidates.theta == plan.theta) & (candidates.beta == plan.beta))
+    if candidates.chances is None or not len(row):
         return []
-    other = float(np.hypot(found.chances.lateral_mm[row[0]], found.chances.depth_mm[row[0]]))
+    other = float(np.hypot(candidates.chances.lateral_mm[row[0]], candidates.chances.depth_mm[row[0]]))
     if not abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
         return []
     return [f"    in the configuration of the table and of check {other:.2f} mm: an approach may end in another one"]
