@@ -87,7 +87,6 @@ KERNELS = MappingProxyType(
     {
         "puncture_twin.planning.clearance.kernels.segment_triangle": ("tests/clearance/test_plain_kernels.py",),
         "puncture_twin.planning.clearance.kernels.side_by_side": ("tests/clearance/test_plain_kernels.py",),
-        "puncture_twin.planning.clearance.kernels.nearest_triangle": ("tests/clearance/test_plain_kernels.py",),
         "puncture_twin.planning.geometry.containment": (
             "tests/clearance/test_plain_kernels.py",
             "tests/geometry/test_crossings.py",

@@ -10,9 +10,8 @@ import numpy as np
 from benchmarks.scenes import Scene
 from benchmarks.timing import least_seconds
 from puncture_twin.planning.clearance.fast_engine import FastEngine
-from puncture_twin.planning.clearance.kernels.bare import bare
 from puncture_twin.planning.clearance.kernels.bounds import disc_bounds, line_distances
-from puncture_twin.planning.clearance.kernels.lanes import LANES
+from puncture_twin.planning.clearance.kernels.lanes import LANES, bare
 from puncture_twin.planning.clearance.kernels.side_by_side import ROWS, bring_into_frame, measure_beside
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED
 

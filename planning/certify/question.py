@@ -14,8 +14,7 @@ from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.cells import Cells
 from puncture_twin.planning.reach.standoff import farthest_flange
-from puncture_twin.planning.uncertainty.any_pose import any_pose
-from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.planning.uncertainty.pose_error import PoseError, any_pose
 
 MOST_TOUCH = 0.5
 """More than every other needle is no limit."""

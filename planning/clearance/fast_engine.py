@@ -30,11 +30,14 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, block_order, pack
-from puncture_twin.planning.clearance.kernels.displaced_axis import displaced_distances
 from puncture_twin.planning.clearance.kernels.lanes import LANES
-from puncture_twin.planning.clearance.kernels.near_blocks import blocks_near, spheres_around
-from puncture_twin.planning.clearance.kernels.nearest_triangle import nearest_triangle
-from puncture_twin.planning.clearance.kernels.scratch import Found, scratch_for
+from puncture_twin.planning.clearance.kernels.segment_triangle import (
+    blocks_near,
+    displaced_distances,
+    nearest_triangle,
+    spheres_around,
+)
+from puncture_twin.planning.clearance.kernels.side_by_side import Found, scratch_for
 from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh

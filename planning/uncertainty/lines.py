@@ -39,8 +39,8 @@ from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.fast_engine import NearFaces, near_faces
 from puncture_twin.planning.clearance.kernels.blocks import Blocks
-from puncture_twin.planning.clearance.kernels.displaced_axis import beyond, displaced_distance
 from puncture_twin.planning.clearance.kernels.lanes import LANES
+from puncture_twin.planning.clearance.kernels.segment_triangle import beyond, displaced_distance
 from puncture_twin.planning.geometry.rigid import frame_about, skew
 from puncture_twin.planning.uncertainty.hit import Proximity
 

@@ -14,7 +14,7 @@ from puncture_twin.planning.certify.certificate import PROVED_SAFE, parse_certif
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.uncertainty.any_pose import AnyPose, any_pose
+from puncture_twin.planning.uncertainty.pose_error import AnyPose, any_pose
 
 CHANCE = 0.05
 

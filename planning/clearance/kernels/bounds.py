@@ -10,8 +10,7 @@ import numpy as np
 from numba.core import types
 
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.clearance.kernels.bare import intrinsic
-from puncture_twin.planning.clearance.kernels.lanes import Arguments, Vector, least, most
+from puncture_twin.planning.clearance.kernels.lanes import Arguments, Vector, intrinsic, least, most
 
 THREE = types.UniTuple(types.float32, 3)  # type: ignore[no-untyped-call]  # numba has no types
 

@@ -11,8 +11,7 @@ import numpy as np
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.bounds import HUGE, ZERO, disc_bounds, heed_ends, line_distances
 from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, least_of, lowest
-from puncture_twin.planning.clearance.kernels.scratch import PAIRS
-from puncture_twin.planning.clearance.kernels.side_by_side import bring_into_frame, measure_beside, measure_other
+from puncture_twin.planning.clearance.kernels.side_by_side import PAIRS, bring_into_frame, measure_beside, measure_other
 
 ROUNDING = np.float32(4e-6)
 """Share of its corners' distance from the line by which a float32 distance may err (docs/concepts/fast-search.md)."""

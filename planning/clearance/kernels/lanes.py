@@ -3,6 +3,8 @@
 What LLVM makes of a loop over 16 lanes depends on what else stands in it, and on its taste in register widths; a
 comparison of all lanes ends there as one number per lane. Here it ends as one integer, a bit per lane, so what passes
 is gone through by its bits and the rest costs nothing. Processors with shorter registers get two or four of them.
+
+Arrays without their reference count, for the inside of hot loops.
 """
 
 from __future__ import annotations
@@ -10,10 +12,30 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]  # it has no types
+from llvmlite import ir
+from numba import extending
 from numba.core import cgutils, types
 
-from puncture_twin.planning.clearance.kernels.bare import intrinsic
+intrinsic: Any = extending.intrinsic
+"""Numba's own; callers leave out the first argument, which mypy cannot know."""
+
+
+@intrinsic  # type: ignore[untyped-decorator]  # numba's own types
+def bare(typing_context: Any, array: Any) -> Any:
+    """The same array without its reference count, which numba would touch at every call in a loop.
+
+    Only for arguments of a function called from Python: the caller holds them until it returns.
+    """
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        proxy: Any = cgutils.create_struct_proxy(signature.args[0])  # type: ignore[no-untyped-call]  # numba has no types
+        view = proxy(context, builder, value=arguments[0])
+        view.meminfo = cgutils.get_null_value(view.meminfo.type)  # type: ignore[no-untyped-call]  # as above
+        view.parent = cgutils.get_null_value(view.parent.type)  # type: ignore[no-untyped-call]  # as above
+        return view._getvalue()
+
+    return array(array), codegen
+
 
 LANES = 16
 """The float32 numbers of one AVX-512 register."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.clearance.kernels.bare import bare
 from puncture_twin.planning.clearance.kernels.bounds import ZERO, disc_bounds, lower_upper_bounds
 from puncture_twin.planning.clearance.kernels.bundle_search import FOUR, GROWN, direction, measure_bundle
-from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, lowest
-from puncture_twin.planning.clearance.kernels.scratch import NODE_ROWS, Found, NeedleAxes, Scratch
+from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, bare, lowest
+from puncture_twin.planning.clearance.kernels.side_by_side import NODE_ROWS, Found, NeedleAxes, Scratch
 
 BEHIND = np.float32(-1e6)
 """Radius of what only fills up the last group of found blocks: the disc bound takes it as behind the target, mm."""

@@ -19,7 +19,6 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.bodies import BODY_NAMES
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.world.arm import load_arm
-from puncture_twin.twin.world.cameras import SimulatedCamera, picture
 from puncture_twin.twin.world.client import (
     STANDARD_GRAVITY_MM_S2,
     physics_client,
@@ -31,7 +30,7 @@ from puncture_twin.twin.world.client import (
     to_mm,
 )
 from puncture_twin.twin.world.execution import execute, touches
-from puncture_twin.twin.world.workcell import load_box, load_surface, open_workcell, thinned
+from puncture_twin.twin.world.workcell import SimulatedCamera, load_box, load_surface, open_workcell, picture, thinned
 
 REPO = ROOT
 TOOL = Tool(210.0, 150.0, 1.2, 30.0)

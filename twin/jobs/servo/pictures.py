@@ -22,8 +22,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
 from puncture_twin.twin.guidance.stereo.session import Reached, Session
 from puncture_twin.twin.report.annotate import INK, write
-from puncture_twin.twin.world.cameras import pinhole_picture
-from puncture_twin.twin.world.workcell import load_ball, open_workcell
+from puncture_twin.twin.world.workcell import load_ball, open_workcell, pinhole_picture
 
 BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)
 """Colours of what is drawn over the picture."""
