@@ -68,12 +68,7 @@ PLAIN = MappingProxyType(
             "tests/anatomy/test_skin_entry.py",
             "tests/search/test_constraints.py",
         ),
-        **{
-            f"puncture_twin.planning.reach.{module}": tuple(
-                f"tests/reach/test_standoff.py::{test}" for test in STANDOFF
-            )
-            for module in ("standoff", "skin_gap")
-        },
+        "puncture_twin.planning.reach.standoff": tuple(f"tests/reach/test_standoff.py::{test}" for test in STANDOFF),
         "puncture_twin.planning.geometry.containment": ("tests/geometry/test_containment.py",),
         "puncture_twin.planning.search.constraints": ("tests/search/test_verdict_order.py",),
         "puncture_twin.planning.registration.marker_pairs": REGISTRATION,

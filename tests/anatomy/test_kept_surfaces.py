@@ -62,7 +62,7 @@ def entry(cache: Cache, what: str) -> Path:
     """The entry of the vessel, of the skin, or of what was found of all structures."""
     assert cache.folder is not None
     if what == "all":
-        (path,) = cache.folder.glob("*mesh_warnings*")
+        (path,) = cache.folder.glob("*mesh_files*")
         return path
     found = [path for path in cache.folder.glob("*anatomy.surfaces*") if b"faces" in path.read_bytes()[:300]]
     has_flags = {b"cut_faces" in path.read_bytes()[:300]: path for path in found}

@@ -25,7 +25,6 @@ MAKERS = (
     "puncture_twin.planning.formats.meshes.mesh_files",
     "puncture_twin.planning.clearance.fast_engine",
     "puncture_twin.planning.collision.packed",
-    "puncture_twin.planning.collision.packed",
     "puncture_twin.planning.collision.proofs",
     "puncture_twin.twin.report.page.page_scene",
 )
@@ -298,7 +297,7 @@ def test_the_code_that_makes_a_surface_is_in_its_stamp():
 def test_the_code_that_reads_a_volume_decides_what_is_kept_of_it(tmp_path, monkeypatch):
     """Readers of DICOM are handed in: the organ of the old one stayed when one was mended."""
     files = closure([f"{PROJECT}/{place_of(surfaces.READERS)}.py"])
-    dicom = [f"dicom/{name}" for name in ("ct_series", "stack", "segmentation", "structure_set")]
+    dicom = [f"dicom/{name}" for name in ("ct_series", "slices", "segmentation", "structure_set")]
     assert {f"{PROJECT}/planning/formats/{name}.py" for name in (*dicom, "labels/slicer_segments")} <= files
     assert {"pydicom", "python-gdcm"} <= set(LIBRARIES)
     made = []
