@@ -22,7 +22,7 @@ from puncture_twin.planning.evidence.target import (
     target_place,
 )
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
-from puncture_twin.planning.registration.checks.marker_list import Surroundings
+from puncture_twin.planning.registration.checks.markers import Surroundings
 from puncture_twin.planning.registration.placement import Placement
 
 
