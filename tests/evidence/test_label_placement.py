@@ -5,7 +5,7 @@ import pytest
 from placed_trunk import PHANTOMS, moved, write_trunk
 from places import DATA
 
-from benchmarks.placements import changed, meshes_of, real, source_of, wrong
+from benchmarks.placements import Patient, changed, meshes_of, real, source_of, wrong
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.findings import Severity
 from puncture_twin.planning.evidence.edges import edge_image
@@ -76,6 +76,43 @@ def test_structures_that_agree_on_another_place_are_named():
     found = assess(image, source_of(patient, off))
     assert found.agreeing == ("1", "2") or found.refuses
     assert assess(image, source_of(patient, meshes)).agreeing == ()
+
+
+def test_one_structure_that_is_off_is_named():
+    """Each of eight by itself 15 mm off to the side: it lies better elsewhere, or its outline is not confirmed.
+
+    Of the true ones none lies better, and fewer than half are not confirmed; a structure beside the image is unseen.
+    """
+    patient = PHANTOMS["trunk"]
+    image, meshes = edge_image(patient.hu, patient.T), meshes_of(patient)
+    true = assess(image, source_of(patient, meshes))
+    assert true.odd == true.unseen == ()
+    assert len(true.unconfirmed) <= 3
+    for name in ("2", "5", "6"):
+        off = meshes | {name: meshes[name].transformed(moved(0.0, 15.0, 0.0))}
+        found = assess(image, source_of(patient, off))
+        assert name in {*found.odd, *found.unconfirmed}, (name, found)
+    away = meshes | {"5": meshes["5"].transformed(moved(0.0, 0.0, 400.0))}
+    assert assess(image, source_of(patient, away)).unseen == ("5",)
+
+
+def test_a_better_edge_around_what_is_uneven_is_no_other_place():
+    """A ball of weak contrast beside a tube of strong contrast: its edges lie better there, and half of it in the tube.
+
+    That is the tube's edge. Without the tube's contrast, and the ball drawn where nothing is, the ball's own is found.
+    """
+    x, y, z = (np.arange(n) * 2.0 - n + 1 for n in (80, 80, 60))
+    x, y, z = np.meshgrid(x, y, z, indexing="ij")
+    ball, tube = x**2 + y**2 + z**2 < 11**2, np.hypot(x - 18, y) < 7
+    hu = np.where(tube, 300.0, np.where(ball, 38.0, 20.0)) + np.random.default_rng(1).normal(0, 10, x.shape)
+    T = np.diag([2.0, 2.0, 2.0, 1.0])
+    T[:3, 3] = x[0, 0, 0], y[0, 0, 0], z[0, 0, 0]
+    patient = Patient(hu, ball.astype(np.int16) + 2 * tube, T)
+    meshes = meshes_of(patient)
+    assert assess(edge_image(hu, T), source_of(patient, meshes)).odd == ()
+    off = meshes | {"1": meshes["1"].transformed(moved(-24.0, 0.0, 0.0))}
+    contrast = edge_image(hu + 100.0 * ball, T)
+    assert assess(contrast, source_of(patient, off)).odd == ("1",)
 
 
 def test_a_thin_slab_is_told_by_the_shifts_that_it_has_room_for():

@@ -218,8 +218,8 @@ def _other_space(rng):
     return np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
-MAY_PASS = 0.35
-"""What is shifted into the rim of the body, or against the skin, where no other part lies."""
+MAY_PASS = 0.1
+"""What is shifted into the rim of the body, or against the skin, where no other part lies, is said in a note."""
 
 KINDS = (
     Kind("labels shifted", 40, partial(_whole, "shift", _shift)),
