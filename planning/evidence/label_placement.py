@@ -290,7 +290,7 @@ class Alone(NamedTuple):
     def better(self, z: float, ratio: float, uneven: float) -> Bools:
         """Which structures lie so much better at which place by themselves, shape (placements, structures)."""
         on_edges = (self.compared.own_z >= z) & (self.compared.own_ratio >= ratio)
-        return np.asarray(on_edges & (self.uneven <= uneven))
+        return np.asarray(on_edges & (self.uneven < uneven))
 
     def names_of(self, rows: Bools) -> tuple[str, ...]:
         """Of some structures (n,)."""
