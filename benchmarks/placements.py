@@ -20,20 +20,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from puncture_twin.planning.evidence.edges import compare, edge_image, sample_surfaces
-from puncture_twin.planning.evidence.label_placement import (
-    AGREEING,
-    STRUCTURES,
-    WARNING_Z,
-    Source,
-    assess,
-    better_alone,
-)
+from puncture_twin.planning.evidence.edges import edge_image
+from puncture_twin.planning.evidence.label_placement import Source, assess
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
 COUNTS = (1, 3, 6, 15, 60)
+OWN = ("odd", "agreeing", "unconfirmed", "unseen")
 CHANGES = ("as it is", "noise 40 HU", "cropped", "every third slice", "blurred")
 
 
@@ -199,34 +193,25 @@ def rows(patients, draws: int, rng: np.random.Generator) -> Iterator[dict]:
                     kind, T = wrong(source, rng)
                     moved = {one: mesh.transformed(T) for one, mesh in source.meshes.items()}
                     off = source_of(image_of, moved)
-                    yield _row(name, change, count, "true", assess(image, source)) | own_z(image, source)
-                    yield _row(name, change, count, kind, assess(image, off)) | own_z(image, off)
-
-
-def own_z(image, source):
-    """Each structure's largest z by itself, for each limit where it is so many times better: shifted, or in RAS."""
-    compared = compare(image, sample_surfaces(list(source.meshes.values())), source.placements())
-    limits = (*STRUCTURES, AGREEING)
-    own = [np.where(better_alone(compared, -np.inf, ratio), compared.own_z, -np.inf) for _, ratio in limits]
-    return {"own_z": [z.max(axis=0).tolist() for z in own]}
+                    yield _row(name, change, count, "true", assess(image, source)) | {"of": len(chosen)}
+                    yield _row(name, change, count, kind, assess(image, off)) | {"of": len(chosen)}
 
 
 def _print_own(found):
-    limits = (*STRUCTURES, AGREEING)
-    print("\nEach structure by itself, the largest z where it is so many times better, and which have so much:")
-    heads = [f"{ratio:g} times better: most | z >= {z:g}" for z, ratio in limits]
-    print(f"| structures | {' | '.join(heads)} |\n|---|{6 * '---|'}")
+    print("\nEach structure by itself: how many are said to lie better elsewhere, and to be unconfirmed:")
+    print("| structures | better elsewhere | at one place | unconfirmed | not in the image |\n|---|---|---|---|---|")
     for kind in ("true", *sorted({row["kind"] for row in found} - {"true"})):
-        own = np.concatenate([np.transpose(row["own_z"]) for row in found if row["kind"] == kind])
-        cells = [f"{own[:, k].max():.1f} | {np.mean(own[:, k] >= z):.3f}" for k, (z, _) in enumerate(limits)]
-        print(f"| {len(own)} {kind} | {' | '.join(cells)} |")
+        some = [row for row in found if row["kind"] == kind]
+        count = sum(row["of"] for row in some)
+        cells = [f"{sum(row[one] for row in some) / count:.3f}" for one in OWN]
+        print(f"| {count} {kind} | {' | '.join(cells)} |")
 
 
 def _row(name, change, count, kind, found):
     return {
         "name": name, "change": change, "structures": count, "kind": kind, "z": found.z, "named": found.T is not None,
-        "told": bool(found.open), "odd": len(found.odd), "refused": found.refuses,
-    }  # fmt: skip
+        "told": bool(found.open), "refused": found.refuses, "doubtful": found.doubtful,
+    } | {one: len(getattr(found, one)) for one in OWN}  # fmt: skip
 
 
 def main() -> None:
@@ -264,15 +249,15 @@ def _refused(row):
 
 
 def _warned(row):
-    return row["z"] >= WARNING_Z and not row["refused"]
+    return row["doubtful"] and not row["refused"]
 
 
 def _open(row):
-    return row["z"] < WARNING_Z and row["told"]
+    return not row["doubtful"] and row["told"]
 
 
 def _passed(row):
-    return row["z"] < WARNING_Z and not row["told"]
+    return not row["doubtful"] and not row["told"]
 
 
 if __name__ == "__main__":

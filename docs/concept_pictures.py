@@ -27,7 +27,7 @@ from puncture_twin.planning.evidence.label_placement import REFUSING_Z
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.reach.standoff import skin_gaps
-from puncture_twin.planning.registration.checks.skin_fit import skin_fit
+from puncture_twin.planning.registration.checks.markers import skin_fit
 from tools.phantoms import supine
 from tools.phantoms.ct_image import rendered
 

@@ -13,41 +13,35 @@ from types import MappingProxyType
 
 from puncture_twin.planning.anatomy.default_roles import LATERAL_MASS, plain_name
 
-ORGANS = frozenset(
-    (
-        *("liver", "spleen", "pancreas", "kidney", "kidneys", "lung", "lungs", "adrenal", "adrenals", "thyroid"),
-        *("parotid", "submandibular", "thymus", "prostate", "uterus", "ovary", "testis", "breast", "breasts", "gland"),
-        *("glands", "node", "nodes", "brain", "cerebrum", "cerebellum", "hemisphere", "matter"),
-    )
-)
+
+def words(text: str) -> frozenset[str]:
+    """The words of a text."""
+    return frozenset(text.split())
+
+
+ORGANS = words("""
+    liver spleen pancreas kidney kidneys lung lungs adrenal adrenals thyroid parotid submandibular thymus prostate
+    uterus ovary testis breast breasts gland glands node nodes brain cerebrum cerebellum hemisphere matter
+""")
 """Organs of solid tissue: a lesion lies in them, and a path to it leads through them."""
 
-LESIONS = frozenset(
-    (
-        *("lesion", "lesions", "laesion", "lasion", "tumor", "tumors", "tumour", "tumours", "tumeur", "nodule"),
-        *("nodules", "metastasis", "metastases", "metastase", "metastasen", "carcinoma", "neoplasm", "neoplasia"),
-        *("cancer", "mass", "gtv", "ctv", "itv", "ptv", "hcc"),
-    )
-)
+LESIONS = words("""
+    lesion lesions laesion lasion tumor tumors tumour tumours tumeur nodule nodules metastasis metastases metastase
+    metastasen carcinoma neoplasm neoplasia cancer mass gtv ctv itv ptv hcc
+""")
 """Lesions, as whole words: a ``Tumorvene`` is none."""
 
-BONES = frozenset(
-    (
-        *("bone", "bones", "rib", "ribs", "vertebra", "vertebrae", "sternum"),
-        *("hip", "ilium", "ischium", "pubis", "sacrum", "femur", "tibia", "fibula", "patella", "humerus"),
-        *("radius", "ulna", "scapula", "clavicle", "clavicula", "skull", "cranium", "mandible", "maxilla"),
-    )
-)
+BONES = words("""
+    bone bones rib ribs vertebra vertebrae sternum hip ilium ischium pubis sacrum femur tibia fibula patella humerus
+    radius ulna scapula clavicle clavicula skull cranium mandible maxilla
+""")
 """Bones; of the spine the vertebrae alone, since a spine may hold its cord."""
 
-SOFT_TISSUES = frozenset(
-    (
-        *("muscle", "muscles", "gluteus", "autochthon", "iliopsoas", "psoas", "pectoralis", "quadriceps", "rectus"),
-        *("oblique", "latissimus", "trapezius", "deltoid", "serratus", "erector"),
-        *("sartorius", "thigh", "levator", "sternocleidomastoid", "platysma", "scalenus", "scalene"),
-        *("digastric", "masseter", "temporalis", "fat", "adipose", "subcutaneous"),
-    )
-)
+SOFT_TISSUES = words("""
+    muscle muscles gluteus autochthon iliopsoas psoas pectoralis quadriceps rectus oblique latissimus trapezius
+    deltoid serratus erector sartorius thigh levator sternocleidomastoid platysma scalenus scalene digastric
+    masseter temporalis fat adipose subcutaneous
+""")
 """Muscles and fat, which needles pass."""
 
 WALLS = frozenset(("internal", "external", "internus", "externus"))
@@ -56,31 +50,21 @@ WALLS = frozenset(("internal", "external", "internus", "externus"))
 LEVELS_OF_CORD = frozenset(("cervical", "thoracic", "lumbar"))
 
 POSITIONS = (
-    WALLS
-    | LEVELS_OF_CORD
-    | {
-        *("middle", "superior", "inferior", "anterior", "posterior", "medial", "lateral", "intermediate", "medius"),
-    }
+    WALLS | LEVELS_OF_CORD | words("middle superior inferior anterior posterior medial lateral intermediate medius")
 )
 """Said of vessels and nerves, which are then named after an organ without a noun of their own: "superior thyroid"."""
 
-PARTS = frozenset(
-    (
-        *("lobe", "lobes", "segment", "segments", "section", "cortex", "parenchyma", "tissue", "hemisphere"),
-        *("gland", "glands", "node", "nodes"),
-    )
-)
+PARTS = words("lobe lobes segment segments section cortex parenchyma tissue hemisphere gland glands node nodes")
 """Parts of an organ: beside one of them a position is its own, as in ``lung_upper_lobe``."""
 
 QUALIFIERS = (
     POSITIONS
     | PARTS
-    | {
-        *("left", "right", "l", "r", "upper", "lower", "major", "minor", "maximus", "minimus"),
-        *("cerebral", "cerebellar", "lymph", "abdominis", "femoris", "spinae", "ani", "white", "grey", "gray"),
-        *("head", "neck", "body", "tail", "whole", "of", "the", "and"),
-        *("costal", "skeletal", "torso", "visceral", "intermuscular", "compartment", "dorsi", "scapulae"),
-    }
+    | words("""
+    left right l r upper lower major minor maximus minimus cerebral cerebellar lymph abdominis femoris spinae ani
+    white grey gray head neck body tail whole of the and costal skeletal torso visceral intermuscular compartment
+    dorsi scapulae
+""")
 ) - ORGANS
 """What is said of an organ besides: a side, a part, a kind. Alone it may be said of a vessel: ``middle cerebral``."""
 
@@ -111,11 +95,11 @@ def named_as_crossed(name: str) -> bool:
     >>> named_as_crossed("superior thyroid"), named_as_crossed("superior thyroid lobe")
     (False, True)
     """
-    words = _words(name)
-    nouns = [word for word in words if word not in QUALIFIERS and not LEVEL.fullmatch(word)]
+    spoken = _words(name)
+    nouns = [word for word in spoken if word not in QUALIFIERS and not LEVEL.fullmatch(word)]
     lesion = any(_is_lesion(word) for word in nouns)
     known = all(word in ORGANS | BONES | SOFT_TISSUES or _is_lesion(word) for word in nouns)
-    return bool(nouns) and known and (lesion or not _may_lack_its_noun(words))
+    return bool(nouns) and known and (lesion or not _may_lack_its_noun(spoken))
 
 
 def named_as_lesion(name: str) -> bool:
@@ -132,10 +116,10 @@ def _is_lesion(word: str) -> bool:
     return word.rstrip(DIGITS) in LESIONS
 
 
-def _may_lack_its_noun(words: frozenset[str]) -> bool:
+def _may_lack_its_noun(spoken: frozenset[str]) -> bool:
     """Whether known words may be said of a vessel, a nerve, the cord or a muscle of the eye."""
-    placed = words & POSITIONS
-    of_organ = bool(placed and words & ORGANS and not words & PARTS)
-    of_bone = bool(words & WALLS and words & BONES)
-    of_cord = "matter" in words and any(word in POSITIONS or LEVEL.fullmatch(word) for word in words)
-    return of_organ or of_bone or of_cord or any(noun in words and not words & NEEDS[noun] for noun in NEEDS)
+    placed = spoken & POSITIONS
+    of_organ = bool(placed and spoken & ORGANS and not spoken & PARTS)
+    of_bone = bool(spoken & WALLS and spoken & BONES)
+    of_cord = "matter" in spoken and any(word in POSITIONS or LEVEL.fullmatch(word) for word in spoken)
+    return of_organ or of_bone or of_cord or any(noun in spoken and not spoken & NEEDS[noun] for noun in NEEDS)

@@ -13,11 +13,12 @@ import unicodedata
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 from puncture_twin.planning.formats.labels.naming import specificity
 
 Kind = Literal["avoid", "traverse", "ignore", "unknown"]
+KINDS: Mapping[str, Kind] = MappingProxyType({kind: kind for kind in get_args(Kind)})
 
 
 class DefaultRole(NamedTuple):
@@ -39,343 +40,133 @@ class DefaultRole(NamedTuple):
     reason: str
 
 
-def _line(group: str, patterns: str, kind: Kind, margin_mm: float, reason: str) -> DefaultRole:
-    """A line of the table; patterns with spaces between them."""
-    return DefaultRole(group, tuple(patterns.split()), kind, margin_mm, reason)
+def _table(text: str) -> tuple[DefaultRole, ...]:
+    """Lines of the table: kind, margin, group and reason; below, indented, the patterns."""
+    found = []
+    for row in re.split(r"\n(?=\S)", text.strip()):
+        first, _, patterns = row.partition("\n")
+        start, _, reason = first.partition(": ")
+        what, _, group = start.partition(", ")
+        kind, _, margin_mm = what.partition(" ")
+        found.append(DefaultRole(group, tuple(patterns.split()), KINDS[kind], float(margin_mm), reason))
+    return tuple(found)
 
 
-UNKNOWN_NAME = _line(
-    "unknown name",
-    "",
-    "avoid",
-    5.0,
-    "nobody knows what it is: the largest margin of the table",
-)
-"""Of a name that no line matches."""
-
-BODY = _line(
-    "outline of the body",
-    "skin body body_trunc body_extremities body_envelope external outline patient",
-    "ignore",
-    0.0,
-    "the skin is found in the CT, or is the skin mesh",
-)
-"""Structures that are the body itself."""
-
-NOT_ANNOTATED = _line(
-    "not annotated",
-    "ignore ignore_label void not_annotated unannotated",
-    "unknown",
-    2.0,
-    "nobody said what is there: no path through it is known to be free",
-)
-"""Voxels that a segmentation leaves open, as nnU-Net's label ``ignore``."""
-
-LESION = _line(
-    "lesion",
-    "*lesion* *lasion* *laesion* *tumor* *tumour* *tumeur* *nodule* *metastas* *carcinoma* *neoplas* *cancer* *mass "
-    "mass_* gtv* ctv* itv* ptv* hcc*",
-    "avoid",
-    3.0,
-    "tumour cells are not carried along the needle; the one that holds the target is the target",
-)
-"""What a target usually is; this line comes before all others."""
+UNKNOWN_NAME, BODY, NOT_ANNOTATED, LESION = _table("""
+avoid 5, unknown name: nobody knows what it is: the largest margin of the table
+ignore 0, outline of the body: the skin is found in the CT, or is the skin mesh
+    skin body body_trunc body_extremities body_envelope external outline patient
+unknown 2, not annotated: nobody said what is there: no path through it is known to be free
+    ignore ignore_label void not_annotated unannotated
+avoid 3, lesion: tumour cells are not carried along the needle; the one that holds the target is the target
+    *lesion* *lasion* *laesion* *tumor* *tumour* *tumeur* *nodule* *metastas* *carcinoma* *neoplas* *cancer* *mass
+    mass_* gtv* ctv* itv* ptv* hcc*
+""")
+"""Of a name that no line matches; structures that are the body itself; voxels that a segmentation leaves open, as
+nnU-Net's label ``ignore``; and what a target usually is, which comes before all others."""
 
 LATERAL_MASS = "lateral_mass"
 """Of a vertebra: a mass that is no lesion."""
 
-GENERAL: tuple[DefaultRole, ...] = (
+GENERAL = (
     BODY,
     NOT_ANNOTATED,
-    _line(
-        "vertebrae, spine",
-        "*vertebra* spine *spinal_column* *intervertebral* *disc *disk *lateral_mass* *massa_lateralis*",
-        "avoid",
-        2.0,
-        "bone deflects a needle; nerve roots leave beside it",
-    ),
-    _line(
-        "ribs",
-        "rib* *_rib* *thoracic_cage*",
-        "avoid",
-        1.0,
-        "bone deflects; the intercostal vessels run below it",
-    ),
-    _line(
-        "costal cartilages, sternum",
-        "*costal_cart* *sternum*",
-        "avoid",
-        1.0,
-        "bone and cartilage deflect a needle",
-    ),
-    _line(
-        "pelvis",
-        "hip hip_* *_hip *pelvi*bone* *ilium *ischium *pubis *sacrum* *coccyx*",
-        "avoid",
-        1.0,
-        "bone deflects a needle",
-    ),
-    _line(
-        "limbs and girdles",
-        "*femur* *tibia* *fibula* *patella* *humerus* *radius* *ulna* *scapula* *clavicula* *clavicle* "
-        "*carpal* *tarsal* *metacarpal* *metatarsal* *phalanges* *bone bone*",
-        "avoid",
-        1.0,
-        "bone deflects a needle",
-    ),
-    _line(
-        "skull and face",
-        "*skull* *crani* *mandible* *maxilla* *zygomatic* *teeth* face* *hyoid*",
-        "avoid",
-        1.0,
-        "bone deflects a needle",
-    ),
-    _line(
-        "spinal cord",
-        "*spinal_cord* *spinal_canal* *medulla_spinalis* *cauda_equina* *thecal_sac* *dural_sac*",
-        "avoid",
-        5.0,
-        "palsy",
-    ),
-    _line(
-        "nerves",
-        "*nerve* *plexus* *optic* *chiasm*",
-        "avoid",
-        5.0,
-        "palsy, pain; they move with their surroundings",
-    ),
-    _line(
-        "brain",
-        "*brain* *cerebr* *cerebell* *thalamus* *caudate* *putamen* *pallidum* *capsule* *subarachnoid* "
-        "*septum_pellucidum* *insular* *parenchyma*",
-        "avoid",
-        3.0,
-        "eloquent tissue",
-    ),
-    _line(
-        "eyes",
-        "*eye* *orbit* *lens* *lacrimal*",
-        "avoid",
-        3.0,
-        "sight",
-    ),
-    _line(
-        "aorta and venae cavae",
-        "*aorta* *vena_cava* vena_cava* ivc svc",
-        "avoid",
-        5.0,
-        "large vessel: bleeding",
-    ),
-    _line(
-        "great vessels of the chest and neck",
-        "*pulmonary_arter* *pulmonary_vein* *pulmonary_venous* *pulmonary_trunk* *brachiocephalic* "
-        "*subclavian* *carotid* *jugular*",
-        "avoid",
-        5.0,
-        "large vessel: bleeding, embolism",
-    ),
-    _line(
-        "portal vein",
-        "*portal_vein* portal* *splenic_vein* *mesenteric*",
-        "avoid",
-        4.0,
-        "bleeding",
-    ),
-    _line(
-        "iliac vessels",
-        "iliac_arter* iliac_ven* *_iliac_arter* *_iliac_ve*",
-        "avoid",
-        4.0,
-        "bleeding",
-    ),
-    _line(
-        "other vessels",
-        "*arter* *vein* hepatic_ve* *vena* *venous* *vessel* *vascul* *sinus_sagitt* "
-        "*circle_of_willis* aneurysm aneurysma *_aneurysm",
-        "avoid",
-        3.0,
-        "bleeding; smaller ones are rarely segmented whole",
-    ),
-    _line(
-        "heart",
-        "*heart* *cardi* *papillary_muscle* *atri* *ventricle_left* *ventricle_right* "
-        "*left_ventricle *right_ventricle *coronar*",
-        "avoid",
-        5.0,
-        "it moves; tamponade",
-    ),
-    _line(
-        "lungs",
-        "*lung* *pulmo* *pleura* *bronch*",
-        "avoid",
-        2.0,
-        "pneumothorax; it moves with the breath",
-    ),
-    _line(
-        "airways",
-        "*trachea* *airway* *larynx* *pharynx* *thyroid_cartilage* *cricoid* nasal* *sinus*",
-        "avoid",
-        3.0,
-        "air leaks; infection",
-    ),
-    _line(
-        "oesophagus",
-        "*esophag*",
-        "avoid",
-        3.0,
-        "perforation, infection",
-    ),
-    _line(
-        "stomach and bowel",
-        "*stomach* *duoden* *bowel* *intestin* *jejun* ileum *colon* *rectum* *sigmoid* *c?ecum* *append*x*",
-        "avoid",
-        3.0,
-        "perforation, infection; it moves",
-    ),
-    _line(
-        "gallbladder and bile ducts",
-        "*gallbladder* *gall_bladder* *bile* *biliary* *common_duct*",
-        "avoid",
-        3.0,
-        "bile leaks",
-    ),
-    _line(
-        "urinary bladder and ureters",
-        "*bladder* *ureter* *urethra*",
-        "avoid",
-        3.0,
-        "urine leaks",
-    ),
-    _line(
-        "liver",
-        "*liver* *hepatic* *hepar*",
-        "avoid",
-        3.0,
-        "it bleeds; make it traverse where a path through the liver is meant",
-    ),
-    _line(
-        "spleen",
-        "*spleen* *splenic*",
-        "avoid",
-        3.0,
-        "it bleeds",
-    ),
-    _line(
-        "kidneys",
-        "*kidney* *renal*",
-        "avoid",
-        3.0,
-        "it bleeds; cysts leak",
-    ),
-    _line(
-        "pancreas",
-        "*pancrea*",
-        "avoid",
-        3.0,
-        "pancreatitis",
-    ),
-    _line(
-        "adrenal glands",
-        "*adrenal* *suprarenal*",
-        "avoid",
-        2.0,
-        "it bleeds; blood pressure crises",
-    ),
-    _line(
-        "thyroid, glands of the neck",
-        "*thyroid* *parotid* *submandibular* *gland* *thymus*",
-        "avoid",
-        2.0,
-        "it bleeds",
-    ),
-    _line(
-        "organs of the pelvis",
-        "*prostate* *uter?s* *ovar* *seminal* *vagina* *testi* *penis*",
-        "avoid",
-        2.0,
-        "bleeding, infection",
-    ),
-    _line(
-        "lymph nodes",
-        "*lymph* *node",
-        "avoid",
-        2.0,
-        "seeding; vessels lie beside them",
-    ),
-    _line(
-        "devices",
-        "*implant* *stent* *pacemaker* *catheter* *port_a* *electrode* *prosthe*",
-        "avoid",
-        3.0,
-        "a needle damages it, or is deflected",
-    ),
-    _line(
-        "muscles",
-        "*gluteus* *autochthon* *iliopsoas* *psoas* *muscle* *pectoralis* *quadriceps* *rectus_abdom* "
-        "*oblique* *latissimus* *trapezius* *deltoid* *serratus* *erector* *sartorius* thigh_* *levator* "
-        "*sternocleido* *platysma* *scalen* *digastric* *masseter* *temporalis*",
-        "traverse",
-        0.0,
-        "needles pass muscle",
-    ),
-    _line(
-        "fat, breast",
-        "*fat *fat_* *adipose* *subcutan* breast* *_breast",
-        "traverse",
-        0.0,
-        "needles pass fat",
-    ),
+    *_table("""
+avoid 2, vertebrae, spine: bone deflects a needle; nerve roots leave beside it
+    *vertebra* spine *spinal_column* *intervertebral* *disc *disk *lateral_mass* *massa_lateralis*
+avoid 1, ribs: bone deflects; the intercostal vessels run below it
+    rib* *_rib* *thoracic_cage*
+avoid 1, costal cartilages, sternum: bone and cartilage deflect a needle
+    *costal_cart* *sternum*
+avoid 1, pelvis: bone deflects a needle
+    hip hip_* *_hip *pelvi*bone* *ilium *ischium *pubis *sacrum* *coccyx*
+avoid 1, limbs and girdles: bone deflects a needle
+    *femur* *tibia* *fibula* *patella* *humerus* *radius* *ulna* *scapula* *clavicula* *clavicle* *carpal* *tarsal*
+    *metacarpal* *metatarsal* *phalanges* *bone bone*
+avoid 1, skull and face: bone deflects a needle
+    *skull* *crani* *mandible* *maxilla* *zygomatic* *teeth* face* *hyoid*
+avoid 5, spinal cord: palsy
+    *spinal_cord* *spinal_canal* *medulla_spinalis* *cauda_equina* *thecal_sac* *dural_sac*
+avoid 5, nerves: palsy, pain; they move with their surroundings
+    *nerve* *plexus* *optic* *chiasm*
+avoid 3, brain: eloquent tissue
+    *brain* *cerebr* *cerebell* *thalamus* *caudate* *putamen* *pallidum* *capsule* *subarachnoid*
+    *septum_pellucidum* *insular* *parenchyma*
+avoid 3, eyes: sight
+    *eye* *orbit* *lens* *lacrimal*
+avoid 5, aorta and venae cavae: large vessel: bleeding
+    *aorta* *vena_cava* vena_cava* ivc svc
+avoid 5, great vessels of the chest and neck: large vessel: bleeding, embolism
+    *pulmonary_arter* *pulmonary_vein* *pulmonary_venous* *pulmonary_trunk* *brachiocephalic* *subclavian*
+    *carotid* *jugular*
+avoid 4, portal vein: bleeding
+    *portal_vein* portal* *splenic_vein* *mesenteric*
+avoid 4, iliac vessels: bleeding
+    iliac_arter* iliac_ven* *_iliac_arter* *_iliac_ve*
+avoid 3, other vessels: bleeding; smaller ones are rarely segmented whole
+    *arter* *vein* hepatic_ve* *vena* *venous* *vessel* *vascul* *sinus_sagitt* *circle_of_willis* aneurysm
+    aneurysma *_aneurysm
+avoid 5, heart: it moves; tamponade
+    *heart* *cardi* *papillary_muscle* *atri* *ventricle_left* *ventricle_right* *left_ventricle *right_ventricle
+    *coronar*
+avoid 2, lungs: pneumothorax; it moves with the breath
+    *lung* *pulmo* *pleura* *bronch*
+avoid 3, airways: air leaks; infection
+    *trachea* *airway* *larynx* *pharynx* *thyroid_cartilage* *cricoid* nasal* *sinus*
+avoid 3, oesophagus: perforation, infection
+    *esophag*
+avoid 3, stomach and bowel: perforation, infection; it moves
+    *stomach* *duoden* *bowel* *intestin* *jejun* ileum *colon* *rectum* *sigmoid* *c?ecum* *append*x*
+avoid 3, gallbladder and bile ducts: bile leaks
+    *gallbladder* *gall_bladder* *bile* *biliary* *common_duct*
+avoid 3, urinary bladder and ureters: urine leaks
+    *bladder* *ureter* *urethra*
+avoid 3, liver: it bleeds; make it traverse where a path through the liver is meant
+    *liver* *hepatic* *hepar*
+avoid 3, spleen: it bleeds
+    *spleen* *splenic*
+avoid 3, kidneys: it bleeds; cysts leak
+    *kidney* *renal*
+avoid 3, pancreas: pancreatitis
+    *pancrea*
+avoid 2, adrenal glands: it bleeds; blood pressure crises
+    *adrenal* *suprarenal*
+avoid 2, thyroid, glands of the neck: it bleeds
+    *thyroid* *parotid* *submandibular* *gland* *thymus*
+avoid 2, organs of the pelvis: bleeding, infection
+    *prostate* *uter?s* *ovar* *seminal* *vagina* *testi* *penis*
+avoid 2, lymph nodes: seeding; vessels lie beside them
+    *lymph* *node
+avoid 3, devices: a needle damages it, or is deflected
+    *implant* *stent* *pacemaker* *catheter* *port_a* *electrode* *prosthe*
+traverse 0, muscles: needles pass muscle
+    *gluteus* *autochthon* *iliopsoas* *psoas* *muscle* *pectoralis* *quadriceps* *rectus_abdom* *oblique*
+    *latissimus* *trapezius* *deltoid* *serratus* *erector* *sartorius* thigh_* *levator* *sternocleido* *platysma*
+    *scalen* *digastric* *masseter* *temporalis*
+traverse 0, fat, breast: needles pass fat
+    *fat *fat_* *adipose* *subcutan* breast* *_breast
+"""),
 )
 """The lines for every region."""
 
 BY_REGION: Mapping[str, tuple[DefaultRole, ...]] = MappingProxyType(
     {
-        "brain": (
-            _line(
-                "brain",
-                "*brain *cerebrum* *cerebral_hemi* *parenchyma* *white_matter* *grey_matter* *gray_matter*",
-                "traverse",
-                0.0,
-                "the path to a target in the brain leads through it",
-            ),
-            _line(
-                "skull and face",
-                "*skull* *crani*",
-                "traverse",
-                0.0,
-                "the path leads through a burr hole",
-            ),
-            _line(
-                "ventricles of the brain",
-                "*ventric*",
-                "avoid",
-                3.0,
-                "leak of fluid, bleeding; the needle deflects at their wall",
-            ),
-            _line(
-                "brainstem",
-                "*brainstem* *brain_stem* *truncus_enceph* *pons* *midbrain* *mesenceph* *medulla_oblong*",
-                "avoid",
-                5.0,
-                "vital centres",
-            ),
-        ),
-        "head": (
-            _line(
-                "ventricles of the brain",
-                "*ventric*",
-                "avoid",
-                3.0,
-                "leak of fluid, bleeding",
-            ),
-            _line(
-                "brainstem",
-                "*brainstem* *brain_stem*",
-                "avoid",
-                5.0,
-                "vital centres",
-            ),
-        ),
+        "brain": _table("""
+traverse 0, brain: the path to a target in the brain leads through it
+    *brain *cerebrum* *cerebral_hemi* *parenchyma* *white_matter* *grey_matter* *gray_matter*
+traverse 0, skull and face: the path leads through a burr hole
+    *skull* *crani*
+avoid 3, ventricles of the brain: leak of fluid, bleeding; the needle deflects at their wall
+    *ventric*
+avoid 5, brainstem: vital centres
+    *brainstem* *brain_stem* *truncus_enceph* *pons* *midbrain* *mesenceph* *medulla_oblong*
+"""),
+        "head": _table("""
+avoid 3, ventricles of the brain: leak of fluid, bleeding
+    *ventric*
+avoid 5, brainstem: vital centres
+    *brainstem* *brain_stem*
+"""),
     }
 )
 """Lines that hold in a region before the general ones; other regions have none of their own."""
@@ -383,15 +174,8 @@ BY_REGION: Mapping[str, tuple[DefaultRole, ...]] = MappingProxyType(
 
 NEVER_CROSSED = frozenset(
     (
-        *(
-            "spinal cord",
-            "nerves",
-            "brainstem",
-            "heart",
-            "aorta and venae cavae",
-            "great vessels of the chest and neck",
-        ),
-        *("portal vein", "iliac vessels", "other vessels"),
+        *("spinal cord", "nerves", "brainstem", "heart", "aorta and venae cavae", "portal vein", "iliac vessels"),
+        *("great vessels of the chest and neck", "other vessels"),
     )
 )
 """Groups that no path crosses because they hold the target too: masks overlap, and a lesion may lie on a vessel."""

@@ -28,101 +28,83 @@ class Organ(NamedTuple):
     conduit: bool = False
 
 
-AORTA = Organ("aorta", ("aorta",), conduit=True)
-BOWEL = Organ("small bowel", ("smallbowel", "smallintestine", "intestinesmall", "jejunum", "ileum", "intestinumtenue"))
-BRAIN = Organ("brain", ("brain", "cerebrum", "cerebr", "encephalon"))
-CAROTID = Organ("carotid arteries", ("carotid", "carotis"), paired=True, conduit=True)
-CAVA_INFERIOR = Organ("inferior vena cava", ("inferiorvenacava", "venacavainferior", "cavainf", "ivc"), conduit=True)
-COLON = Organ("colon", ("colon", "largebowel", "largeintestine", "intestinelarge"))
-CORD = Organ("spinal cord", ("spinalcord", "medullaspinalis", "myelon", "spinalcanal"))
-HEART = Organ("heart", ("heart", "cor", "cardi", "ventric", "atrium"))
-KIDNEYS = Organ("kidneys", ("kidney", "ren", "renal"), paired=True)
-LUNGS = Organ("lungs", ("lung", "pulmo", "pleura"), paired=True)
-OESOPHAGUS = Organ("oesophagus", ("oesophagus", "esophagus"))
-RIBS = Organ("ribs", ("rib", "costa", "thoraciccage"))
-SKULL = Organ("skull", ("skull", "cranium", "calvari"))
-SPINE = Organ("spine", ("vertebra", "spine", "spinalcolumn", "backbone"))
-TRACHEA = Organ("trachea", ("trachea", "airway", "windpipe"))
+def _rows(text: str) -> Iterator[tuple[str, str]]:
+    """What stands before and after the first colon of each row; what is indented goes on."""
+    for row in re.split(r"\n(?=\S)", text.strip()):
+        first, _, rest = row.partition(":")
+        yield first, rest
+
+
+ORGANS: Mapping[str, Organ] = MappingProxyType(
+    {
+        name: Organ(name, tuple(words.split()), "paired" in kinds, "conduit" in kinds)
+        for first, words in _rows("""
+liver: liver hepar
+gallbladder: gallbladder vesicafellea
+spleen: spleen lien
+pancreas: pancreas
+stomach: stomach gaster ventriculus
+duodenum: duodenum
+small bowel: smallbowel smallintestine intestinesmall jejunum ileum intestinumtenue
+colon: colon largebowel largeintestine intestinelarge
+kidneys, paired: kidney ren renal
+aorta, conduit: aorta
+inferior vena cava, conduit: inferiorvenacava venacavainferior cavainf ivc
+portal vein, conduit: portal portavein venaporta
+lungs, paired: lung pulmo pleura
+ribs: rib costa thoraciccage
+spine: vertebra spine spinalcolumn backbone
+heart: heart cor cardi ventric atrium
+pulmonary artery, conduit: pulmonaryartery pulmonarytrunk pulmonaryvein arteriapulmonalis
+superior vena cava, conduit: superiorvenacava venacavasuperior cavasup svc
+oesophagus: oesophagus esophagus
+trachea: trachea airway windpipe
+sternum: sternum breastbone
+urinary bladder: bladder vesicaurinaria
+rectum or colon: rectum colon largebowel largeintestine intestinelarge
+iliac arteries, paired, conduit: iliacartery arteriailiaca
+iliac veins, paired, conduit: iliacvein iliacvena venailiaca
+hip bones, paired: hip ilium pelvis pelvicbone oscoxae
+sacrum: sacrum
+femurs, paired: femur
+brain: brain cerebrum cerebr encephalon
+skull: skull cranium calvari
+brainstem: brainstem truncusencephali pons
+ventricles: ventric
+vessels, conduit: arter vein vena vessel sinus willis carotid
+optic nerves, conduit: optic chiasm
+eyes, paired: eye orbit bulbus
+airway: airway pharynx nasal trachea
+carotid arteries, paired, conduit: carotid carotis
+jugular veins, paired, conduit: jugular
+thyroid gland: thyroid
+spinal cord: spinalcord medullaspinalis myelon spinalcanal
+bone: bone femur tibia fibula humerus radius ulna patella
+artery, conduit: arter
+vein, conduit: vein vena
+nerve, conduit: nerv
+""")
+        for name, *kinds in [first.split(", ")]
+    }
+)
+"""By name; after it whether it is paired, or a conduit; then the words."""
 
 USUAL: Mapping[str, tuple[Organ, ...]] = MappingProxyType(
     {
-        "abdomen": (
-            Organ("liver", ("liver", "hepar")),
-            Organ("gallbladder", ("gallbladder", "vesicafellea")),
-            Organ("spleen", ("spleen", "lien")),
-            Organ("pancreas", ("pancreas",)),
-            Organ("stomach", ("stomach", "gaster", "ventriculus")),
-            Organ("duodenum", ("duodenum",)),
-            BOWEL,
-            COLON,
-            KIDNEYS,
-            AORTA,
-            CAVA_INFERIOR,
-            Organ("portal vein", ("portal", "portavein", "venaporta"), conduit=True),
-            LUNGS,
-            RIBS,
-            SPINE,
-        ),
-        "chest": (
-            LUNGS,
-            HEART,
-            AORTA,
-            Organ(
-                "pulmonary artery",
-                ("pulmonaryartery", "pulmonarytrunk", "pulmonaryvein", "arteriapulmonalis"),
-                conduit=True,
-            ),
-            Organ("superior vena cava", ("superiorvenacava", "venacavasuperior", "cavasup", "svc"), conduit=True),
-            OESOPHAGUS,
-            TRACHEA,
-            RIBS,
-            Organ("sternum", ("sternum", "breastbone")),
-            SPINE,
-        ),
-        "pelvis": (
-            Organ("urinary bladder", ("bladder", "vesicaurinaria")),
-            Organ("rectum or colon", ("rectum", *COLON.words)),
-            BOWEL,
-            Organ("iliac arteries", ("iliacartery", "arteriailiaca"), paired=True, conduit=True),
-            Organ("iliac veins", ("iliacvein", "iliacvena", "venailiaca"), paired=True, conduit=True),
-            Organ("hip bones", ("hip", "ilium", "pelvis", "pelvicbone", "oscoxae"), paired=True),
-            Organ("sacrum", ("sacrum",)),
-            Organ("femurs", ("femur",), paired=True),
-        ),
-        "brain": (
-            BRAIN,
-            SKULL,
-            Organ("brainstem", ("brainstem", "truncusencephali", "pons")),
-            Organ("ventricles", ("ventric",)),
-            Organ("vessels", ("arter", "vein", "vena", "vessel", "sinus", "willis"), conduit=True),
-            Organ("optic nerves", ("optic", "chiasm"), conduit=True),
-        ),
-        "head": (
-            BRAIN,
-            SKULL,
-            Organ("eyes", ("eye", "orbit", "bulbus"), paired=True),
-            Organ("vessels", ("arter", "vein", "vena", "vessel", "sinus", "carotid"), conduit=True),
-            Organ("airway", ("airway", "pharynx", "nasal", "trachea")),
-        ),
-        "neck": (
-            CAROTID,
-            Organ("jugular veins", ("jugular",), paired=True, conduit=True),
-            Organ("thyroid gland", ("thyroid",)),
-            TRACHEA,
-            OESOPHAGUS,
-            SPINE,
-            CORD,
-            LUNGS,
-        ),
-        "spine": (SPINE, CORD, AORTA, CAVA_INFERIOR, KIDNEYS, LUNGS),
-        "limb": (
-            Organ("bone", ("bone", "femur", "tibia", "fibula", "humerus", "radius", "ulna", "patella")),
-            Organ("artery", ("arter",), conduit=True),
-            Organ("vein", ("vein", "vena"), conduit=True),
-            Organ("nerve", ("nerv",), conduit=True),
-        ),
-        "phantom": (),
-        "other": (),
+        region: tuple(ORGANS[" ".join(name.split())] for name in names.split(";") if name.strip())
+        for region, names in _rows("""
+abdomen: liver; gallbladder; spleen; pancreas; stomach; duodenum; small bowel; colon; kidneys; aorta; inferior vena
+    cava; portal vein; lungs; ribs; spine
+chest: lungs; heart; aorta; pulmonary artery; superior vena cava; oesophagus; trachea; ribs; sternum; spine
+pelvis: urinary bladder; rectum or colon; small bowel; iliac arteries; iliac veins; hip bones; sacrum; femurs
+brain: brain; skull; brainstem; ventricles; vessels; optic nerves
+head: brain; skull; eyes; vessels; airway
+neck: carotid arteries; jugular veins; thyroid gland; trachea; oesophagus; spine; spinal cord; lungs
+spine: spine; spinal cord; aorta; inferior vena cava; kidneys; lungs
+limb: bone; artery; vein; nerve
+phantom:
+other:
+""")
     }
 )
 """Region to its usual organs."""

@@ -118,6 +118,11 @@ class EdgeImage:
         strength[np.any((index < 1.0) | (index > np.array(self.values.shape) - 2.0), axis=1)] = np.nan
         return strength
 
+    def hu_at(self, points_ct: Floats) -> Floats:
+        """Its values at points (n, 3), HU, shape (n,); NaN outside of the image."""
+        index = apply(np.linalg.inv(self.T_ct_index), points_ct).T
+        return np.asarray(scipy.ndimage.map_coordinates(self.values, index, order=1, cval=np.nan))
+
 
 def edge_image(hu: NDArray[np.generic], T_ct_index: Floats) -> EdgeImage:
     """The CT as the edge test sees it.

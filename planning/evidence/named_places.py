@@ -13,7 +13,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy
 from puncture_twin.planning.anatomy.crossed_names import BONES, LEVEL, QUALIFIERS
-from puncture_twin.planning.anatomy.default_roles import plain_name
+from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
@@ -39,6 +39,10 @@ second's, in nearly every body: in situs inversus, one of ten thousand, sides ar
 
 SEVERAL = frozenset(("vertebrae", "kidney", "lung", "hip", "rib", "femur"))
 """Of these there are several, with a side or a number behind the name."""
+
+OF_LIMBS = frozenset(("limbs and girdles", "other vessels", "iliac vessels", "nerves", "muscles"))
+NOT_OF_LIMBS = re.compile(r"hepatic|renal|scapula|clavic|autochthon")
+"""Groups of the table of default roles whose structures move with a limb, and what does not."""
 
 CLEARLY_MM = 10.0
 """Middles nearer to each other along the axis say nothing: a field of view may cut off most of an organ."""
@@ -110,7 +114,7 @@ def order_of_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
         if not wrong:
             continue
         said = ", ".join(f"{a} lies nearer to the {other} than {b}" for a, b in wrong[:3])
-        facts = max(len({_whole(pair[end]) for pair in wrong}) for end in range(2))
+        facts = max(len({_kind(pair[end]) for pair in wrong}) for end in range(2))
         all_wrong = len(wrong) == len(pairs) and facts >= 2 and not case.ct.trust_labels
         yield Finding(
             "organs_out_of_order",
@@ -126,9 +130,15 @@ def _named(anatomy: Anatomy) -> list[Structure]:
     return [one for one in anatomy.structures if one.source != OWN_TARGET]
 
 
-def _whole(name: str) -> str:
-    """A vertebra's name as the spine's: one organ beside many levels of it is one fact."""
-    return "vertebrae" if name.startswith("vertebrae") else name
+def _kind(name: str) -> str:
+    """What is one fact beside another organ: many levels of a spine, an organ's two sides, all that a limb holds.
+
+    Legs that are crossed or drawn up take bones, arteries and veins along, of both sides.
+    """
+    line = default_role(name, "other")
+    if line is not None and line.group in OF_LIMBS and not NOT_OF_LIMBS.search(name):
+        return "limb"
+    return next((organ for organ in SEVERAL if _is(name, organ)), SIDES.sub("", name))
 
 
 def _at_one_level(box: Floats, other: Floats) -> bool:

@@ -12,7 +12,7 @@ from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.named_files import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.evidence.coverage import ignored_organs
+from puncture_twin.planning.evidence.checks import ignored_organs
 from puncture_twin.planning.formats.labels.naming import V2
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main

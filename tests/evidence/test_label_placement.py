@@ -5,11 +5,11 @@ import pytest
 from placed_trunk import PHANTOMS, moved, write_trunk
 from places import DATA
 
-from benchmarks.placements import changed, meshes_of, real, source_of, wrong
+from benchmarks.placements import Patient, changed, meshes_of, real, source_of, wrong
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.findings import Severity
-from puncture_twin.planning.evidence.edges import edge_image
-from puncture_twin.planning.evidence.label_placement import REFUSING_Z, WARNING_Z, assess, slip_of
+from puncture_twin.planning.evidence.edges import compare, edge_image, sample_surfaces
+from puncture_twin.planning.evidence.label_placement import REFUSING_Z, STRUCTURES, WARNING_Z, assess, slip_of
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.search.context import prepare
 
@@ -76,6 +76,42 @@ def test_structures_that_agree_on_another_place_are_named():
     found = assess(image, source_of(patient, off))
     assert found.agreeing == ("1", "2") or found.refuses
     assert assess(image, source_of(patient, meshes)).agreeing == ()
+
+
+def test_one_structure_that_is_off_is_named():
+    """Each of eight by itself 15 mm off to the side: it lies better elsewhere, or its outline is not confirmed.
+
+    Of the true ones none lies better, and fewer than half are not confirmed; a structure beside the image is unseen.
+    """
+    patient = PHANTOMS["trunk"]
+    image, meshes = edge_image(patient.hu, patient.T), meshes_of(patient)
+    true = assess(image, source_of(patient, meshes))
+    assert true.odd == true.unseen == ()
+    assert len(true.unconfirmed) <= 3
+    for name in ("2", "5", "6"):
+        off = meshes | {name: meshes[name].transformed(moved(0.0, 15.0, 0.0))}
+        found = assess(image, source_of(patient, off))
+        assert name in {*found.odd, *found.unconfirmed}, (name, found)
+    away = meshes | {"5": meshes["5"].transformed(moved(0.0, 0.0, 400.0))}
+    assert assess(image, source_of(patient, away)).unseen == ("5",)
+
+
+def test_a_better_edge_around_what_is_uneven_is_no_other_place():
+    """A vein of hardly any contrast beside an artery of much: half in it its edges are stronger beyond chance.
+
+    But they are the artery's, and what would lie within is not even.
+    """
+    x, y, z = np.meshgrid(*(np.arange(n) * 2.0 - n + 1 for n in (80, 80, 60)), indexing="ij")
+    vein, artery = np.hypot(x, y) < 10, np.hypot(x - 24, y) < 7
+    hu = np.where(artery, 300.0, np.where(vein, 24.0, 20.0)) + np.random.default_rng(1).normal(0, 10, x.shape)
+    T = np.diag([2.0, 2.0, 2.0, 1.0])
+    T[:3, 3] = x[0, 0, 0], y[0, 0, 0], z[0, 0, 0]
+    patient = Patient(hu, vein.astype(np.int16) + 2 * artery, T)
+    image, source = edge_image(hu, T), source_of(patient, meshes_of(patient))
+    tried = compare(image, sample_surfaces(list(source.meshes.values())), source.placements())
+    (z_least, ratio_least, _), _ = STRUCTURES
+    assert np.any((tried.own_z[:, 0] >= z_least) & (tried.own_ratio[:, 0] >= ratio_least))
+    assert assess(image, source).odd == ()
 
 
 def test_a_thin_slab_is_told_by_the_shifts_that_it_has_room_for():

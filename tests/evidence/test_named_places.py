@@ -48,6 +48,27 @@ def test_one_pair_of_several_is_a_warning(trunk):
     assert [one.severity for one in found] == [Severity.WARNING]
 
 
+@pytest.mark.parametrize(
+    "places",
+    [
+        {"femoral_artery_right": (40, 0, 0), "femoral_artery_left": (-40, 0, 0), "femoral_vein_right": (44, 0, 9),
+         "femoral_vein_left": (-44, 0, 9), "tibia_right": (50, 0, 30), "tibia_left": (-50, 0, 30)},
+        {"femur_right": (-40, -60, 60), "femur_left": (40, -60, 60), "hip_right": (-40, 0, 0), "hip_left": (40, 0, 0)},
+    ],
+    ids=["crossed", "drawn up"],
+)  # fmt: skip
+def test_legs_are_one_witness(trunk, places):
+    """Crossed or drawn up they take bones, arteries and veins of both sides along: doubted, and not refused."""
+    ball = next(one for one in trunk.anatomy.structures if one.name == "kidney_left")
+    middle = ball.mesh.bounds.mean(axis=0)
+    legs = tuple(
+        replace(ball, name=name, mesh=ball.mesh.transformed(moved(*(np.array(place) - middle))))
+        for name, place in places.items()
+    )
+    found = list(order_of_organs(trunk.case, replace(trunk.anatomy, structures=legs)))
+    assert [one.severity for one in found] == [Severity.WARNING]
+
+
 def test_bones_that_are_none_are_doubted(trunk):
     """The vertebrae 40 mm in front of where the CT shows them; in place, nothing is said."""
     assert list(densities(trunk.case, trunk.anatomy, on_edges=False)) == []

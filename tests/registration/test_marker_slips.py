@@ -108,11 +108,16 @@ def test_markers_in_order_raise_no_word(case, capfd):
 
 @pytest.mark.parametrize("name", ["abdomen", "carton/case_h.toml", "carton/case_m.toml", "carton/case_l.toml"])
 def test_of_the_embedded_cases_the_carton_alone_is_beyond_its_noise(name, capfd):
-    """None is ambiguous or slipped; pixels and slices do not explain the paper's touches, which the case accepts."""
+    """None is ambiguous or slipped; pixels and slices do not explain the paper's touches, which the case accepts.
+
+    What explains some of them better is a stretch of one list, which is said too.
+    """
     report = registered(meshes_folder() / name, capfd)
     assert report["warnings"] == []
     told = [flag for flag in report["flags"] if "do not agree with the declared errors" in flag]
-    assert (len(report["flags"]), len(told)) == ((0, 0) if name == "abdomen" else (1, 1))
+    deformed = report["distortion"] is not None and report["distortion"]["doubted"]
+    assert (len(report["flags"]) - deformed, len(told)) == ((0, 0) if name == "abdomen" else (1, 1))
+    assert deformed == (name != "abdomen")
 
 
 def beside_their_own_transform(here):

@@ -10,7 +10,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, left_jacobian, pose
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
-from puncture_twin.planning.registration.checks.marker_list import Surroundings
+from puncture_twin.planning.registration.checks.markers import Surroundings
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.jobs.patient.answers import registration_report
 

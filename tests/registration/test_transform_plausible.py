@@ -11,9 +11,12 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.tables import other_readings
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
-from puncture_twin.planning.registration.checks.checked_placement import placement_findings
-from puncture_twin.planning.registration.checks.marker_list import Surroundings
-from puncture_twin.planning.registration.checks.stated_transform import check_transform, markers_beside
+from puncture_twin.planning.registration.checks.checked_placement import (
+    check_transform,
+    markers_beside,
+    placement_findings,
+)
+from puncture_twin.planning.registration.checks.markers import Surroundings
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare

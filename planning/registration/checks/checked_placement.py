@@ -1,17 +1,253 @@
-"""A placement whose markers, or stated transform, have been compared with what else is known."""
+"""A placement whose markers, or stated transform, have been compared with what else is known.
+
+A transform file says neither which way it goes nor what its axes are at the robot, and each slip is a rigid motion like
+any other. Markers tell it in mm; without them physics excludes. So what the case states is held against the three other
+readings of its keys.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from puncture_twin.planning.anatomy.anatomy import load_couch, load_skin
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.registration.checks.base_place import OF_MARKERS, OF_MOUNT, place_warnings
-from puncture_twin.planning.registration.checks.marker_check import MarkerFindings, check_markers
-from puncture_twin.planning.registration.checks.marker_list import Surroundings
-from puncture_twin.planning.registration.checks.stated_transform import check_transform, markers_beside
-from puncture_twin.planning.registration.placement import Placement, load_placement
+from puncture_twin.planning.case.tables import NO_RESIDUALS, MarkerSection, RegistrationSection, other_readings
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.checks.markers import MarkerFindings, Surroundings, check_markers
+from puncture_twin.planning.registration.checks.places import (
+    OF_MARKERS,
+    OF_MOUNT,
+    base_place,
+    off_upright,
+    place_warnings,
+)
+from puncture_twin.planning.registration.placement import Placement, load_placement, registered
+from puncture_twin.planning.registration.registration import Registration
+
+UPRIGHT = np.radians(30.0)
+"""An arm whose z axis lies so near to up stands on a floor, a rail or a cart, as most do."""
+
+EXPLAINED = 3.29
+"""Times the expected (rms) error of a point: normal errors exceed it at most once in 1,000, in whatever directions they
+lie. It is the normal distribution's own bound, and errors along one line, of one size, reach it most often."""
+
+MAX_APART_MM = 5.0
+"""Markers and a transform that differ by more, and by more than both errors explain, are of two patients or robots."""
+
+CAUSES = (
+    "the usual causes are a transform that goes the other way (transform_maps), other axes at the robot (base_axes; a "
+    "URDF's base_link is turned likewise), and a transform of another image"
+)
+MARKERS_TELL = " (markers_ct and markers_base beside it measure it)"
+BOX_TELLS = " (so does what the patient lies on, as an obstacle of frame base)"
+"""What makes a warning needless."""
+
+ALLOWED = "a transform between this CT and this robot's base, with transform_maps and base_axes as it was saved"
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What the file would say under some keys.
+
+    Attributes:
+        keys: Those that differ from the case's; empty as stated.
+        T_base_ct: Shape (4, 4), mm.
+        impossible: Why nothing can be so, or empty.
+        unlikely: What hardly is so, or empty.
+        rests_on: The obstacle of frame ``base`` that the patient lies on, or empty.
+        tilt: Between the robot's z axis and up, rad.
+    """
+
+    keys: str
+    T_base_ct: Floats
+    impossible: str
+    unlikely: str
+    rests_on: str
+    tilt: float
+
+    @property
+    def plausible(self) -> bool:
+        """Whether nothing speaks against it."""
+        return not self.impossible and not self.unlikely
+
+    @property
+    def upright(self) -> bool:
+        """Whether the arm stands; others hang, or reach out of a wall."""
+        return self.tilt <= UPRIGHT
+
+    @property
+    def usual(self) -> tuple[bool, bool]:
+        """What speaks for it: the patient lies on something, and the arm stands."""
+        return bool(self.rests_on), self.upright
+
+    def better_than(self, other: Reading) -> bool:
+        """Whether something speaks for it that does not for the other."""
+        return any(mine and not theirs for mine, theirs in zip(self.usual, other.usual, strict=True))
+
+    def text(self) -> str:
+        """What speaks for it or not, in words."""
+        lies = f"on '{self.rests_on}'" if self.rests_on else "on no obstacle of frame base"
+        return f"the patient lies {lies} and the robot's z axis {np.degrees(self.tilt):.0f} deg from up"
+
+
+def markers_beside(case: Case, stated: RegistrationSection) -> Registration | None:
+    """What the markers beside a stated transform say; None without them.
+
+    Raises:
+        InputError: As `registered`.
+    """
+    return None if stated.markers_ct is None else registered(case, MarkerSection(**stated.model_dump()))
+
+
+def check_transform(
+    case: Case, skin: TriangleMesh, T_base_ct: Floats, registration: Registration | None = None
+) -> MarkerFindings:
+    """Compare a stated transform with the markers beside it, if any, and with what physics excludes.
+
+    Args:
+        case: Nothing is done where it states no transform.
+        skin: CT frame.
+        T_base_ct: Shape (4, 4), mm, as stated.
+        registration: Of `markers_beside`, whose own checks are `check_markers`.
+
+    Returns:
+        Warnings, one sentence each; how far markers that agree are from it is a note.
+
+    Raises:
+        InputError: Base or a box of the robot's frame would be in the patient; or markers are elsewhere.
+    """
+    stated = case.robot.stated
+    if stated is None:
+        return MarkerFindings((), ())
+    given = _reading(case, skin, "", T_base_ct)
+    others = [_reading(case, skin, keys, T) for keys, T in other_readings(stated, T_base_ct).items()]
+    if given.impossible:
+        _refuse(case, f"{given.impossible}: {CAUSES}{_better(others)}")
+    if registration is None:
+        return MarkerFindings(tuple(_unmeasured(case, given, others)), ())
+    told_apart = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
+    doubts = (*_doubts(case, given, told_apart), *_alike(case, given, told_apart))
+    compared = _held_against_markers(case, registration, given, others)
+    if _apart(case, registration, given.T_base_ct).unexplained:
+        return MarkerFindings((compared, *doubts), ())
+    return MarkerFindings(doubts, (compared,))
+
+
+def _reading(case: Case, skin: TriangleMesh, keys: str, T_base_ct: Floats) -> Reading:
+    return Reading(keys, T_base_ct, *base_place(case, skin, T_base_ct), off_upright(case, T_base_ct))
+
+
+def _better(others: Sequence[Reading]) -> str:
+    """Which other readings nothing speaks against, as the end of a sentence."""
+    plausible = [one for one in others if one.plausible]
+    return f"; plausible would be {_named(plausible)}" if plausible else "; no other reading of these keys is plausible"
+
+
+def _named(readings: Sequence[Reading]) -> str:
+    """Their keys with what speaks for them, the most usual first."""
+    usual_first = sorted(readings, key=lambda one: one.usual, reverse=True)
+    return ", or ".join(f"{one.keys} ({one.text()})" for one in usual_first)
+
+
+def _unmeasured(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
+    """Without markers: that nothing measures it, and what it cannot be told from, in one line; then what is doubted."""
+    alike = "".join(f"; {one.removeprefix('registration: ')}" for one in _alike(case, given, others))
+    yield f"registration: {NO_RESIDUALS.format(file=case.robot.transform)}{MARKERS_TELL}{alike}"
+    yield from _doubts(case, given, others)
+
+
+def _doubts(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
+    """What hardly is so as stated; else the other readings that are more usual."""
+    if given.unlikely:
+        yield f"registration: by the stated transform {given.unlikely}: {CAUSES}{_better(others)}"
+    elif better := [one for one in _rivals(given, others) if one.better_than(given) and not given.better_than(one)]:
+        yield (
+            f"registration: more usual than what is stated ({given.text()}; place.up says which way is up) would be "
+            f"{_named(better)}: {CAUSES}"
+        )
+
+
+def _alike(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
+    """The other readings that are as plausible as what is stated, where no other is more so."""
+    rivals = _rivals(given, others)
+    if given.unlikely or any(one.better_than(given) and not given.better_than(one) for one in rivals):
+        return
+    if alike := [one for one in rivals if one.better_than(given) == given.better_than(one)]:
+        away = [np.linalg.norm(apply(one.T_base_ct - given.T_base_ct, case.target_ct)) for one in alike]
+        named = ", ".join(f"{one.keys} ({mm:.0f} mm away)" for one, mm in zip(alike, away, strict=True))
+        yield (
+            f"registration: nothing tells the stated transform from other readings, by which the target is elsewhere: "
+            f"{named}{BOX_TELLS}"
+        )
+
+
+def _rivals(given: Reading, others: Sequence[Reading]) -> list[Reading]:
+    """Other readings that nothing speaks against, and that put the base elsewhere."""
+    return [one for one in others if one.plausible and not np.allclose(one.T_base_ct, given.T_base_ct, atol=1e-6)]
+
+
+def _held_against_markers(case: Case, registration: Registration, given: Reading, others: Sequence[Reading]) -> str:
+    """How far the transform is from what the markers say.
+
+    Raises:
+        InputError: Too far for both to be of one patient and robot.
+    """
+    found = _apart(case, registration, given.T_base_ct)
+    said = (
+        f"the markers put {found.where} {found.apart_mm:.1f} mm from where the stated transform puts it; expected of "
+        f"them there are {found.expected_mm:.1f} mm (rms)"
+    )
+    if found.contradicts:
+        fitting = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
+        better = "".join(f"; with {one.keys} they agree" for one in fitting)
+        _refuse(case, f"{said}: {CAUSES}{better}")
+    doubt = ", more than their errors explain" if found.unexplained else ""
+    return f"registration: stated transform: {said}{doubt}; its own expected error is unknown"
+
+
+@dataclass(frozen=True)
+class Apart:
+    """Where markers and a transform differ most, measured by what is expected of the markers there.
+
+    Attributes:
+        where: The target or a marker.
+        apart_mm: How far.
+        expected_mm: The expected (rms) error of the markers there.
+        contradicts: Whether some point differs by more than both errors explain, and by more than `MAX_APART_MM`.
+    """
+
+    where: str
+    apart_mm: float
+    expected_mm: float
+    contradicts: bool
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether the markers' errors alone do not explain it."""
+        return self.apart_mm > EXPLAINED * self.expected_mm
+
+
+def _apart(case: Case, registration: Registration, T_base_ct: Floats) -> Apart:
+    markers = registration.markers
+    points = np.vstack([case.target_ct, markers.points_ct])
+    names = ["the target", *(f"marker {name}" for name in markers.names)]
+    apart = np.linalg.norm(apply(T_base_ct, points) - apply(registration.T_base_ct, points), axis=1)
+    expected = np.maximum(registration.expected_tre_mm(points), np.finfo(float).tiny)
+    row = int(np.argmax(apart / expected))
+    both = np.maximum(MAX_APART_MM, np.sqrt(2.0) * EXPLAINED * expected)
+    return Apart(names[row], float(apart[row]), float(expected[row]), bool(np.any(apart > both)))
+
+
+def _refuse(case: Case, what: str) -> None:
+    raise InputError(what, where=f"{case.path}: registration.transform", allowed=ALLOWED)
 
 
 class CheckedPlacement(NamedTuple):

@@ -24,9 +24,10 @@ from puncture_twin.planning.registration.fits.least_squares import carried, desi
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 
-DOUBTED = 0.01
-"""True lists look so deformed once in 100 registrations: it is said, and nothing is refused for it. Where one axis is
-read five times as badly as the others and nobody declares it, up to one in ten (1,000 draws each, 3 to 12 markers)."""
+DOUBTED, SURE = 0.05, 0.01
+"""True lists look so deformed once in 20 registrations, and once in 100: it is said, and nothing is refused for it.
+Where one axis is read five times as badly as the others and nobody declares it, the second is up to one in ten (1,000
+draws each, 3 to 12 markers)."""
 
 LEAST_MM = 0.05
 """Rms of what a deformation moves the markers by, below which it does not matter, however sure it is."""
@@ -65,8 +66,9 @@ class Distortion:
 
     def text(self) -> str:
         """The finding, in one sentence."""
+        noise = "not noise, for" if self.probability < SURE else "more than noise, it seems:"
         return (
-            f"{self.brief()}: not noise, for beside it the readings err by {self.reading_mm:.2g} mm a "
+            f"{self.brief()}: {noise} beside it the readings err by {self.reading_mm:.2g} mm a "
             "coordinate; without it the expected TRE at the target would be about "
             f"{self.rms_without_mm:.1f} mm instead of {self.rms_mm:.1f}; the registration does not use this"
         )

@@ -27,7 +27,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.advice import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
-from puncture_twin.planning.registration.checks.touching import touchable_points
+from puncture_twin.planning.registration.checks.places import touchable_points
 from puncture_twin.planning.registration.fits.least_squares import rigid_fre_mm
 from puncture_twin.planning.registration.fits.method import LEAST_FOUND_MM
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match

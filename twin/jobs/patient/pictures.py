@@ -13,7 +13,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.registration.checks.touching import touchable_points
+from puncture_twin.planning.registration.checks.places import touchable_points
 from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation

@@ -318,7 +318,8 @@ def _nothing_safe(run: Run) -> list[str]:
 
 
 def _footer(run: Run) -> list[str]:
-    lines = [f"warning: {warning}" for warning in run.context.anatomy.warnings]
+    notes = (one.sentence for one in run.context.anatomy.findings if one.severity == "note")
+    lines = [*(f"warning: {one}" for one in run.context.anatomy.warnings), *(f"note: {one}" for one in notes)]
     if run.certificate is not None:
         lines += certificate_lines(run.certificate.summary())
     if run.checked is not None:

@@ -24,7 +24,7 @@ from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.checks.skin_fit import skin_fit
+from puncture_twin.planning.registration.checks.markers import skin_fit
 from puncture_twin.twin.plant.outside_objects import Beside, Part, lay_beside
 from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, box, check_closed, rod
 

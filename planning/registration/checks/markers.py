@@ -1,0 +1,333 @@
+"""Can the markers be trusted? What their residuals cannot show: permuted names, slipped axes, markers off the skin.
+
+*Names* come from the user and are normally right; the danger is a slip. Permuted names that fit as well within the
+noise leave no trace in the residuals, and skin and couch are blind to them: markers stay markers. Only the place where
+the robot would stand can exclude a permutation; where it does not, the case is refused, or its user has checked the
+names. *Axes*: coordinates of RAS read as LPS are turned by 180 degrees about z: a proper rotation, which the
+registration swallows without a residual. But markers lie on the skin, and a needle's tip touched them. A list that does
+so only after a half turn is refused; one that does so before and after it is named in a warning.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import fdtri
+
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.geometry.triangle_distance import squared_distance
+from puncture_twin.planning.registration.checks.places import place_excluded, untouchable
+from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits.marker_ambiguity import Renaming, renamings
+from puncture_twin.planning.registration.registration import Registration
+
+MARKER_ON_SKIN_MM = 30.0
+"""A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""
+
+
+@dataclass(frozen=True, eq=False)
+class SkinFit:
+    """Markers against the skin.
+
+    Attributes:
+        gaps_mm: Shape (n,), distance from the skin, negative inside the body (of an open skin that is not known).
+        normals_ct: Shape (n, 3), unit vectors out of the skin at its nearest triangle.
+    """
+
+    gaps_mm: Floats
+    normals_ct: Floats
+
+    @property
+    def on_skin(self) -> bool:
+        """Whether every marker is within its own height of the skin."""
+        return bool(np.all(np.abs(self.gaps_mm) <= MARKER_ON_SKIN_MM))
+
+    @property
+    def scatter_mm(self) -> float:
+        """Root mean square of what is left of the gaps by the best common height of the markers, n - 1 degrees."""
+        height = np.clip(self.gaps_mm.mean(), 0.0, MARKER_ON_SKIN_MM)
+        return float(np.sqrt(np.sum((self.gaps_mm - height) ** 2) / (len(self.gaps_mm) - 1)))
+
+
+def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:
+    """Measure markers from the skin; where the body was cut there is none.
+
+    Args:
+        points_ct: Shape (n, 3), mm.
+        skin: Of the case.
+    """
+    triangles = skin.mesh.triangles[~skin.cut_faces]
+    centres = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - centres[:, None], axis=2).max()
+    outward = _orientation(skin)
+    gaps, normals = np.empty(len(points_ct)), np.empty((len(points_ct), 3))
+    for row, point in enumerate(points_ct):
+        from_centres = np.linalg.norm(centres - point, axis=1)
+        near = triangles[from_centres <= from_centres.min() + reach]  # holds the nearest one
+        squares = squared_distance(point, near)
+        inside = side_of(skin.mesh, point) is Side.INSIDE
+        gaps[row] = np.sqrt(squares.min()) * (-1.0 if inside else 1.0)
+        normals[row] = outward * _normal(near[int(np.argmin(squares))])
+    return SkinFit(gaps, normals)
+
+
+def kept_skin_fit(points_ct: Floats, skin: Skin, cache: Cache) -> SkinFit:
+    """`skin_fit`, from the cache where it is there; no target decides it."""
+    cut = hashlib.sha256(skin.cut_faces.tobytes()).hexdigest()
+    made_from = {"what": "skin fit", "skin": skin.mesh.digest, "cut": cut, "points": points_ct.tolist()}
+    stored = cache.arrays(made_from, lambda: vars(skin_fit(points_ct, skin)), by=__name__)
+    return SkinFit(**stored)
+
+
+def _orientation(skin: Skin) -> float:
+    """1 where the triangles' normals point out of the body, -1 where they point into it."""
+    a, b, c = np.moveaxis(skin.mesh.triangles - skin.mesh.bounds.mean(axis=0), 1, 0)
+    return 1.0 if np.einsum("ij,ij->", a, np.cross(b, c)) >= 0 else -1.0
+
+
+def _normal(triangle: Floats) -> Floats:
+    normal = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
+    length = np.linalg.norm(normal)
+    return np.asarray(normal / length) if length > 0 else np.array([0.0, 0.0, 1.0])
+
+
+Signs = tuple[float, float, float]
+
+
+class Surroundings(NamedTuple):
+    """What markers are held against, CT frame."""
+
+    skin: Skin
+    couch: TriangleMesh | None
+    """What lies beyond what the patient lies on, where the CT shows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerList:
+    """One reading of the CT markers.
+
+    Attributes:
+        fit: How it lies on the skin.
+        behind: Rows of markers that no needle can have touched, and what is before each, in words.
+        excluded: Why the robot cannot stand where this list puts it, or empty.
+        target_mm: How far this list puts the target from where the given one puts it.
+    """
+
+    fit: SkinFit
+    behind: tuple[tuple[int, str], ...]
+    excluded: str
+    target_mm: float
+
+    @property
+    def plausible(self) -> bool:
+        """Whether every marker is near the skin, was within a needle's reach, and the robot can stand there."""
+        return self.fit.on_skin and not self.behind and not self.excluded
+
+
+def marker_list(
+    case: Case,
+    around: Surroundings,
+    registration: Registration,
+    signs: Signs = (1.0, 1.0, 1.0),
+    cache: Cache = NO_CACHE,
+) -> MarkerList:
+    """The CT markers with some axes negated, compared with skin, couch and the robot's place."""
+    points = registration.markers.points_ct * np.array(signs)
+    fit = kept_skin_fit(points, around.skin, cache)
+    T_base_ct = fit_rigid(points, registration.markers.points_base)
+    moved = apply(T_base_ct, case.target_ct) - apply(registration.T_base_ct, case.target_ct)
+    behind = untouchable(case, points, fit.normals_ct, around.couch)
+    return MarkerList(fit, behind, place_excluded(case, around.skin.mesh, T_base_ct), float(np.linalg.norm(moved)))
+
+
+ALLOWED_NAMES = (
+    "markers without a symmetry, fle_mm as small as it is known, or registration.accept_symmetry = true once the "
+    "names have been checked at the patient"
+)
+
+
+def check_names(case: Case, skin: Skin, registration: Registration) -> tuple[str, ...]:
+    """Compare the names with their permutations; returns warnings, one sentence each.
+
+    Raises:
+        InputError: Permuted names fit much better; or they fit as well, nothing excludes them, and the case does not
+            accept that.
+    """
+    test, where = registration.residual_test, f"{case.path}: registration"
+    found, complete = renamings(registration.markers, case.target_ct, test.alike_mm)
+    better = [one for one in found if test.contradicted_by(one.fre_mm)]
+    given = f"as named, FRE is {test.fre_mm:.2f} mm"
+    if better:
+        what = f"the marker names look permuted: {min(better, key=lambda one: one.fre_mm).text()}; {given}"
+        raise InputError(what, where=where, allowed="the names as the markers were touched")
+    excluded = [place_excluded(case, skin.mesh, one.T_base_ct) for one in found]
+    possible = [one for one, why in zip(found, excluded, strict=True) if not why]
+    if possible and not _accepted(case):
+        what = f"a slip in the marker names would pass unnoticed: {_worst(possible)}; {given}"
+        raise InputError(what, where=where, allowed=ALLOWED_NAMES)
+    warnings = () if complete else (f"of {len(registration.markers)} markers only swaps of two names were tested",)
+    if possible:
+        return (*warnings, f"marker names: {_worst(possible)}; accepted by accept_symmetry, {given}")
+    if found:
+        return (*warnings, f"marker names: {_worst(found)}; told apart by this alone: then {excluded[0]}")
+    return warnings
+
+
+def _accepted(case: Case) -> bool:
+    stated = case.registration or case.robot.stated
+    return stated is not None and stated.accept_symmetry
+
+
+def _worst(found: Sequence[Renaming]) -> str:
+    """The first, which puts the target farthest away, and how many more there are."""
+    more = len(found) - 1
+    return found[0].text() + (f" (and {more} more permutation{'s' if more > 1 else ''})" if more else "")
+
+
+HALF_TURNS: Mapping[str, Signs] = MappingProxyType(
+    {
+        "x and y negated, as LPS and RAS differ,": (-1.0, -1.0, 1.0),
+        "y and z negated": (1.0, -1.0, -1.0),
+        "x and z negated": (-1.0, 1.0, -1.0),
+    }
+)
+"""The slips of axes that are proper rotations; a list with one or three axes negated is refused as mirrored."""
+
+REFUSING_DOUBT = 0.01
+"""A list is refused at 99 %. Honest lists less often: the more symmetric a body, the more alike are both lists."""
+
+SCATTER_MM = 0.25
+"""No skin is known better: a third of a millimetre's voxel, and the marker's own reading."""
+
+USUAL_SCATTER_MM = 3.0
+"""Markers of one kind on the skin of their own CT scatter less."""
+
+EXCLUDING_DOUBT = 0.001
+"""A half turn is no more mentioned at 99.9 %."""
+
+
+def check_axes(
+    case: Case, around: Surroundings, registration: Registration, given: MarkerList, cache: Cache = NO_CACHE
+) -> tuple[str, ...]:
+    """Compare the given list with its half turns; returns warnings, one sentence each.
+
+    Raises:
+        InputError: The list lies on the skin, or where it can be touched, only after a half turn.
+    """
+    slips = {name: marker_list(case, around, registration, signs, cache) for name, signs in HALF_TURNS.items()}
+    likely = {name: slip for name, slip in slips.items() if _explains(slip, given)}
+    if likely:
+        best = min(likely.values(), key=lambda slip: slip.fit.scatter_mm)
+        alike = {name: one for name, one in likely.items() if not _excluded(one, best)}
+        fits = ", or ".join(
+            f"with {name} they lie on the skin to {one.fit.scatter_mm:.1f} mm (rms)" for name, one in alike.items()
+        )
+        raise InputError(
+            f"markers_ct look like coordinates of other axes: {fits}, as given {_as_given(registration, given, best)}",
+            where=f"{case.path}: registration",
+            allowed="markers_ct in the axes (LPS, RAS) that the case or their file states",
+        )
+    return tuple(
+        f"markers_ct with {name} would lie on the skin to {slip.fit.scatter_mm:.1f} mm rms, as given to "
+        f"{given.fit.scatter_mm:.1f} mm: too alike to tell, and the target would be {slip.target_mm:.0f} mm away; "
+        "check the axes of their file"
+        for name, slip in slips.items()
+        if not _excluded(slip, given)
+    )
+
+
+def _explains(slip: MarkerList, given: MarkerList) -> bool:
+    """Whether the given list is likely the other one, slipped: off the skin, or on it where no needle touches it."""
+    if not slip.plausible:
+        return False
+    hidden = bool(given.behind) and not _worse(slip.fit, given.fit, doubt=REFUSING_DOUBT)
+    return hidden or _worse(given.fit, slip.fit, doubt=REFUSING_DOUBT)
+
+
+def _excluded(slip: MarkerList, given: MarkerList) -> bool:
+    """Whether a list is implausible, or so much farther off the skin than the given one that it is not meant."""
+    unusual = slip.fit.scatter_mm > USUAL_SCATTER_MM >= given.fit.scatter_mm
+    return unusual or not slip.plausible or _worse(slip.fit, given.fit, doubt=EXCLUDING_DOUBT)
+
+
+def _worse(fit: SkinFit, other: SkinFit, *, doubt: float) -> bool:
+    """Whether the same markers scatter more in one list than in another beyond chance, by an F-test.
+
+    Args:
+        fit: Of one list.
+        other: Of the same markers, read in other axes.
+        doubt: How often two lists of one scatter would seem so different.
+    """
+    freedom = len(fit.gaps_mm) - 1
+    limit = float(np.sqrt(fdtri(freedom, freedom, 1 - doubt)))
+    return fit.scatter_mm > limit * max(other.scatter_mm, SCATTER_MM)
+
+
+def _as_given(registration: Registration, given: MarkerList, slip: MarkerList) -> str:
+    if _worse(given.fit, slip.fit, doubt=REFUSING_DOUBT):
+        return f"to {given.fit.scatter_mm:.1f} mm"
+    row, before = given.behind[0]
+    return f"{registration.markers.names[row]} lies behind {before}, where no needle touches it"
+
+
+def off_the_skin(registration: Registration, given: MarkerList) -> tuple[str, ...]:
+    """Markers far from the skin, or behind an obstacle: warnings, one sentence each."""
+    names = registration.markers.names
+    gaps = zip(names, np.abs(given.fit.gaps_mm), strict=True)
+    far = [f"{name} ({gap:.0f} mm)" for name, gap in gaps if gap > MARKER_ON_SKIN_MM]
+    behind = tuple(
+        f"marker {names[row]} lies behind {before}: no needle can touch it there" for row, before in given.behind
+    )
+    if not far:
+        return behind
+    said = f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?"
+    return (said, *behind)
+
+
+LOCAL_AXES = 'space "local": nothing tells whether the axes of markers_ct have slipped by a half turn'
+
+BASE_AXES = (
+    "not checked: a half turn of markers_base (such as ROS base_link for the controller's base); residuals, skin and "
+    "couch are blind to it"
+)
+
+
+class MarkerFindings(NamedTuple):
+    """What is to be known about a case's markers or transform."""
+
+    warnings: tuple[str, ...]
+    """What these markers leave open, one sentence each."""
+    notes: tuple[str, ...]
+    """What no markers can show."""
+
+
+def check_markers(
+    case: Case, around: Surroundings, registration: Registration, cache: Cache = NO_CACHE
+) -> MarkerFindings:
+    """Check a registration's markers against permuted names, half turns, skin and couch.
+
+    How the markers lie on the skin depends on no target: ``cache`` keeps it.
+
+    Raises:
+        InputError: Names that fit much better permuted, or as well where nothing tells them apart; a list that lies on
+            the skin only after a half turn.
+    """
+    names = check_names(case, around.skin, registration)
+    given = marker_list(case, around, registration, cache=cache)
+    local = case.space is Space.LOCAL
+    axes = () if local else check_axes(case, around, registration, given, cache)
+    warnings = (*names, *axes, *off_the_skin(registration, given))
+    return MarkerFindings(warnings, (LOCAL_AXES, BASE_AXES) if local else (BASE_AXES,))
