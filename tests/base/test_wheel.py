@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 from base.test_brought_kernels import OWN, PLAINEST, begin, end, kept
+from benchmarks.build_wheels import build
 from places import ROOT
 from walls.house import PARTS, modules
 
-from benchmarks.build_wheels import build
 from puncture_twin.planning.base.cache.brought_kernels import BROUGHT, classes_of
 from puncture_twin.planning.base.cache.kernel_cache import host_features
 
