@@ -43,6 +43,9 @@ config: Any = nb.config
 FOLDER_VARIABLE = "NUMBA_CACHE_DIR"
 """Numba's own: what the user says with it is the place of all folders. Processes that this one begins learn it so."""
 
+LOCATORS = "UserProvidedCacheLocator,IPythonCacheLocator"
+"""Numba's names: that place alone, and what a notebook's cells have. It would go on to folders of other states."""
+
 PREFIX = "kernels-"
 COMPILERS = ("numba", "llvmlite", "numpy")
 """Whose versions decide what is compiled."""
@@ -72,7 +75,7 @@ def _use_folder() -> None:
         folder = _own_folder(place / name)
     atexit.register(_remove_if_edited, folder, sources)
     os.environ[FOLDER_VARIABLE] = config.CACHE_DIR = str(folder)
-    config.CACHE_LOCATOR_CLASSES = os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = "UserProvidedCacheLocator"
+    config.CACHE_LOCATOR_CLASSES = os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = LOCATORS
 
 
 def _place() -> Path:
