@@ -94,9 +94,9 @@ kernels:
 	    $(BIN)/python run_twin.py check meshes/abdomen --theta 64 --beta 98; } > $$out/log 2>&1 || \
 	  { tail -n 1 $$out/log; echo "kernels will be compiled where they are first used"; }; rm -rf $$out
 
-# In out/wheels, some minutes: one for every machine, and one for this Python on Linux x86-64 that brings machine code.
+# In out/wheels: for every machine.
 wheel: install
-	$(BIN)/python -m benchmarks.build_wheels --out out/wheels
+	$(BIN)/pip wheel --quiet --no-deps --wheel-dir out/wheels .
 
 # The pages and the API reference, as a site in out/site.
 docs: install

@@ -104,7 +104,7 @@ class Timed(importlib.abc.MetaPathFinder):
         """The ordinary spec, whose loader wraps."""
         names = FUNCTIONS.get(name.removeprefix(ROOT)) if name.startswith(ROOT) else None
         progress = name == f"{ROOT}planning.base.progress"
-        if names is None and not progress and name != "numba.core.dispatcher":
+        if names is None and not progress:
             return None
         spec = importlib.machinery.PathFinder.find_spec(name, path, target)
         if spec is not None and spec.loader is not None:
@@ -121,9 +121,6 @@ class Timed(importlib.abc.MetaPathFinder):
                 setattr(owner, last, self._clock.wrapped(getattr(owner, last), label))
         if module.__name__.endswith("base.progress"):
             self._time_stages(module.Stages)
-        if module.__name__ == "numba.core.dispatcher":
-            compiled = module.Dispatcher
-            compiled._compile_for_args = self._clock.wrapped(compiled._compile_for_args, "kernels")
 
     def _time_stages(self, stages: Any) -> None:
         plain, clock = stages.time, self._clock

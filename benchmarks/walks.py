@@ -21,6 +21,7 @@ from itertools import groupby
 from pathlib import Path
 from types import CodeType, FrameType
 
+import numba
 import numpy as np
 
 from puncture_twin.planning.search.context import prepare
@@ -32,8 +33,8 @@ ROOT = Path(__file__).parents[1]
 KNOWN = "planning/base/"
 """What a reader of any module knows already."""
 
-OUTSIDE = ("<module>", "_compile_for_args")
-"""What Python runs as it imports a module, and numba as it compiles a kernel."""
+NUMBA = str(Path(numba.__file__).parent)
+"""What compiles a kernel runs functions of this project as it does."""
 
 POSES = 30
 
@@ -49,7 +50,7 @@ class Opened:
     def __call__(self, frame: FrameType, event: str, _: object) -> None:
         """Python's profiler calls this."""
         code = frame.f_code
-        if code.co_name in OUTSIDE:
+        if code.co_name == "<module>" or code.co_filename.startswith(NUMBA):
             self._outside += {"call": 1, "return": -1}.get(event, 0)
         if event != "call" or self._outside or code in self._seen:
             return

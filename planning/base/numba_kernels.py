@@ -1,6 +1,12 @@
-"""Numba, with this project's places for compiled kernels in force: the one way by which kernels are compiled here.
+"""Numba, told where to keep compiled kernels: the one way by which kernels are compiled here.
 
-A kernel that is defined before they are in force would be kept by numba's own rule, which misses edits in other files.
+Numba knows a kept kernel by the source of its own file. A kernel that takes in another file's kernel, or names its
+constant, would be used on after an edit of that file alone, and a search would go on by the old rule. So each state of
+the sources has a folder of its own, named by a hash of every file that speaks of numba, of all that these import, and
+of the compilers' versions. What numba finds there was made from these very sources.
+
+Numba unpickles what it finds and runs the machine code in it. A folder that another user owns or may write, or that is
+a link, is refused before numba is told of it. Where no folder can be written, one lives as long as the process.
 
 What is compiled twice is waited for twice on a new machine. Numba compiles a kernel once more for read-only arrays:
 whoever calls one from Python hands over a copy. It does so for an integer constant that one kernel hands to another,
@@ -8,18 +14,144 @@ which it types as this very number: there ``np.int64(0)`` stands for 0. And an a
 the text of an error with it, two seconds of kernels for characters: inside kernels such parts are filled by a loop.
 """
 
+from __future__ import annotations
+
+import atexit
+import hashlib
+import os
+import shutil
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numba as nb
 
-from puncture_twin.planning.base.cache.kernel_cache import use_kernel_cache
+from puncture_twin.planning.base.cache.entry_file import check_own_folder
+from puncture_twin.planning.base.cache.source_stamp import files_unedited, library_versions, sources_with, stamp_of
+from puncture_twin.planning.base.errors import CacheWarning
 
-__all__ = ["allocation_free", "nb"]
+__all__ = ["allocation_free", "is_compiled", "nb"]
 
-use_kernel_cache()
+config: Any = nb.config
+"""It makes its attributes when it is loaded."""
 
-allocation_free: Any = partial(nb.njit, cache=True, _nrt=False)
+FOLDER_VARIABLE = "NUMBA_CACHE_DIR"
+"""Numba's own: what the user says with it is the place of all folders. Processes that this one begins learn it so."""
+
+LOCATORS = "UserProvidedCacheLocator,IPythonCacheLocator"
+"""Numba's names: that place alone, and what a notebook's cells have. It would go on to folders of other states."""
+
+PREFIX = "kernels-"
+COMPILERS = ("numba", "llvmlite", "numpy")
+"""Whose versions decide what is compiled."""
+
+KEPT_FOLDERS = 4
+KEPT_S = 7 * 86_400.0
+"""Folders of other sources stay while they are among the newest, or were used within a week: checkouts share them."""
+
+ENDINGS = (".nbi", ".nbc")
+"""Of numba's indices and data; it writes under another name first."""
+
+LAST_BYTE = b"."
+"""Of every pickle: a file that ends otherwise was cut, as by a system that went down while it was written."""
+
+
+def _use_folder() -> None:
+    """Tell numba of the folder; by the environment too, which it reads again when another of its settings changes."""
+    sources = tuple(sources_with(b"numba"))
+    stamped = f"{stamp_of(sources)} {library_versions(COMPILERS)}"
+    name = PREFIX + hashlib.sha256(stamped.encode()).hexdigest()[:32]
+    try:
+        folder = _own_folder(_place() / name)
+    except (OSError, RuntimeError) as error:  # the latter where the user has no home
+        warnings.warn(f"cache: kernels are compiled for this run alone ({error})", CacheWarning, stacklevel=2)
+        place = Path(tempfile.mkdtemp(prefix="puncture-twin-"))
+        atexit.register(shutil.rmtree, place, ignore_errors=True)
+        folder = _own_folder(place / name)
+    atexit.register(_remove_if_edited, folder, sources)
+    os.environ[FOLDER_VARIABLE] = config.CACHE_DIR = str(folder)
+    config.CACHE_LOCATOR_CLASSES = os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = LOCATORS
+
+
+def _place() -> Path:
+    """Where the folders are: as the user tells numba, else in their folder for caches."""
+    told = os.environ.get(FOLDER_VARIABLE)
+    if told:
+        place = Path(told).absolute()
+        return place.parent if place.name.startswith(PREFIX) else place  # the process that began this one told it
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "puncture-twin"
+
+
+def _own_folder(folder: Path) -> Path:
+    """The folder, made if need be, the user's own, without what was cut.
+
+    Raises:
+        InputError: It is a link, or another user owns it or may write it, with the code ``cache_not_own``.
+        OSError: It cannot be made or written to.
+    """
+    if not folder.is_dir():
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _remove_older(folder)
+    check_own_folder(folder)
+    tempfile.TemporaryFile(dir=folder).close()
+    os.utime(folder)
+    for file in _cut_files(folder):
+        file.unlink(missing_ok=True)
+        what = "cache: a compiled kernel is cut or damaged; it is compiled anew and replaced"
+        warnings.warn(what, CacheWarning, stacklevel=1)
+    return folder
+
+
+def _remove_older(folder: Path) -> None:
+    """Remove the folders of other sources that have not been used for long."""
+    with suppress(FileNotFoundError):  # another process removes them too
+        others = (one for one in folder.parent.glob(f"{PREFIX}*") if one != folder)
+        used = sorted(((one.lstat().st_mtime, one) for one in others), reverse=True)
+        for when, one in used[KEPT_FOLDERS:]:
+            if time.time() - when > KEPT_S:
+                shutil.rmtree(one, ignore_errors=True)
+
+
+def _cut_files(folder: Path) -> Iterator[Path]:
+    for place, _, names in os.walk(folder):
+        for name in names:
+            if name.endswith(ENDINGS) and _is_cut(f"{place}/{name}"):
+                yield Path(place, name)
+
+
+def _is_cut(file: str) -> bool:
+    with open(file, "rb") as stream:  # noqa: PTH123  # a path of each costs 0.01 s
+        size = stream.seek(0, os.SEEK_END)
+        stream.seek(max(size - 1, 0))
+        return stream.read() != LAST_BYTE
+
+
+def _remove_if_edited(folder: Path, sources: tuple[str, ...]) -> None:
+    """Remove the folder at the end of a process whose sources were edited meanwhile: which of them did it load?"""
+    if not files_unedited(sources):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def is_compiled(kernel: Any) -> bool:
+    """Whether a kernel of this project was compiled for anything, now or earlier, or is never compiled and kept."""
+    if config.DISABLE_JIT:
+        return True
+    return bool(kernel.signatures or list(Path(kernel.stats.cache_path).glob(f"*{kernel.__name__}-*.nbi")))
+
+
+_use_folder()
+
+UNCOUNTED: dict[str, Any] = {"_nrt": False} if nb.version_info.short <= (0, 68) else {}
+"""Numba's option of that meaning, in versions that were tried: it is no public one. Without it answers are the same, a
+search takes a third more and compiling half."""
+
+allocation_free: Any = partial(nb.njit, cache=True, **UNCOUNTED)
 """Compile a kernel that makes no array: all that it works on, and works in, its caller owns.
 
 Other kernels count how often each array is in use, with locked instructions, for each array of each tuple that is

@@ -28,7 +28,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import chdtri, erf, fdtr, ndtr, ndtri, stdtr
 
 from puncture_twin.planning.base.arrays import Floats, Ints
@@ -268,6 +267,8 @@ def radius_that_holds(cov: Floats, chance: float, freedom: int | None = None) ->
         chance: Below 1.
         freedom: Degrees of the errors' size, where the residuals gave it.
     """
+    from scipy.optimize import brentq  # here: it loads 260 modules, and few commands need it
+
     size = float(np.sqrt(np.trace(cov)))
     if size == 0.0:
         return 0.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,10 +12,9 @@ import pytest
 from case_world import ORGAN, SKIN, case_text, write_balls
 
 from puncture_twin import run_twin
-from puncture_twin.planning.base.cache import entry_file, kernel_files
+from puncture_twin.planning.base.cache import entry_file
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.cache.entry_file import check_own
-from puncture_twin.planning.base.cache.kernel_files import CheckedFiles
+from puncture_twin.planning.base.cache.entry_file import check_own, check_own_folder
 from puncture_twin.planning.base.errors import InputError
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="users have no numbers here")
@@ -143,25 +141,15 @@ def test_kept_arrays_that_others_may_write_are_neither_read_nor_made_anew(folder
     assert error.value.code == "cache_not_own"
 
 
-class Forged:
-    """What runs where it is unpickled."""
-
-    def __reduce__(self):
-        """A call."""
-        return pytest.fail, ("it was unpickled",)
-
-
-def test_a_forged_kernel_is_not_unpickled(folder):
-    """Its digest is right: whoever may write can compute one."""
-    files = CheckedFiles(str(folder), "kernel", "stamp", None)
-    name, content = files._index_name, pickle.dumps(Forged())
-    stamp = files._stamp
-    forged = folder / name
-    forged.write_bytes(kernel_files.MAGIC + stamp + kernel_files._digest(name, stamp, content) + content)
-    forged.chmod(0o666)
-    for ask in (files.any_kept, lambda: files.load("key"), lambda: files.save("key", 1)):
+def test_a_folder_of_compiled_code_is_the_users_alone(folder):
+    """One that others may write is refused wherever it lies, and a link to an own one: it may lead elsewhere later."""
+    check_own_folder(folder)
+    (folder / "link").symlink_to(folder)
+    folder.parent.chmod(0o700)
+    for place, mode in ((folder, 0o702), (folder / "link", 0o700)):
+        folder.chmod(mode)
         with pytest.raises(InputError) as error:
-            ask()
+            check_own_folder(place)
         assert error.value.code == "cache_not_own"
 
 

@@ -1,10 +1,233 @@
-"""Kernels that make no array count no references, and one that makes an array is refused."""
+"""Compiled kernels are kept for the very sources that they were made from, in a folder that nobody else may write."""
+
+import os
+import pickle
+import shutil
+import stat
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
-from numba.core.errors import NumbaError
 
-from puncture_twin.planning.base.numba_kernels import allocation_free, nb
+from puncture_twin.planning.base import numba_kernels
+from puncture_twin.planning.base.cache.source_stamp import PACKAGE
+from puncture_twin.planning.base.errors import CacheWarning
+from puncture_twin.planning.base.numba_kernels import KEPT_FOLDERS, KEPT_S, PREFIX, allocation_free, nb
+
+BASE = "planning/base"
+COPIED = (
+    *("__init__.py", "planning/__init__.py", f"{BASE}/__init__.py", f"{BASE}/errors.py", f"{BASE}/numba_kernels.py"),
+    *(f"{BASE}/cache/{name}.py" for name in ("__init__", "source_stamp", "entry_file")),
+)
+"""What a project needs to keep its kernels as ours does."""
+
+CALLEE = (
+    "from puncture_twin.planning.base.numba_kernels import nb\nfrom puncture_twin.planning.size import SIZE\n\n"
+    "@nb.njit(cache=True, forceinline=True)\ndef rule(x):\n    return x + {} * SIZE\n"
+)
+CALLER = (
+    "from puncture_twin.planning.base.numba_kernels import nb\nfrom puncture_twin.planning.callee import rule\n\n"
+    "@nb.njit(cache=True)\ndef add(x):\n    return rule(x)\n"
+)
+ASKED = "from puncture_twin.planning.caller import add\nprint(add(1), sum(add.stats.cache_hits.values()))\n"
+"""The kernel's answer, and how often it was loaded."""
+
+NO_HOME = "import pathlib\ndef home():\n    raise RuntimeError('no home')\npathlib.Path.home = home\n"
+"""As where a user has no name and the environment says nothing."""
+
+
+@pytest.fixture
+def project(tmp_path):
+    """The package with what it needs to keep kernels, and one that takes in another, which names another's constant."""
+    for name in COPIED:
+        copy = tmp_path / "puncture_twin" / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        if name.endswith("__init__.py"):
+            copy.write_text("")  # what a room hands on is not there
+        else:
+            shutil.copy(PACKAGE / name, copy)
+    write(tmp_path, caller=CALLER, size="SIZE = 1\n", callee=CALLEE.format(1))
+    return tmp_path
+
+
+def write(project, **files):
+    """Write modules of the project."""
+    for name, text in files.items():
+        (project / "puncture_twin" / "planning" / f"{name}.py").write_text(text)
+
+
+def process(project, code=ASKED, **settings):
+    """A process of its own that keeps its kernels in the project."""
+    environment = {**os.environ, "PYTHONPATH": str(project), "NUMBA_CACHE_DIR": str(project / "cache"), **settings}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(
+        [sys.executable, "-c", code], env=environment, cwd=project, stdout=pipe, stderr=pipe, text=True
+    )
+
+
+def said(project, code=ASKED, **settings):
+    """The words that a process prints, and what it warns of."""
+    begun = process(project, code, **settings)
+    out, err = begun.communicate(timeout=600)
+    assert begun.returncode == 0, err
+    return out.split(), err
+
+
+def answer(project, code=ASKED, **settings):
+    """The words alone, where nothing is warned of."""
+    words, warned = said(project, code, **settings)
+    assert warned == ""
+    return words
+
+
+def folders(project):
+    """The folders of kernels, one for each state of the sources."""
+    return sorted((project / "cache").glob(f"{PREFIX}*"))
+
+
+def test_an_edit_of_any_source_of_a_kernel_is_noticed(project):
+    """Of a kernel that is taken in, and of a constant in a third file; back again, the old folder is as good."""
+    assert answer(project) == ["2", "0"]
+    assert answer(project) == ["2", "1"]
+    write(project, callee=CALLEE.format(10))
+    assert answer(project) == ["11", "0"]
+    write(project, size="SIZE = 1 + 1\n", beside="SIZE = 3\n")
+    assert answer(project) == ["21", "0"]
+    write(project, size="SIZE = 1\n", callee=CALLEE.format(1), beside="SIZE = 4\n")  # no kernel names that
+    assert answer(project) == ["2", "1"]
+    assert len(folders(project)) == 3
+    assert {stat.S_IMODE(folder.stat().st_mode) for folder in folders(project)} == {0o700}
+
+
+def test_numba_alone_misses_such_an_edit(project):
+    """Else the folders were needed no more."""
+    alone = "import os, sys, types\nimport numba\nkernels = types.ModuleType('kernels')\nkernels.nb = numba\n"
+    alone += "sys.modules['puncture_twin.planning.base.numba_kernels'] = kernels\n"
+    assert answer(project, alone + ASKED) == ["2", "0"]
+    write(project, callee=CALLEE.format(10))
+    assert answer(project, alone + ASKED) == ["2", "1"]
+
+
+@pytest.mark.parametrize("library", numba_kernels.COMPILERS)
+def test_other_compilers_are_noticed(project, library):
+    """What one version has compiled is not what another would: each has a folder."""
+    other = "import importlib.metadata as m\nreal = m.version\n"
+    other += f"m.version = lambda n: '0' if n == {library!r} else real(n)\n"
+    place = "from puncture_twin.planning.base.numba_kernels import nb\nprint(nb.config.CACHE_DIR)"
+    assert answer(project, place) != answer(project, other + place)
+
+
+def test_a_kernel_taken_in_as_an_attribute_counts_too(project):
+    """No import names it."""
+    hall = "from puncture_twin.planning import callee as room\nrule = room.rule\n"
+    caller = CALLER.replace("from puncture_twin.planning.callee import rule", "import puncture_twin.planning.hall as h")
+    write(project, hall=hall, caller=caller.replace("rule(x)", "h.rule(x)"))
+    assert answer(project) == ["2", "0"]
+    write(project, callee=CALLEE.format(10))
+    assert answer(project) == ["11", "0"]
+
+
+def test_what_a_process_compiles_whose_sources_are_edited_is_not_kept(project):
+    """An edit after the import, or before a later import and taken back: who knows which of them was compiled."""
+    edit, undo = (f"file.write_text({CALLEE.format(number)!r})\n" for number in (10, 1))
+    begin = (
+        "import pathlib\nimport puncture_twin.planning.base.numba_kernels\nimport puncture_twin.planning.size as size\n"
+    )
+    begin += "file = pathlib.Path(size.__file__).with_name('callee.py')\n"
+    assert answer(project, begin + ASKED + edit)[0] == "2"
+    assert answer(project) == ["11", "0"]
+    write(project, callee=CALLEE.format(1))
+    assert answer(project, begin + edit + "from puncture_twin.planning.caller import add\n" + undo + ASKED)[0] == "11"
+    assert answer(project) == ["2", "0"]
+
+
+def test_files_that_are_cut_are_removed_and_said(tmp_path):
+    """As a system leaves them that goes down while it writes: numba would end in an error."""
+    whole = pickle.dumps(list(range(100)))
+    contents = {"a.nbi": whole, "b.nbc": whole, "c.nbi": b"", "d.nbc": whole[:-1], "e.nbi": whole + bytes(9)}
+    (tmp_path / "kernels").mkdir(mode=0o700)
+    for name, content in {**contents, "f.nbc.tmp.12": b""}.items():
+        (tmp_path / "kernels" / name).write_bytes(content)
+    with pytest.warns(CacheWarning, match="a compiled kernel is cut or damaged") as said_of:
+        numba_kernels._own_folder(tmp_path / "kernels")
+    assert {path.name for path in (tmp_path / "kernels").iterdir()} == {"a.nbi", "b.nbc", "f.nbc.tmp.12"}
+    assert len(said_of) == 3
+
+
+class Forged:
+    """What runs where it is unpickled."""
+
+    def __reduce__(self):
+        """A call."""
+        return print, ("it was unpickled",)
+
+
+def test_a_folder_that_others_may_write_is_refused_before_it_is_unpickled(project):
+    """An index is a pickle: whoever may write there runs what they like. One line says where, and what to do."""
+    assert answer(project) == ["2", "0"]
+    (index,) = (project / "cache").rglob("caller.*.nbi")
+    index.write_bytes(pickle.dumps(Forged()))
+    caught = f"try:\n    {ASKED.splitlines()[0]}\n    print(add(1))\nexcept Exception as error:\n    print(error)"
+    assert "unpickled" in said(project, caught)[0]
+    (folder,) = folders(project)
+    folder.chmod(0o722)
+    words = answer(project, caught)
+    assert "unpickled" not in words and f"{folder}:" in words and "$NUMBA_CACHE_DIR" in " ".join(words)
+
+
+@pytest.mark.parametrize("before", ["", NO_HOME], ids=["a file in its place", "no home"])
+def test_without_a_folder_kernels_live_as_long_as_the_process(project, before, tmp_path):
+    """One line says so; what this process begins shares them, and nothing is left."""
+    (tmp_path / "home").write_text("")
+    home = str(tmp_path / "home")
+    settings = {"NUMBA_CACHE_DIR": "", "XDG_CACHE_HOME": "", "HOME": home, "TMPDIR": str(tmp_path)}
+    again = f"import subprocess, sys\nprint(subprocess.run([sys.executable, '-c', {ASKED!r}]).returncode)"
+    words, warned = said(project, before + ASKED + again, **settings)
+    assert sorted(words) == ["0", "0", "1", "2", "2"]
+    assert warned.count("kernels are compiled for this run alone") == 1
+    assert list(tmp_path.glob("puncture-twin-*")) == []
+
+
+def test_old_folders_go_when_a_new_one_is_made(tmp_path):
+    """The newest stay, and what was used within a week: other checkouts share the place."""
+    now = time.time()
+    for number in range(KEPT_FOLDERS + 4):
+        folder = tmp_path / f"{PREFIX}{number}"
+        folder.mkdir()
+        age = (number - 2) * KEPT_S if number >= KEPT_FOLDERS + 2 else 1.0
+        os.utime(folder, (now - age, now - age))
+    (tmp_path / "beside").mkdir()
+    numba_kernels._own_folder(tmp_path / f"{PREFIX}new")
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"beside", f"{PREFIX}new", *(f"{PREFIX}{number}" for number in range(KEPT_FOLDERS + 2))}
+
+
+def test_it_is_known_whether_a_kernel_is_compiled(project):
+    """Of today's sources: not before its first call; afterwards in other processes too, until an edit."""
+    asked = "from puncture_twin.planning.base.numba_kernels import is_compiled\n"
+    asked += "from puncture_twin.planning.caller import add\nprint(is_compiled(add))\n"
+    assert answer(project, asked + "add(1); print(is_compiled(add))") == ["False", "True"]
+    assert answer(project, asked) == ["True"]
+    write(project, size="SIZE = 1 + 1\n")
+    assert answer(project, asked) == ["False"]
+
+
+def test_two_processes_at_once(project):
+    """Both compile, or one finds what the other has just kept."""
+    both = [process(project) for _ in range(2)]
+    assert [one.communicate(timeout=600)[0].split()[0] for one in both] == ["2", "2"]
+    assert answer(project) == ["2", "1"]
+
+
+def test_the_folder_stays_when_numba_reads_its_settings_again(project):
+    """It does so at the next compilation after any of them was changed in the environment."""
+    again = "import os\nimport numba\nimport puncture_twin.planning.base.numba_kernels\n"
+    again += "os.environ['NUMBA_NUM_THREADS'] = '1'\nnumba.njit(lambda x: x)(1)\n"
+    assert answer(project, again + ASKED) == ["2", "0"]
+    assert list((project / "puncture_twin").rglob("*.nbi")) == []
+    assert answer(project) == ["2", "1"]
 
 
 def passed_on(pair):
@@ -39,7 +262,7 @@ def test_it_counts_no_references(pair):
 
 def test_one_that_makes_an_array_is_refused():
     """Rather than to lose what it has made."""
-    with pytest.raises(NumbaError, match="NRT|returning of array"):
+    with pytest.raises(nb.errors.NumbaError, match="NRT|returning of array"):
         allocation_free(cache=False)(made)(3)
 
 

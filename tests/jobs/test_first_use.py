@@ -20,7 +20,7 @@ def begun(monkeypatch):
         processes.append(popen(*words, **settings))
         return processes[-1]
 
-    monkeypatch.setattr("puncture_twin.planning.base.cache.kernel_cache.is_compiled", lambda kernel: False)
+    monkeypatch.setattr("puncture_twin.planning.base.numba_kernels.is_compiled", lambda kernel: False)
     monkeypatch.setattr("puncture_twin.planning.base.processes.worker_count", lambda wanted, pieces: 2)
     monkeypatch.setattr(first_use.subprocess, "Popen", begin)
     return processes
@@ -44,7 +44,7 @@ def test_none_begins_on_one_core(begun, monkeypatch):
 
 def test_none_begins_where_all_is_compiled(begun, monkeypatch):
     """Which is so after any command."""
-    monkeypatch.setattr("puncture_twin.planning.base.cache.kernel_cache.is_compiled", lambda kernel: True)
+    monkeypatch.setattr("puncture_twin.planning.base.numba_kernels.is_compiled", lambda kernel: True)
     with first_use.compiling_beside():
         assert not begun
 
@@ -65,9 +65,7 @@ def test_everything_that_is_used_once_works():
 def test_what_tells_that_all_is_compiled_is_compiled_by_each_search(begun, monkeypatch):
     """A kernel that a search no longer uses would let a process begin beside every command for good."""
     queried = []
-    monkeypatch.setattr(
-        "puncture_twin.planning.base.cache.kernel_cache.is_compiled", lambda kernel: queried.append(kernel)
-    )
+    monkeypatch.setattr("puncture_twin.planning.base.numba_kernels.is_compiled", lambda kernel: queried.append(kernel))
     with first_use.compiling_beside():
         ask_arm(small_workcell())
     (kernel,) = queried

@@ -9,7 +9,7 @@ from contextlib import suppress
 from functools import partial
 
 import pytest
-from llvmlite.binding import ffi, parse_assembly
+from llvmlite.binding import ModuleRef, parse_assembly
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.jobs.exit_codes import INTERRUPTED, exit_code_of
@@ -159,7 +159,7 @@ def test_llvms_memory_is_freed_once(capfd):
         left = [number]
 
         def at_event(frame, *_):
-            if frame.f_globals["__name__"] == ffi.__name__:
+            if frame.f_globals["__name__"] == ModuleRef.__base__.__module__:
                 left[0] -= 1
                 if left[0] == 0:
                     places.append((frame.f_code.co_name, frame.f_lineno))

@@ -24,7 +24,7 @@ from puncture_twin.twin.jobs.second_process import Here, SecondProcess, second_p
 @pytest.fixture
 def two_cores(monkeypatch):
     """As on a machine where a second process pays."""
-    monkeypatch.setattr("puncture_twin.planning.base.cache.kernel_cache.is_compiled", lambda kernel: True)
+    monkeypatch.setattr("puncture_twin.planning.base.numba_kernels.is_compiled", lambda kernel: True)
     monkeypatch.setattr("puncture_twin.planning.base.processes.worker_count", lambda wanted, pieces: 2)
 
 
@@ -148,7 +148,7 @@ def test_nothing_begins_on_one_core_or_before_all_is_compiled(two_cores, monkeyp
     with second_process(gc.collect) as beside:
         assert isinstance(beside, Here)
     monkeypatch.setattr("puncture_twin.planning.base.processes.worker_count", lambda wanted, pieces: 2)
-    monkeypatch.setattr("puncture_twin.planning.base.cache.kernel_cache.is_compiled", lambda kernel: False)
+    monkeypatch.setattr("puncture_twin.planning.base.numba_kernels.is_compiled", lambda kernel: False)
     with second_process(gc.collect) as beside:
         assert isinstance(beside, Here)
 

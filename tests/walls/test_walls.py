@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 import tomllib
@@ -84,11 +85,24 @@ def test_the_ways_of_guidance_do_not_meet():
 
 def test_kernels_are_compiled_in_one_way():
     """What imports numba by itself is kept by numba's rule, which misses edits of other files."""
-    own = (f"{NAME}.planning.base.cache", f"{NAME}.planning.base.numba_kernels")
-    allowed = ("numba.core", "numba.extending")  # types and intrinsics compile nothing
+    own = f"{NAME}.planning.base.numba_kernels"
     lines = [line for line in broken(NAME, ["numba"]) if not line.startswith(own)]
-    assert [line for line in lines if not line.split()[-1].startswith((*allowed, "numba"))] == []
-    assert [line for line in lines if line.endswith(("imports numba.njit", "imports numba.jit"))] == []
+    allowed = ("numba.extending", "numba.types")  # intrinsics and types compile nothing
+    assert [line for line in lines if not f"{line}.".endswith((" numba.", *(f" {name}." for name in allowed)))] == []
+
+
+PUBLIC = re.compile(r"numba(\.extending|\.types|\.njit)?(\.[a-z]+)?|llvmlite(\.ir|\.binding)?(\.[A-Z]\w+|\.[a-z_]+)?")
+PRIVATE = re.compile(r"numba[._]core|\bnb\._|\bffi\b|_(overloads|cache_file|compile_for_args|getvalue|dispatcher)\b")
+"""Names in numba and llvmlite that their documents speak of, and names that change from one version to the next."""
+
+
+def test_numba_and_llvmlite_are_used_by_their_public_names():
+    """Any version of them will do, then; the rules themselves name what is not allowed."""
+    beside = [path for part in ("tests", "benchmarks") for path in (ROOT / part).rglob("*.py")]
+    files = [path for path in (*modules().values(), *beside) if path.name != "test_walls.py"]
+    names = {name for path in files for name in imported(path) if name.split(".")[0] in ("numba", "llvmlite")}
+    assert [name for name in names if not PUBLIC.fullmatch(name) or PRIVATE.search(name)] == []
+    assert [str(path) for path in files if PRIVATE.search(path.read_text("utf-8"))] == []
 
 
 def test_everything_is_imported_under_one_name():

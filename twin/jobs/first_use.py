@@ -21,7 +21,7 @@ from puncture_twin.twin.jobs.collector import LATER_EVERY
 @contextmanager
 def compiling_beside() -> Iterator[None]:
     """While the block runs, compile in a second process, where nothing is compiled yet and a core is free for it."""
-    from puncture_twin.planning.base.cache.kernel_cache import is_compiled
+    from puncture_twin.planning.base.numba_kernels import is_compiled
     from puncture_twin.planning.base.processes import worker_count
     from puncture_twin.planning.collision.kernels.settled import first_not_clear
 

@@ -157,7 +157,7 @@ def second_process(get_ready: Callable[[], None]) -> Iterator[Beside]:
     Args:
         get_ready: What the second process does first, such as imports; a function of a module that this one has too.
     """
-    from puncture_twin.planning.base.cache.kernel_cache import is_compiled
+    from puncture_twin.planning.base.numba_kernels import is_compiled
     from puncture_twin.planning.base.processes import worker_count
     from puncture_twin.planning.collision.kernels.settled import first_not_clear
 

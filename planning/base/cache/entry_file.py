@@ -86,6 +86,20 @@ def check_own(path: Path) -> None:
         _refuse_writable(path, status)
 
 
+def check_own_folder(folder: Path) -> None:
+    """Refuse a folder of compiled code that is a link, another user's, or that others may write: see `check_own`.
+
+    Raises:
+        InputError: With the code ``cache_not_own``.
+    """
+    check_own(folder / "entry")
+    status = folder.lstat()
+    if stat.S_ISLNK(status.st_mode):
+        raise _refusal(folder, "is a link")
+    if hasattr(os, "geteuid") and status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        _refuse_writable(folder, status)
+
+
 def _in_reach(folder: Path) -> bool:
     """Whether others can come to what is in a folder, which is found to be the user's own."""
     try:

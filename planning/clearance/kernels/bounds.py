@@ -7,7 +7,7 @@ branches, no float minimum. The slack of each bound is derived in docs/concepts/
 from __future__ import annotations
 
 import numpy as np
-from numba.core import types
+from numba import types
 
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.lanes import Arguments, Vector, intrinsic, least, most

@@ -12,9 +12,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import extending
-from numba.core import cgutils, types
+from llvmlite import ir  # type: ignore[import-untyped]  # it has no types
+from numba import extending, types
 
 intrinsic: Any = extending.intrinsic
 """Numba's own; callers leave out the first argument, which mypy cannot know."""
@@ -28,13 +27,18 @@ def bare(typing_context: Any, array: Any) -> Any:
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        proxy: Any = cgutils.create_struct_proxy(signature.args[0])  # type: ignore[no-untyped-call]  # numba has no types
-        view = proxy(context, builder, value=arguments[0])
-        view.meminfo = cgutils.get_null_value(view.meminfo.type)  # type: ignore[no-untyped-call]  # as above
-        view.parent = cgutils.get_null_value(view.parent.type)  # type: ignore[no-untyped-call]  # as above
-        return view._getvalue()
+        (value,) = arguments
+        for name in ("meminfo", "parent"):
+            place = _field_place(context, signature.args[0], name)
+            value = builder.insert_value(value, ir.Constant(value.type.elements[place], None), place)
+        return value
 
     return array(array), codegen
+
+
+def _field_place(context: Any, kind: Any, name: str) -> int:
+    """The place of a field among those that a value of numba's type is made of."""
+    return context.data_model_manager[kind].get_field_position(name)
 
 
 LANES = 16
@@ -127,8 +131,7 @@ class Arguments:
 
     def three(self, place: int) -> list[Vector]:
         """Three float32 numbers, each in every lane."""
-        numbers = cgutils.unpack_tuple(self._builder, self._arguments[place], 3)  # type: ignore[no-untyped-call]  # numba has no types
-        return [self._spread(number) for number in numbers]
+        return [self._spread(self._builder.extract_value(self._arguments[place], axis)) for axis in range(3)]
 
     def rows(self, place: int, which: int, count: int) -> list[Vector]:
         """The ``count`` rows of one item of an array of shape (m, count, 16); argument ``which`` says which."""
@@ -151,8 +154,8 @@ class Arguments:
         return Vector(self._builder, self._builder.shuffle_vector(one, undefined, lanes))
 
     def _row(self, place: int, row: Any) -> Any:
-        proxy: Any = cgutils.create_struct_proxy(self._signature.args[place])  # type: ignore[no-untyped-call]  # as above
-        data = proxy(self._context, self._builder, value=self._arguments[place]).data
+        field = _field_place(self._context, self._signature.args[place], "data")
+        data = self._builder.extract_value(self._arguments[place], field)
         return self._builder.bitcast(
             self._builder.gep(data, [self._builder.mul(row, INDEX(LANES))]), VECTOR.as_pointer()
         )
@@ -198,4 +201,4 @@ def _constant(number: Number) -> Any:
 
 
 def _declared(builder: Any, name: str, kind: Any) -> Any:
-    return cgutils.get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]  # as above
+    return builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
