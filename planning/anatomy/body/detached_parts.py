@@ -7,13 +7,16 @@ nothing dense counts as air (`puncture_twin.planning.anatomy.body.outside_body`)
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, counts_of
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
+from puncture_twin.planning.geometry.parts import middle_of
 
 OPENING_MM = 6.0
 """Parts thinner than twice this are no trunk, head or limb: table tops, sheets, tubes."""
@@ -34,81 +37,99 @@ ALIKE = 0.9
 the bed."""
 
 
-def thick_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
-    """Number the parts of a mask into which a ball of ``OPENING_MM`` fits, with what lies near each.
+class Piece(NamedTuple):
+    """A part of what a CT shows.
 
-    The border counts as mask. Fine images are sampled: where a table ends and an arm begins is a coarse question.
+    Attributes:
+        box: Of the image, in which it lies.
+        mask: Shape of the box.
+    """
+
+    box: tuple[slice, ...]
+    mask: Bools
+
+
+def thick_parts(mask: Bools, spacing_mm: Floats) -> Iterator[Piece]:
+    """The parts of a mask into which a ball of ``OPENING_MM`` fits, with what lies near each, the largest first.
+
+    The border counts as mask. Fine images are sampled: where a table ends and an arm begins is a coarse question. Of
+    others than the first only those that may be as large as a limb.
 
     Args:
         mask: Shape (nx, ny, nz).
         spacing_mm: Shape (3,).
-
-    Returns:
-        Shape of ``mask``: 0 outside and in thin parts, 1 in the largest part, 2 in the next, and so on.
     """
     stride = np.maximum(1, (SAMPLING_MM / spacing_mm).astype(int))
-    coarse = mask[:: stride[0], :: stride[1], :: stride[2]]
-    coarse_mm = spacing_mm * stride
-    reach = np.ceil(OPENING_MM / coarse_mm).astype(int)
-    padded = np.pad(coarse, [(r, r) for r in reach], mode="edge")
-    cores = _by_size(scipy.ndimage.distance_transform_edt(padded, sampling=coarse_mm) > OPENING_MM)
+    parts = _coarse_parts(mask[:: stride[0], :: stride[1], :: stride[2]], spacing_mm * stride)
+    most_ml = np.bincount(parts.ravel()) * float(np.prod(stride * spacing_mm)) / 1000.0
+    for number, coarse in enumerate(scipy.ndimage.find_objects(parts), start=1):
+        if number > 1 and most_ml[number] < MIN_LIMB_ML:
+            continue
+        ends = zip(coarse, stride, mask.shape, strict=True)
+        box = tuple(slice(one.start * step, min(one.stop * step, size)) for one, step, size in ends)
+        whole = parts[coarse] == number
+        for axis in (2, 1, 0):
+            whole = whole.repeat(stride[axis], axis=axis)
+        inside = mask[box]
+        yield Piece(box, inside & whole[tuple(map(slice, inside.shape))])
+
+
+def _coarse_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
+    """Number the parts into which the ball fits, 1 the largest, and what lies near each; 0 elsewhere."""
+    reach = np.ceil(OPENING_MM / spacing_mm).astype(int)
+    cores = _by_size(_eroded(np.pad(mask, [(r, r) for r in reach], mode="edge"), spacing_mm))
     if not cores.any():
         return np.zeros(mask.shape, np.int32)
-    gap, nearest = scipy.ndimage.distance_transform_edt(cores == 0, sampling=coarse_mm, return_indices=True)
-    parts = np.where(gap <= CORNER * OPENING_MM + coarse_mm.max(), cores[tuple(nearest)], 0)
-    parts = parts[tuple(slice(r, -r) for r in reach)]
-    whole = np.zeros(mask.shape, np.int32)
-    for i, plane in enumerate(whole):
-        spread = parts[i // stride[0]].repeat(stride[1], axis=0).repeat(stride[2], axis=1)
-        np.multiply(spread[: mask.shape[1], : mask.shape[2]], mask[i], out=plane)
-    return whole
+    gap, nearest = scipy.ndimage.distance_transform_edt(cores == 0, sampling=spacing_mm, return_indices=True)
+    parts = np.where(gap <= CORNER * OPENING_MM + spacing_mm.max(), cores[tuple(nearest)], 0)
+    return np.asarray(parts[tuple(slice(r, -r) for r in reach)])
 
 
-def largest_component(mask: Bools) -> Bools:
-    """The largest part of a mask whose voxels share faces; the mask itself where it is empty."""
-    labels, count = scipy.ndimage.label(mask)
-    if count == 0:
-        return mask
-    return np.asarray(labels == 1 + int(np.argmax(counts_of(labels, count)[1:])))
+def _eroded(mask: Bools, spacing_mm: Floats) -> Bools:
+    """Where the ball fits."""
+    fits, size = mask.copy(), mask.shape
+    reach = np.floor(OPENING_MM / spacing_mm).astype(int)
+    for by in itertools.product(*(range(-r, r + 1) for r in reach)):
+        if np.linalg.norm(by * spacing_mm) <= OPENING_MM:
+            into = tuple(slice(max(0, -k), n - max(0, k)) for k, n in zip(by, size, strict=True))
+            out_of = tuple(slice(max(0, k), n - max(0, -k)) for k, n in zip(by, size, strict=True))
+            fits[into] &= mask[out_of]
+    return fits
 
 
-def detached_limbs(hu: NDArray[np.float32], parts: Ints32, spacing_mm: Floats) -> tuple[Bools, ...]:
-    """The parts, beside the first, that are of the patient.
+def detached_limbs(hu: NDArray[np.float32], parts: Iterable[Piece], spacing_mm: Floats) -> tuple[Piece, ...]:
+    """Those of some parts beside the trunk that are of the patient.
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the bed.
-        parts: Same shape, as `thick_parts` numbers them.
+        parts: As `thick_parts` finds them.
         spacing_mm: Shape (3,).
-
-    Returns:
-        A mask for each.
     """
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
-    sizes = counts_of(parts, int(parts.max())) * voxel_ml
     limbs = []
-    for number in np.flatnonzero(sizes >= MIN_LIMB_ML):
-        if number < 2:
+    for part in parts:
+        values = hu[part.box][part.mask]
+        if len(values) * voxel_ml < MIN_LIMB_ML:
             continue
-        part = parts == number
         low, high = SOFT_TISSUE_HU
-        soft = low <= float(np.median(hu[part])) <= high
-        bone_ml = np.count_nonzero(hu[part] > BONE_HU) * voxel_ml
-        if soft and (bone_ml >= MIN_BONE_ML or not _one_section(part)):
+        soft = low <= float(np.median(values)) <= high
+        bone_ml = np.count_nonzero(values > BONE_HU) * voxel_ml
+        if soft and (bone_ml >= MIN_BONE_ML or not _one_section(part.mask, hu.shape[2])):
             limbs.append(part)
     return tuple(limbs)
 
 
-def limb_warnings(limbs: Sequence[Bools], trunk: Bools, voxel_ml: float) -> Iterator[str]:
+def limb_warnings(limbs: Sequence[Piece], trunk: Bools, voxel_ml: float) -> Iterator[str]:
     """One sentence that names every detached part, where there is one."""
     if limbs:
-        middle = scipy.ndimage.center_of_mass(trunk)
-        named = [f"{_side(limb, middle)} ({np.count_nonzero(limb) * voxel_ml:.0f} ml)" for limb in limbs]
+        middle = middle_of(trunk)
+        named = [f"{_side(limb, middle)} ({np.count_nonzero(limb.mask) * voxel_ml:.0f} ml)" for limb in limbs]
         yield f"parts that do not touch the trunk (arms, legs?) count as body: {', '.join(named)}"
 
 
-def _side(limb: Bools, middle: Sequence[float]) -> str:
+def _side(limb: Piece, middle: Floats) -> str:
     """Where a part lies, seen from the trunk; axes run to the left and to the back."""
-    away = np.array(scipy.ndimage.center_of_mass(limb)) - np.array(middle)
+    away = middle_of(limb.mask) + [one.start for one in limb.box] - middle
     if abs(away[0]) >= abs(away[1]):
         return "left of it" if away[0] > 0 else "right of it"
     return "behind it" if away[1] > 0 else "in front of it"
@@ -124,12 +145,14 @@ def _by_size(mask: Bools) -> Ints32:
     return rank[labels]
 
 
-def _one_section(part: Bools) -> bool:
+def _one_section(part: Bools, slices: int) -> bool:
     """Whether the part is the same in nearly every slice of the image, as a table is."""
     present = part.any(axis=(0, 1))
-    if present.mean() < ALIKE:
+    if np.count_nonzero(present) < ALIKE * slices:
         return False
     section = part[:, :, present].mean(axis=2) > 0.5
     both = (part & section[:, :, None]).sum(axis=(0, 1))
     either = (part | section[:, :, None]).sum(axis=(0, 1))
-    return bool(np.mean(both / np.maximum(either, 1)) > ALIKE)
+    alike = np.zeros(slices)
+    alike[: len(both)] = both / np.maximum(either, 1)
+    return bool(np.mean(alike) > ALIKE)

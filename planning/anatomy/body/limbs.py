@@ -261,14 +261,19 @@ def _axis(points: Floats) -> tuple[Floats, Floats]:
     return middle, np.linalg.svd(points - middle, full_matrices=False)[2][0]
 
 
-def _share(mask: Bools, stride: NDArray[np.int_]) -> NDArray[np.float32]:
+def _share(mask: Bools, stride: NDArray[np.int_]) -> Floats:
     """How much of each block a mask fills; 0..1."""
-    share: NDArray[np.float32] = mask.astype(np.float32)
+    counts: NDArray[np.integer] = mask.view(np.uint8)
+    most = np.ones(1)
     for axis, times in enumerate(stride):
-        starts = np.arange(0, mask.shape[axis], times)
-        counts = np.diff(np.append(starts, mask.shape[axis])).reshape([-1 if k == axis else 1 for k in range(3)])
-        share = np.asarray(np.add.reduceat(share, starts, axis=axis) / counts.astype(np.float32))
-    return share
+        blocks = np.add.reduceat(np.ones(mask.shape[axis]), np.arange(0, mask.shape[axis], times))
+        most = most[..., None] * blocks
+        source = np.moveaxis(counts, axis, 0)
+        found = np.zeros((len(blocks), *source.shape[1:]), np.min_scalar_type(int(np.prod(stride))))
+        for first in range(times):
+            found[: len(source[first::times])] += source[first::times]
+        counts = np.moveaxis(found, 0, axis)
+    return counts / most[0]
 
 
 def _shifted(mask: Bools, by: NDArray[np.int_]) -> Bools:
