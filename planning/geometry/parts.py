@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32
 from puncture_twin.planning.base.numba_kernels import nb
@@ -41,15 +42,15 @@ class Parts:
         _count(_plain(where), self.runs, held)
         return np.bincount(self.part, held, len(self.sizes)).astype(np.int64)
 
-    def mask(self, chosen: Bools) -> Bools:
-        """Some of the parts.
+    def painted(self, values: NDArray[Any]) -> NDArray[Any]:
+        """A grid that holds a value of its own in each part, and zero outside of all.
 
         Args:
-            chosen: Shape (parts,).
+            values: Shape (parts,), whole numbers or flags.
         """
-        painted = np.zeros(self.shape, bool)
-        _paint(self.runs[chosen[self.part]], painted)
-        return painted
+        grid = np.zeros(self.shape, values.dtype)
+        _paint(self.runs, values[self.part], grid)
+        return grid
 
 
 def parts_of(mask: Bools) -> Parts:
@@ -60,7 +61,7 @@ def parts_of(mask: Bools) -> Parts:
 def largest_part(mask: Bools) -> Bools:
     """The largest part of a mask; the mask itself where it is empty."""
     parts = parts_of(mask)
-    return parts.mask(np.arange(len(parts.sizes)) == np.argmax(parts.sizes)) if len(parts.sizes) else mask
+    return parts.painted(np.arange(len(parts.sizes)) == np.argmax(parts.sizes)) if len(parts.sizes) else mask
 
 
 def slice_counts(mask: Bools) -> tuple[Ints, Ints, Ints]:
@@ -178,7 +179,8 @@ def _count(mask: Any, runs: Any, held: Any) -> None:
 
 
 @nb.njit(cache=True)
-def _paint(runs: Any, mask: Any) -> None:
+def _paint(runs: Any, values: Any, grid: Any) -> None:
     for r in range(len(runs)):
-        for k in range(runs[r, 2], runs[r, 3]):
-            mask[runs[r, 0], runs[r, 1], k] = True
+        if values[r]:
+            for k in range(runs[r, 2], runs[r, 3]):
+                grid[runs[r, 0], runs[r, 1], k] = values[r]

@@ -207,8 +207,8 @@ def _fill_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warni
     inside = (air.sizes * voxel_ml < MIN_OUTSIDE_ML) | (2 * denser > air.sizes)
     numbers = np.arange(len(inside))
     for number in np.flatnonzero(~inside & (2 * denser == air.sizes)):  # the median lies between two values
-        inside[number] = np.median(hu[air.mask(numbers == number)]) > OUTSIDE_AIR_HU
+        inside[number] = np.median(hu[air.painted(numbers == number)]) > OUTSIDE_AIR_HU
     if inside.any():
-        body |= air.mask(inside)
+        body |= air.painted(inside)
         total = (air.sizes * voxel_ml)[inside].sum()
         warnings.append(f"{total:.1f} ml of air at the border of the volume were taken as lung or gas inside the body")

@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
-from puncture_twin.planning.geometry.parts import middle_of
+from puncture_twin.planning.geometry.parts import middle_of, parts_of
 
 OPENING_MM = 6.0
 """Parts thinner than twice this are no trunk, head or limb: table tops, sheets, tubes."""
@@ -77,11 +77,19 @@ def thick_parts(mask: Bools, spacing_mm: Floats) -> Iterator[Piece]:
 def _coarse_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
     """Number the parts into which the ball fits, 1 the largest, and what lies near each; 0 elsewhere."""
     reach = np.ceil(OPENING_MM / spacing_mm).astype(int)
-    cores = _by_size(_eroded(np.pad(mask, [(r, r) for r in reach], mode="edge"), spacing_mm))
-    if not cores.any():
+    cores = parts_of(_eroded(np.pad(mask, [(r, r) for r in reach], mode="edge"), spacing_mm))
+    rank = np.argsort(np.argsort(-cores.sizes, kind="stable"), kind="stable").astype(np.int32)
+    numbers = cores.painted(rank + 1)
+    if not len(rank):
         return np.zeros(mask.shape, np.int32)
-    gap, nearest = scipy.ndimage.distance_transform_edt(cores == 0, sampling=spacing_mm, return_indices=True)
-    parts = np.where(gap <= CORNER * OPENING_MM + spacing_mm.max(), cores[tuple(nearest)], 0)
+    nearest = scipy.ndimage.distance_transform_edt(
+        numbers == 0, sampling=spacing_mm, return_distances=False, return_indices=True
+    )
+    gap = np.zeros(numbers.shape, np.float32)
+    for axis, at in enumerate(nearest):
+        along = np.moveaxis(at, axis, -1) - np.arange(numbers.shape[axis], dtype=np.int32)
+        gap += np.moveaxis(np.square(along * np.float32(spacing_mm[axis])), -1, axis)
+    parts = np.where(gap <= (CORNER * OPENING_MM + spacing_mm.max()) ** 2, numbers[tuple(nearest)], 0)
     return np.asarray(parts[tuple(slice(r, -r) for r in reach)])
 
 
@@ -133,16 +141,6 @@ def _side(limb: Piece, middle: Floats) -> str:
     if abs(away[0]) >= abs(away[1]):
         return "left of it" if away[0] > 0 else "right of it"
     return "behind it" if away[1] > 0 else "in front of it"
-
-
-def _by_size(mask: Bools) -> Ints32:
-    """Components of a mask, 1 the largest; 0 elsewhere."""
-    labels, count = scipy.ndimage.label(mask)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    sizes[0] = 0
-    rank = np.zeros(count + 1, np.int32)
-    rank[np.argsort(-sizes, kind="stable")[:count]] = np.arange(1, count + 1)
-    return rank[labels]
 
 
 def _one_section(part: Bools, slices: int) -> bool:

@@ -53,6 +53,8 @@ TILTS_FROM_MM = 100.0
 """From this length of the image on, a bed at an angle to the slices' axis is looked for too."""
 TILTS_RAD = np.radians(np.linspace(-4.0, 4.0, 17))
 """Of the bed against the slices' axis, across the lines of sight; along them any angle is found."""
+TILT_SAMPLING_MM = 4.0, 8.0
+"""Spacing of lines of sight and slices by which such an angle is sought; smoothed along the bed they hold all of it."""
 NEARLY = 0.95
 """A tilted bed explains more than a straight one only if more than this is drawn."""
 EDGE_MM = 40.0
@@ -341,6 +343,14 @@ class _Ends(NamedTuple):
         """Of the image, along the bed."""
         return float(self.ends_mm.shape[1] * self.spacing_mm[2])
 
+    def sampled(self) -> _Ends:
+        """Some of its lines of sight in some of its slices."""
+        axes = [1 - self.axis, 2]
+        step = np.maximum(1, (TILT_SAMPLING_MM / self.spacing_mm[axes]).astype(int))
+        spacing_mm, some = self.spacing_mm.copy(), np.s_[:: step[0], :: step[1]]
+        spacing_mm[axes] *= step
+        return self._replace(ends_mm=self.ends_mm[some], firm=self.firm[some], spacing_mm=spacing_mm)
+
 
 class _Bed(NamedTuple):
     """Ends of lines of sight (n,), mm, in slice 0 of a bed that may run at an angle to the slices' axis.
@@ -370,7 +380,7 @@ def drawn_sides(
     if trunk.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
         return ()
     parts = parts_of((hu > level) | trunk)
-    surfaces = surface_ends(hu, parts.mask(parts.counts(trunk) > 0), level)
+    surfaces = surface_ends(hu, parts.painted(parts.counts(trunk) > 0), level)
     views, middle_mm = [], middle_of(trunk) * spacing_mm
     for (axis, end), ends in surfaces.items():
         ends_mm = _smooth(ends * spacing_mm[axis], float(spacing_mm[2]))
@@ -423,6 +433,7 @@ def _own_bed(view: _Ends) -> _Bed:
     """The bed under whose direction most lines of sight of one side are drawn."""
     if view.length_mm < TILTS_FROM_MM:
         return _bed_at(view, (0.0, 0.0))
+    view = view.sampled()
     beds = [_bed_at(view, (0.0, 0.0))]
     for across in np.tan(sorted(TILTS_RAD, key=abs)):
         along = _commonest_slope(_sheared(view, across), float(view.spacing_mm[2]))
