@@ -210,9 +210,10 @@ class LimbSearch:
         reach = gap <= FLAT * radius + SLACK_MM
         along = _axis(np.argwhere(bones) * self.spacing_mm)[1] / self.spacing_mm
         steps = np.arange(-BEYOND_ENDS_MM, BEYOND_ENDS_MM + 1e-9, 0.5 * float(self.spacing_mm.min()))
-        beyond = np.zeros_like(bones)
-        for shift in np.unique(np.rint(steps[:, None] * along).astype(int), axis=0):
-            beyond |= _shifted(reach, shift)
+        line = np.rint(steps[:, None] * along).astype(int)
+        rod = np.zeros(2 * np.abs(line).max(axis=0) + 1, bool)
+        rod[tuple((line + np.array(rod.shape) // 2).T)] = True
+        beyond = scipy.ndimage.binary_dilation(reach, rod)
         return np.asarray(gap < radius) if beyond[self.at] else beyond
 
 
@@ -274,15 +275,6 @@ def _share(mask: Bools, stride: NDArray[np.int_]) -> Floats:
             found[: len(source[first::times])] += source[first::times]
         counts = np.moveaxis(found, 0, axis)
     return counts / most[0]
-
-
-def _shifted(mask: Bools, by: NDArray[np.int_]) -> Bools:
-    """The mask moved by whole voxels; False comes in."""
-    moved = np.zeros_like(mask)
-    into = tuple(slice(max(0, k), n + min(0, k)) for k, n in zip(by, mask.shape, strict=True))
-    out_of = tuple(slice(max(0, -k), n + min(0, -k)) for k, n in zip(by, mask.shape, strict=True))
-    moved[into] = mask[out_of]
-    return moved
 
 
 def _groups(mask: Bools, spacing_mm: Floats) -> Ints32:

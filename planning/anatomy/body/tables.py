@@ -217,44 +217,38 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
         side: Its far side.
         spacing_mm: Shape (3,).
     """
-    view = np.moveaxis(dense, side.axis, 0)[:: -1 if side.end else 1]
-    first = np.argmax(view, axis=0)
-    index = np.arange(len(view))[:, None, None]
-    after = np.argmax(~view & (index > first), axis=0)
-    thick_mm = np.where(after > first, after - first, np.inf) * spacing_mm[side.axis]
+    along_mm, across_mm = (float(spacing_mm[axis]) for axis in (side.axis, 1 - side.axis))
+    found, view = np.zeros(dense.shape, bool), np.moveaxis(dense, side.axis, 0)
+    first = ends_of(dense)[FACES.index(side.face)]
+    inward = np.arange(int(THICKEST_MM / along_mm) + 2)
+    index = first + (-1 if side.end else 1) * inward[:, None, None]
+    seen = (first >= 0) & (index >= 0) & (index < len(view))
+    seen &= np.take_along_axis(view, np.clip(index, 0, len(view) - 1), axis=0)
     lines = np.unique(np.clip(np.rint(side.across).astype(int), 0, view.shape[1] - 1))
-    at = np.full(view.shape[1], np.nan)
-    middle = np.array([_middle(row) for row in thick_mm[lines]])
-    same = np.abs(thick_mm[lines] - np.nan_to_num(middle, posinf=0.0)[:, None]) <= max(
-        ALIKE_MM / 2.0, 1.5 * float(spacing_mm[side.axis])
-    )
-    open_to_body = (same.mean(axis=1) >= DRAWN_FRACTION) & (middle <= THICKEST_MM)
-    at[lines[open_to_body]] = middle[open_to_body]
-    run = max(2, int(RUN_MM / spacing_mm[1 - side.axis]))
-    edges = [_seen_edge(at[lines], run), _seen_edge(at[lines][::-1], run)]
-    found = np.zeros(dense.shape, bool)
-    if any(edge is None for edge in edges) or not (~open_to_body).any():
+    thick_mm = np.where(seen.all(axis=0), np.inf, np.argmin(seen, axis=0) * along_mm)[lines]
+    middle = np.median(thick_mm, axis=1)
+    alike_mm = max(ALIKE_MM / 2.0, 1.5 * along_mm)
+    alike = (thick_mm >= middle[:, None] - alike_mm) & (thick_mm <= middle[:, None] + alike_mm)
+    open_to_body = (alike.mean(axis=1) >= DRAWN_FRACTION) & (middle <= THICKEST_MM)
+    at = np.where(open_to_body, middle, np.nan)
+    run = max(2, int(RUN_MM / across_mm))
+    edges = [_seen_edge(at, run), _seen_edge(at[::-1], run)]
+    if not all(edges) or open_to_body.all():
         return found
-    known = np.isfinite(at)
-    table_mm = np.interp(np.arange(len(at)), np.flatnonzero(known), at[known], left=0.0, right=0.0)
-    table_mm = np.minimum(table_mm, max(edge for edge in edges if edge is not None) + ALIKE_MM)
-    within = (index >= first) & ((index - first) * spacing_mm[side.axis] < table_mm[:, None] - 1e-6)
-    turned = (within & view)[:: -1 if side.end else 1]
-    return np.asarray(np.moveaxis(turned, 0, side.axis))
+    table_mm = np.interp(np.arange(view.shape[1]), lines[open_to_body], middle[open_to_body], left=0.0, right=0.0)
+    table_mm = np.minimum(table_mm, max(edges) + ALIKE_MM)
+    deep, line, k = np.nonzero(seen & (inward[:, None, None] * along_mm < table_mm[:, None] - 1e-6))
+    np.moveaxis(found, side.axis, 0)[index[deep, line, k], line, k] = True
+    return found
 
 
-def _middle(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else np.inf
-
-
-def _seen_edge(thick_mm: Floats, run: int) -> float | None:
-    """How thick a table is at its first edge, where it is seen in a run of lines and is as thick all along it."""
+def _seen_edge(thick_mm: Floats, run: int) -> float:
+    """How thick a table is at its first edge, where it is seen in a run of lines and is as thick all along it; or 0."""
     seen = np.flatnonzero(np.isfinite(thick_mm))
     first = thick_mm[seen[0] : seen[0] + run] if len(seen) else thick_mm[:0]
     known = first[np.isfinite(first)]
     enough = len(known) >= 0.8 * run and float(np.ptp(known)) <= 2.0 * ALIKE_MM
-    return float(np.median(known)) if enough else None
+    return float(np.median(known)) if enough else 0.0
 
 
 def flat_sides(hu: NDArray[np.floating], body: Bools, spacing_mm: Floats, level: float = 0.0) -> tuple[TableSide, ...]:
@@ -381,11 +375,7 @@ def drawn_sides(
         return ()
     parts = parts_of((hu > level) | trunk)
     surfaces = surface_ends(hu, parts.painted(parts.counts(trunk) > 0), level)
-    views, middle_mm = [], middle_of(trunk) * spacing_mm
-    for (axis, end), ends in surfaces.items():
-        ends_mm = _smooth(ends * spacing_mm[axis], float(spacing_mm[2]))
-        views.append(_Ends(axis, end, ends_mm, np.isfinite(ends_mm), spacing_mm, DRAWN_MM, middle_mm))
-    sides = _sides(views)
+    sides = _sides(_views(surfaces, trunk, spacing_mm))
     return tuple(side._replace(edge_mm=EDGE_MM) if side.whole else side for side in sides)
 
 
@@ -400,26 +390,33 @@ def support_side(outside: Bools, body: Bools, spacing_mm: Floats) -> TableSide |
         body: Same shape.
         spacing_mm: Shape (3,).
     """
-    views, middle_mm = [], middle_of(body) * spacing_mm
-    for (axis, end), first, own in zip(FACES, ends_of(outside | body), ends_of(outside), strict=True):
-        at = np.where(first < 0, np.nan, first + (0.5 if end else -0.5))  # the voxel's outer face
-        ends_mm = _smooth(at * spacing_mm[axis], float(spacing_mm[2]))
-        near_mm = max(DRAWN_MM, float(spacing_mm[axis]))
-        firm = np.isfinite(ends_mm) & (own == first)
-        views.append(_Ends(axis, end, ends_mm, firm, spacing_mm, near_mm, middle_mm))
-    sides = [side for side in _sides(views) if side.whole]
+    surfaces, own = {}, {}
+    for face, first, outer in zip(FACES, ends_of(outside | body), ends_of(outside), strict=True):
+        surfaces[face] = np.where(first < 0, np.nan, first + (0.5 if face[1] else -0.5))  # the voxel's outer face
+        own[face] = outer == first
+    sides = [side for side in _sides(_views(surfaces, body, spacing_mm, own)) if side.whole]
     return max(sides, key=lambda side: side.width_mm, default=None)
 
 
+def _views(
+    surfaces: dict[Side, Floats], body: Bools, spacing_mm: Floats, own: dict[Side, Bools] | None = None
+) -> list[_Ends]:
+    """What is seen of surfaces from each side; where ``own`` says which ends count, they are known to a voxel."""
+    views, middle_mm = [], middle_of(body) * spacing_mm
+    for (axis, end), ends in surfaces.items():
+        ends_mm = _smooth(ends * spacing_mm[axis], float(spacing_mm[2]))
+        firm = np.isfinite(ends_mm) & (True if own is None else own[axis, end])
+        near_mm = DRAWN_MM if own is None else max(DRAWN_MM, float(spacing_mm[axis]))
+        views.append(_Ends(axis, end, ends_mm, firm, spacing_mm, near_mm, middle_mm))
+    return views
+
+
 def _sides(views: Sequence[_Ends]) -> tuple[TableSide, ...]:
-    """The drawn sides of one bed: of the directions that each side suggests, the one under which most is drawn."""
+    """The drawn sides of one bed."""
     if views[0].length_mm < LEAST_LENGTH_MM:
         return ()
-    suggested = [bed.slopes for bed in map(_own_bed, views) if bed.width_mm >= DRAWN_WIDTH_MM]
-    found = [[_bed_at(view, slopes) for view in views] for slopes in [(0.0, 0.0), *suggested]]
-    widths = [sum(bed.width_mm for bed in beds) for beds in found]
-    nearly = [beds for beds, width in zip(found, widths, strict=True) if width >= NEARLY * max(widths)]
-    beds = min(nearly, key=lambda beds: np.hypot(*beds[0].slopes))
+    slopes = _direction([view.sampled() for view in views])
+    beds = [_bed_at(view, slopes) for view in views]
     tables = [bed.width_mm >= DRAWN_WIDTH_MM for bed in beds]
     sides = []
     for view, bed, table in zip(views, beds, tables, strict=True):
@@ -429,22 +426,18 @@ def _sides(views: Sequence[_Ends]) -> tuple[TableSide, ...]:
     return tuple(side for side in sides if side is not None)
 
 
-def _own_bed(view: _Ends) -> _Bed:
-    """The bed under whose direction most lines of sight of one side are drawn."""
-    if view.length_mm < TILTS_FROM_MM:
-        return _bed_at(view, (0.0, 0.0))
-    view = view.sampled()
-    beds = [_bed_at(view, (0.0, 0.0))]
-    for across in np.tan(sorted(TILTS_RAD, key=abs)):
-        along = _commonest_slope(_sheared(view, across), float(view.spacing_mm[2]))
-        beds.append(_bed_at(view, (along, across) if view.axis == 0 else (across, along)))
-    return _straightest(beds)
-
-
-def _straightest(beds: Sequence[_Bed]) -> _Bed:
-    """Of the beds under which nearly most is drawn the one with the least tilt."""
-    most = max(bed.width_mm for bed in beds)
-    return min((bed for bed in beds if bed.width_mm >= NEARLY * most), key=lambda bed: np.hypot(*bed.slopes))
+def _direction(views: Sequence[_Ends]) -> tuple[float, float]:
+    """A bed's slopes under which most is drawn at all sides; of those under which nearly most is, the least."""
+    slopes = {(0.0, 0.0)}
+    for view in views if views[0].length_mm >= TILTS_FROM_MM else ():
+        for across in np.tan(TILTS_RAD):
+            along = _commonest_slope(_sheared(view, across), float(view.spacing_mm[2]))
+            tilt = (along, float(across)) if view.axis == 0 else (float(across), along)
+            if _bed_at(view, tilt).width_mm >= DRAWN_WIDTH_MM:
+                slopes.add(tilt)
+    widths = {tilt: sum(_bed_at(view, tilt).width_mm for view in views) for tilt in slopes}
+    most = max(widths.values())
+    return min((tilt for tilt, width in widths.items() if width >= NEARLY * most), key=lambda tilt: np.hypot(*tilt))
 
 
 def _smooth(ends_mm: Floats, step_mm: float) -> Floats:
