@@ -7,7 +7,7 @@ whatever lies behind it, and what lies behind it is left out: the image ends the
 
 What cannot be told: where the case says that it shows a phantom, one that ends flat is taken to be whole, unless a
 structure ends there that does not run through it from end to end; and a face at one of the bed's sides that cuts no
-organ may as well be pressed on something (`puncture_twin.planning.anatomy.body.flat_side`). The key ``cut`` of the skin
+organ may as well be pressed on something (`puncture_twin.planning.anatomy.body.tables`). The key ``cut`` of the skin
 says what is right.
 """
 

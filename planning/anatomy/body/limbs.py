@@ -21,8 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.body.body_mask import CtImage
-from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
+from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, CtImage
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
