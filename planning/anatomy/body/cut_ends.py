@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.parts import slice_counts
 
 SIDES: Mapping[str, tuple[int, int]] = MappingProxyType(
     {"right": (0, 0), "left": (0, 1), "front": (1, 0), "back": (1, 1), "feet": (2, 0), "head": (2, 1)}
@@ -130,8 +131,7 @@ def content_of(dense: Bools, T_ct_index: Floats) -> Content:
     spacing_mm = spacing_of(T_ct_index)
     last, area = np.zeros((3, 2), np.int64), np.zeros((3, 2))
     thick, wide = np.zeros((3, 2), bool), np.zeros((3, 2), bool)
-    lines = dense.sum(axis=0, dtype=np.uint32)
-    counts = [np.array([np.count_nonzero(plane) for plane in dense]), lines.sum(axis=1), lines.sum(axis=0)]
+    counts = slice_counts(dense)
     for axis in range(3):
         step_mm, across_mm = float(spacing_mm[axis]), np.delete(spacing_mm, axis)
         areas = counts[axis] * float(np.prod(across_mm))
