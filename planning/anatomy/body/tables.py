@@ -427,15 +427,13 @@ def _sides(views: Sequence[_Ends]) -> tuple[TableSide, ...]:
 
 
 def _direction(views: Sequence[_Ends]) -> tuple[float, float]:
-    """A bed's slopes under which most is drawn at all sides; of those under which nearly most is, the least."""
-    slopes = {(0.0, 0.0)}
+    """A bed's slopes under which most is drawn at one side; of those under which nearly most is, the least."""
+    widths = {(0.0, 0.0): max(_bed_at(view, (0.0, 0.0)).width_mm for view in views)}
     for view in views if views[0].length_mm >= TILTS_FROM_MM else ():
         for across in np.tan(TILTS_RAD):
             along = _commonest_slope(_sheared(view, across), float(view.spacing_mm[2]))
             tilt = (along, float(across)) if view.axis == 0 else (float(across), along)
-            if _bed_at(view, tilt).width_mm >= DRAWN_WIDTH_MM:
-                slopes.add(tilt)
-    widths = {tilt: sum(_bed_at(view, tilt).width_mm for view in views) for tilt in slopes}
+            widths[tilt] = max(widths.get(tilt, 0.0), _bed_at(view, tilt).width_mm)
     most = max(widths.values())
     return min((tilt for tilt, width in widths.items() if width >= NEARLY * most), key=lambda tilt: np.hypot(*tilt))
 
