@@ -6,7 +6,6 @@ import SimpleITK as sitk  # noqa: N813
 from places import REAL_CT
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, body_mask
-from puncture_twin.planning.anatomy.body.detached_parts import largest_component
 from puncture_twin.planning.anatomy.body.outside_body import OutsideImage, outside_mask
 from puncture_twin.planning.anatomy.body.tables import (
     Shown,
@@ -16,6 +15,7 @@ from puncture_twin.planning.anatomy.body.tables import (
     support_warnings,
     touching_tables,
 )
+from puncture_twin.planning.geometry.parts import largest_part
 
 CT = REAL_CT / "ct.nii.gz"
 SPACING = np.array([4.0, 4.0, 5.0])
@@ -153,7 +153,7 @@ def test_a_table_that_touches_a_phantom_is_cut_off_and_the_phantom_is_whole(kind
     table_mm = np.minimum(12.0 - np.abs(Y - BOTTOM_MM[kind] - 12.0), 150.0 - np.abs(X - 198.0))
     scene = noisy(np.maximum(phantom, 500.0 * np.clip(table_mm, -4.0, 4.0) / 4.0))
     found = touching_tables(scene, scene > 0.0, SPACING, Shown(phantom=True))
-    left = largest_component((scene > 0.0) & ~found.cut_off)
+    left = largest_part((scene > 0.0) & ~found.cut_off)
     wrong = left ^ (noisy(phantom) > 0.0)
     assert found.sides == ()
     assert wrong.sum() <= 0.02 * left.sum()

@@ -1,28 +1,31 @@
-"""Which voxels of a CT are the patient: trunk and limbs without table and sheets, solid, lungs and gas included."""
+"""Which voxels of a CT are the patient: trunk and limbs without table and sheets, solid, lungs and gas included.
+
+A limb that does not touch the trunk is of soft tissue and holds bone, or changes its section along the bed. A table
+does neither: it is one section, drawn along the bed. What is taken for neither stays outside of the body, where
+nothing dense counts as air (`puncture_twin.planning.anatomy.body.outside_body`).
+"""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.cut_ends import Box, Content, content_of, shifted, spacing_of
-from puncture_twin.planning.anatomy.body.detached_parts import (
-    detached_limbs,
-    largest_component,
-    limb_warnings,
-    thick_parts,
-)
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown, TableSide, touching_tables
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned, measured_hu
-from puncture_twin.planning.base.arrays import Bools, Floats, counts_of, grown
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, grown
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.parts import largest_part, middle_of, parts_of
 
 BODY_HU = -500.0
 """Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
@@ -33,8 +36,23 @@ MIN_OUTSIDE_ML = 50.0
 """A smaller air region at the border may be bowel gas that the field of view cuts."""
 MIN_BODY_ML = 100.0
 """Less than a tenth of a newborn's head: something else was found."""
-IN_SLICE = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], bool)[..., None] & np.array([False, True, False])
-"""Voxels of one slice that share an edge are neighbours."""
+OPENING_MM = 6.0
+"""Parts thinner than twice this are no trunk, head or limb: table tops, sheets, tubes."""
+CORNER = 3.0**0.5
+"""So many times as far from where the ball fits a box's corner lies: it belongs to the box."""
+SAMPLING_MM = 3.0
+"""Spacing at which the opening is done: half its radius."""
+MIN_LIMB_ML = 20.0
+"""Smaller than a newborn's forearm (some 25 ml): hands of adults, cushions and lines are left to the outside."""
+SOFT_TISSUE_HU = (-150.0, 150.0)
+"""Fat at -100, muscle at 50, both with noise: the median of a limb lies between. Foam, wood and metal do not."""
+BONE_HU = 200.0
+"""Above soft tissue with contrast in its vessels; cortical bone has 500 and more."""
+MIN_BONE_ML = 1.0
+"""Some 10 mm of an adult's radius."""
+ALIKE = 0.9
+"""Overlap (intersection over union) of sections with the median one, from which on a part is one section drawn along
+the bed."""
 PADDED = (
     "where nothing was scanned the image is filled up with one value, and that cuts the body; no skin is known there, "
     "no body that the arm could meet, and what is filled up is unknown_region (outside_body)"
@@ -163,8 +181,10 @@ def _found(
 ) -> tuple[Bools, tuple[TableSide, ...], list[str]]:
     """The body with all that was filled, the tables that touch it, and what the user should know."""
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
-    solids = thick_parts(hu > BODY_HU, spacing_mm)
-    trunk = largest_component(solids == 1)
+    dense = hu > BODY_HU
+    trunk, parts = np.zeros(hu.shape, bool), thick_parts(dense, spacing_mm)
+    for first in itertools.islice(parts, 1):
+        trunk[first.box] = largest_part(first.mask)
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
         allowed = f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
@@ -172,43 +192,166 @@ def _found(
     warnings: list[str] = []
     tables: tuple[TableSide, ...] = ()
     if shown.tables:
-        touching = touching_tables(hu - BODY_HU, trunk, spacing_mm, shown)
+        touching = touching_tables(hu, trunk, spacing_mm, shown, level=BODY_HU)
         tables, warnings = touching.sides, list(touching.warnings)
         if touching.cut_off.any():
-            solids[touching.cut_off] = 0
-            trunk = largest_component(trunk & ~touching.cut_off)
-    limbs = detached_limbs(hu, solids, spacing_mm) if shown.limbs else ()
-    del solids  # four bytes a voxel
+            dense &= ~touching.cut_off  # what is left of parts is still drawn from it
+            trunk = largest_part(trunk & dense)
+    limbs = detached_limbs(hu, parts if shown.limbs else (), spacing_mm)
     warnings += limb_warnings(limbs, trunk, voxel_ml)
     filled = filled_slices(trunk)
-    for limb in limbs:
-        filled |= filled_slices(limb)
-    body = _with_cut_lungs(filled, hu, voxel_ml, warnings)
-    if body.all():
+    for box, limb in limbs:
+        filled[box] |= filled_slices(limb)
+    _fill_cut_lungs(filled, hu, voxel_ml, warnings)
+    if filled.all():
         raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
-    return body, tables, warnings
+    return filled, tables, warnings
 
 
 def filled_slices(mask: Bools) -> Bools:
-    """The mask with every hole filled that it encloses in a slice across axis 2."""
-    air, count = scipy.ndimage.label(~mask, IN_SLICE)
-    outside = np.zeros(count + 1, bool)
-    for border in (air[0], air[-1], air[:, 0], air[:, -1]):
-        outside[border] = True
-    outside[0] = False
-    return ~outside[air]
+    """The mask with every hole filled that it encloses in a slice across axis 2: what no way within it leads out of."""
+    air = np.packbits(~mask, axis=2)  # eight slices at a time
+    outside = np.zeros_like(air)
+    ways = [(outside.swapaxes(0, axis)[::step], air.swapaxes(0, axis)[::step]) for axis in (0, 1) for step in (1, -1)]
+    for reached, free in ways:
+        reached[0] = free[0]
+    before = None
+    while before is None or not np.array_equal(before, outside):
+        before = outside.copy()
+        for reached, free in ways:
+            for k in range(1, len(free)):
+                reached[k] |= reached[k - 1] & free[k]
+    return ~np.unpackbits(outside, axis=2, count=mask.shape[2]).view(bool)
 
 
-def _with_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> Bools:
+def _fill_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> None:
     """Fills air regions that are not the room: small ones, and those with the density of lung."""
-    labels, count = scipy.ndimage.label(~body)
-    sizes, denser = counts_of(labels, count), counts_of(labels, count, hu > OUTSIDE_AIR_HU)
-    inside = (sizes * voxel_ml < MIN_OUTSIDE_ML) | (2 * denser > sizes)
-    for number in np.flatnonzero(~inside & (2 * denser == sizes)):  # the median lies between two values
-        inside[number] = np.median(hu[labels == number]) > OUTSIDE_AIR_HU
-    inside[0] = False
-    if not inside.any():
-        return body
-    total = (sizes * voxel_ml)[inside].sum()
-    warnings.append(f"{total:.1f} ml of air at the border of the volume were taken as lung or gas inside the body")
-    return np.asarray(body | inside[labels])
+    air = parts_of(~body)
+    denser = air.counts(hu > OUTSIDE_AIR_HU)
+    inside = (air.sizes * voxel_ml < MIN_OUTSIDE_ML) | (2 * denser > air.sizes)
+    numbers = np.arange(len(inside))
+    for number in np.flatnonzero(~inside & (2 * denser == air.sizes)):  # the median lies between two values
+        inside[number] = np.median(hu[air.painted(numbers == number)]) > OUTSIDE_AIR_HU
+    if inside.any():
+        body |= air.painted(inside)
+        total = (air.sizes * voxel_ml)[inside].sum()
+        warnings.append(f"{total:.1f} ml of air at the border of the volume were taken as lung or gas inside the body")
+
+
+class Piece(NamedTuple):
+    """A part of what a CT shows.
+
+    Attributes:
+        box: Of the image, in which it lies.
+        mask: Shape of the box.
+    """
+
+    box: tuple[slice, ...]
+    mask: Bools
+
+
+def thick_parts(mask: Bools, spacing_mm: Floats) -> Iterator[Piece]:
+    """The parts of a mask into which a ball of ``OPENING_MM`` fits, with what lies near each, the largest first.
+
+    The border counts as mask. Fine images are sampled: where a table ends and an arm begins is a coarse question. Of
+    others than the first only those that may be as large as a limb.
+
+    Args:
+        mask: Shape (nx, ny, nz).
+        spacing_mm: Shape (3,).
+    """
+    stride = np.maximum(1, (SAMPLING_MM / spacing_mm).astype(int))
+    parts = _coarse_parts(mask[:: stride[0], :: stride[1], :: stride[2]], spacing_mm * stride)
+    most_ml = np.bincount(parts.ravel()) * float(np.prod(stride * spacing_mm)) / 1000.0
+    for number, coarse in enumerate(scipy.ndimage.find_objects(parts), start=1):
+        if number > 1 and most_ml[number] < MIN_LIMB_ML:
+            continue
+        ends = zip(coarse, stride, mask.shape, strict=True)
+        box = tuple(slice(one.start * step, min(one.stop * step, size)) for one, step, size in ends)
+        whole = parts[coarse] == number
+        for axis in (2, 1, 0):
+            whole = whole.repeat(stride[axis], axis=axis)
+        inside = mask[box]
+        yield Piece(box, inside & whole[tuple(map(slice, inside.shape))])
+
+
+def _coarse_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
+    """Number the parts into which the ball fits, 1 the largest, and what lies near each; 0 elsewhere."""
+    reach = np.ceil(OPENING_MM / spacing_mm).astype(int)
+    cores = parts_of(_eroded(np.pad(mask, [(r, r) for r in reach], mode="edge"), spacing_mm))
+    rank = np.argsort(np.argsort(-cores.sizes, kind="stable"), kind="stable").astype(np.int32)
+    numbers = cores.painted(rank + 1)
+    if not len(rank):
+        return np.zeros(mask.shape, np.int32)
+    nearest = scipy.ndimage.distance_transform_edt(
+        numbers == 0, sampling=spacing_mm, return_distances=False, return_indices=True
+    )
+    gap = np.zeros(numbers.shape, np.float32)
+    for axis, at in enumerate(nearest):
+        along = np.moveaxis(at, axis, -1) - np.arange(numbers.shape[axis], dtype=np.int32)
+        gap += np.moveaxis(np.square(along * np.float32(spacing_mm[axis])), -1, axis)
+    parts = np.where(gap <= (CORNER * OPENING_MM + spacing_mm.max()) ** 2, numbers[tuple(nearest)], 0)
+    return np.asarray(parts[tuple(slice(r, -r) for r in reach)])
+
+
+def _eroded(mask: Bools, spacing_mm: Floats) -> Bools:
+    """Where the ball fits."""
+    fits, size = mask.copy(), mask.shape
+    reach = np.floor(OPENING_MM / spacing_mm).astype(int)
+    for by in itertools.product(*(range(-r, r + 1) for r in reach)):
+        if np.linalg.norm(by * spacing_mm) <= OPENING_MM:
+            into = tuple(slice(max(0, -k), n - max(0, k)) for k, n in zip(by, size, strict=True))
+            out_of = tuple(slice(max(0, k), n - max(0, -k)) for k, n in zip(by, size, strict=True))
+            fits[into] &= mask[out_of]
+    return fits
+
+
+def detached_limbs(hu: NDArray[np.float32], parts: Iterable[Piece], spacing_mm: Floats) -> tuple[Piece, ...]:
+    """Those of some parts beside the trunk that are of the patient.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the bed.
+        parts: As `thick_parts` finds them.
+        spacing_mm: Shape (3,).
+    """
+    voxel_ml = float(np.prod(spacing_mm)) / 1000.0
+    limbs = []
+    for part in parts:
+        values = hu[part.box][part.mask]
+        if len(values) * voxel_ml < MIN_LIMB_ML:
+            continue
+        low, high = SOFT_TISSUE_HU
+        soft = low <= float(np.median(values)) <= high
+        bone_ml = np.count_nonzero(values > BONE_HU) * voxel_ml
+        if soft and (bone_ml >= MIN_BONE_ML or not _one_section(part.mask, hu.shape[2])):
+            limbs.append(part)
+    return tuple(limbs)
+
+
+def limb_warnings(limbs: Sequence[Piece], trunk: Bools, voxel_ml: float) -> Iterator[str]:
+    """One sentence that names every detached part, where there is one."""
+    if limbs:
+        middle = middle_of(trunk)
+        named = [f"{_side(limb, middle)} ({np.count_nonzero(limb.mask) * voxel_ml:.0f} ml)" for limb in limbs]
+        yield f"parts that do not touch the trunk (arms, legs?) count as body: {', '.join(named)}"
+
+
+def _side(limb: Piece, middle: Floats) -> str:
+    """Where a part lies, seen from the trunk; axes run to the left and to the back."""
+    away = middle_of(limb.mask) + [one.start for one in limb.box] - middle
+    if abs(away[0]) >= abs(away[1]):
+        return "left of it" if away[0] > 0 else "right of it"
+    return "behind it" if away[1] > 0 else "in front of it"
+
+
+def _one_section(part: Bools, slices: int) -> bool:
+    """Whether the part is the same in nearly every slice of the image, as a table is."""
+    present = part.any(axis=(0, 1))
+    if np.count_nonzero(present) < ALIKE * slices:
+        return False
+    section = part[:, :, present].mean(axis=2) > 0.5
+    both = (part & section[:, :, None]).sum(axis=(0, 1))
+    either = (part | section[:, :, None]).sum(axis=(0, 1))
+    alike = np.zeros(slices)
+    alike[: len(both)] = both / np.maximum(either, 1)
+    return bool(np.mean(alike) > ALIKE)

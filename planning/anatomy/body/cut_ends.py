@@ -7,7 +7,7 @@ whatever lies behind it, and what lies behind it is left out: the image ends the
 
 What cannot be told: where the case says that it shows a phantom, one that ends flat is taken to be whole, unless a
 structure ends there that does not run through it from end to end; and a face at one of the bed's sides that cuts no
-organ may as well be pressed on something (`puncture_twin.planning.anatomy.body.flat_side`). The key ``cut`` of the skin
+organ may as well be pressed on something (`puncture_twin.planning.anatomy.body.tables`). The key ``cut`` of the skin
 says what is right.
 """
 
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.parts import slice_counts
 
 SIDES: Mapping[str, tuple[int, int]] = MappingProxyType(
     {"right": (0, 0), "left": (0, 1), "front": (1, 0), "back": (1, 1), "feet": (2, 0), "head": (2, 1)}
@@ -130,8 +131,7 @@ def content_of(dense: Bools, T_ct_index: Floats) -> Content:
     spacing_mm = spacing_of(T_ct_index)
     last, area = np.zeros((3, 2), np.int64), np.zeros((3, 2))
     thick, wide = np.zeros((3, 2), bool), np.zeros((3, 2), bool)
-    lines = dense.sum(axis=0, dtype=np.uint32)
-    counts = [np.array([np.count_nonzero(plane) for plane in dense]), lines.sum(axis=1), lines.sum(axis=0)]
+    counts = slice_counts(dense)
     for axis in range(3):
         step_mm, across_mm = float(spacing_mm[axis]), np.delete(spacing_mm, axis)
         areas = counts[axis] * float(np.prod(across_mm))

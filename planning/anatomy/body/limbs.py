@@ -21,8 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.body.body_mask import CtImage
-from puncture_twin.planning.anatomy.body.detached_parts import BONE_HU, MIN_BONE_ML
+from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, CtImage
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
@@ -210,9 +209,10 @@ class LimbSearch:
         reach = gap <= FLAT * radius + SLACK_MM
         along = _axis(np.argwhere(bones) * self.spacing_mm)[1] / self.spacing_mm
         steps = np.arange(-BEYOND_ENDS_MM, BEYOND_ENDS_MM + 1e-9, 0.5 * float(self.spacing_mm.min()))
-        beyond = np.zeros_like(bones)
-        for shift in np.unique(np.rint(steps[:, None] * along).astype(int), axis=0):
-            beyond |= _shifted(reach, shift)
+        line = np.rint(steps[:, None] * along).astype(int)
+        rod = np.zeros(2 * np.abs(line).max(axis=0) + 1, bool)
+        rod[tuple((line + np.array(rod.shape) // 2).T)] = True
+        beyond = scipy.ndimage.binary_dilation(reach, rod)
         return np.asarray(gap < radius) if beyond[self.at] else beyond
 
 
@@ -261,23 +261,19 @@ def _axis(points: Floats) -> tuple[Floats, Floats]:
     return middle, np.linalg.svd(points - middle, full_matrices=False)[2][0]
 
 
-def _share(mask: Bools, stride: NDArray[np.int_]) -> NDArray[np.float32]:
+def _share(mask: Bools, stride: NDArray[np.int_]) -> Floats:
     """How much of each block a mask fills; 0..1."""
-    share: NDArray[np.float32] = mask.astype(np.float32)
+    counts: NDArray[np.integer] = mask.view(np.uint8)
+    most = np.ones(1)
     for axis, times in enumerate(stride):
-        starts = np.arange(0, mask.shape[axis], times)
-        counts = np.diff(np.append(starts, mask.shape[axis])).reshape([-1 if k == axis else 1 for k in range(3)])
-        share = np.asarray(np.add.reduceat(share, starts, axis=axis) / counts.astype(np.float32))
-    return share
-
-
-def _shifted(mask: Bools, by: NDArray[np.int_]) -> Bools:
-    """The mask moved by whole voxels; False comes in."""
-    moved = np.zeros_like(mask)
-    into = tuple(slice(max(0, k), n + min(0, k)) for k, n in zip(by, mask.shape, strict=True))
-    out_of = tuple(slice(max(0, -k), n + min(0, -k)) for k, n in zip(by, mask.shape, strict=True))
-    moved[into] = mask[out_of]
-    return moved
+        blocks = np.add.reduceat(np.ones(mask.shape[axis]), np.arange(0, mask.shape[axis], times))
+        most = most[..., None] * blocks
+        source = np.moveaxis(counts, axis, 0)
+        found = np.zeros((len(blocks), *source.shape[1:]), np.min_scalar_type(int(np.prod(stride))))
+        for first in range(times):
+            found[: len(source[first::times])] += source[first::times]
+        counts = np.moveaxis(found, 0, axis)
+    return counts / most[0]
 
 
 def _groups(mask: Bools, spacing_mm: Floats) -> Ints32:

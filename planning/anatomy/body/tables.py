@@ -12,7 +12,7 @@ A body that has one section at all four sides is no table, whatever it lies on: 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.geometry.parts import ends_of, middle_of, parts_of
 
 FLAT_MM = 1.0
 """A side is flat where it keeps within this of one plane; noise moves the surface of a 5 mm voxel by some 0.2 mm."""
@@ -52,6 +53,8 @@ TILTS_FROM_MM = 100.0
 """From this length of the image on, a bed at an angle to the slices' axis is looked for too."""
 TILTS_RAD = np.radians(np.linspace(-4.0, 4.0, 17))
 """Of the bed against the slices' axis, across the lines of sight; along them any angle is found."""
+TILT_SAMPLING_MM = 4.0, 8.0
+"""Spacing of lines of sight and slices by which such an angle is sought; smoothed along the bed they hold all of it."""
 NEARLY = 0.95
 """A tilted bed explains more than a straight one only if more than this is drawn."""
 EDGE_MM = 40.0
@@ -163,28 +166,34 @@ class Touching(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def touching_tables(above: NDArray[np.floating], trunk: Bools, spacing_mm: Floats, shown: Shown = PATIENT) -> Touching:
+def touching_tables(
+    hu: NDArray[np.floating], trunk: Bools, spacing_mm: Floats, shown: Shown = PATIENT, level: float = 0.0
+) -> Touching:
     """The tables that hold together with a body.
 
     Args:
-        above: Shape (nx, ny, nz), Hounsfield units above those of the body's surface, axis 2 along the bed.
+        hu: Shape (nx, ny, nz), axis 2 along the bed.
         trunk: Same shape; what is as dense and connected with it counts too, however thin.
         spacing_mm: Shape (3,).
         shown: What a person says: a phantom may end in one section, and only what can be cut off it is a table, unless
             there is said to be one.
+        level: Where the body's surface is, of the values.
     """
-    drawn = drawn_sides(above, trunk, spacing_mm)
+    dense = hu > level
+    drawn = drawn_sides(hu, trunk, spacing_mm, level)
     cut_off, said, cut = np.zeros(trunk.shape, bool), list[str](), set[Side]()
     for side in (side for side in drawn if side.whole):
-        table = table_beside(above > 0.0, side, spacing_mm)
+        table = table_beside(dense, side, spacing_mm)
         if table.any():
             thick_mm = float(np.median(table.sum(axis=side.axis)[table.any(axis=side.axis)])) * spacing_mm[side.axis]
             said.append(CUT_OFF.format(thick=thick_mm, name=SIDES[side.face]))
             cut_off |= table
             cut.add(side.face)
     if cut:
-        drawn = drawn_sides(np.where(cut_off, -np.abs(above), above), trunk & ~cut_off, spacing_mm)
-    flat = flat_sides(above, trunk & ~cut_off, spacing_mm)
+        trunk = trunk & ~cut_off
+        hu = np.where(cut_off, level - np.abs(hu - level), hu)
+        drawn = drawn_sides(hu, trunk, spacing_mm, level)
+    flat = flat_sides(hu, trunk, spacing_mm, level)
     prism = {side.face for side in (*flat, *drawn) if side.whole} == set(FACES)
     if (shown.phantom or prism) and shown.table != "present":
         return Touching(cut_off, (), tuple(said) if shown.phantom else (*said, PRISM))
@@ -208,61 +217,48 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
         side: Its far side.
         spacing_mm: Shape (3,).
     """
-    view = np.moveaxis(dense, side.axis, 0)[:: -1 if side.end else 1]
-    first = np.argmax(view, axis=0)
-    index = np.arange(len(view))[:, None, None]
-    after = np.argmax(~view & (index > first), axis=0)
-    thick_mm = np.where(after > first, after - first, np.inf) * spacing_mm[side.axis]
+    along_mm, across_mm = (float(spacing_mm[axis]) for axis in (side.axis, 1 - side.axis))
+    found, view = np.zeros(dense.shape, bool), np.moveaxis(dense, side.axis, 0)
+    first = ends_of(dense)[FACES.index(side.face)]
+    inward = np.arange(int(THICKEST_MM / along_mm) + 2)
+    index = first + (-1 if side.end else 1) * inward[:, None, None]
+    seen = (first >= 0) & (index >= 0) & (index < len(view))
+    seen &= np.take_along_axis(view, np.clip(index, 0, len(view) - 1), axis=0)
     lines = np.unique(np.clip(np.rint(side.across).astype(int), 0, view.shape[1] - 1))
-    at = np.full(view.shape[1], np.nan)
-    middle = np.array([_middle(row) for row in thick_mm[lines]])
-    same = np.abs(thick_mm[lines] - np.nan_to_num(middle, posinf=0.0)[:, None]) <= max(
-        ALIKE_MM / 2.0, 1.5 * float(spacing_mm[side.axis])
-    )
-    open_to_body = (same.mean(axis=1) >= DRAWN_FRACTION) & (middle <= THICKEST_MM)
-    at[lines[open_to_body]] = middle[open_to_body]
-    run = max(2, int(RUN_MM / spacing_mm[1 - side.axis]))
-    edges = [_seen_edge(at[lines], run), _seen_edge(at[lines][::-1], run)]
-    found = np.zeros(dense.shape, bool)
-    if any(edge is None for edge in edges) or not (~open_to_body).any():
+    thick_mm = np.where(seen.all(axis=0), np.inf, np.argmin(seen, axis=0) * along_mm)[lines]
+    middle = np.median(thick_mm, axis=1)
+    alike_mm = max(ALIKE_MM / 2.0, 1.5 * along_mm)
+    alike = (thick_mm >= middle[:, None] - alike_mm) & (thick_mm <= middle[:, None] + alike_mm)
+    open_to_body = (alike.mean(axis=1) >= DRAWN_FRACTION) & (middle <= THICKEST_MM)
+    at = np.where(open_to_body, middle, np.nan)
+    run = max(2, int(RUN_MM / across_mm))
+    edges = [_seen_edge(at, run), _seen_edge(at[::-1], run)]
+    if not all(edges) or open_to_body.all():
         return found
-    known = np.isfinite(at)
-    table_mm = np.interp(np.arange(len(at)), np.flatnonzero(known), at[known], left=0.0, right=0.0)
-    table_mm = np.minimum(table_mm, max(edge for edge in edges if edge is not None) + ALIKE_MM)
-    within = (index >= first) & ((index - first) * spacing_mm[side.axis] < table_mm[:, None] - 1e-6)
-    turned = (within & view)[:: -1 if side.end else 1]
-    return np.asarray(np.moveaxis(turned, 0, side.axis))
+    table_mm = np.interp(np.arange(view.shape[1]), lines[open_to_body], middle[open_to_body], left=0.0, right=0.0)
+    table_mm = np.minimum(table_mm, max(edges) + ALIKE_MM)
+    deep, line, k = np.nonzero(seen & (inward[:, None, None] * along_mm < table_mm[:, None] - 1e-6))
+    np.moveaxis(found, side.axis, 0)[index[deep, line, k], line, k] = True
+    return found
 
 
-def _middle(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else np.inf
-
-
-def _seen_edge(thick_mm: Floats, run: int) -> float | None:
-    """How thick a table is at its first edge, where it is seen in a run of lines and is as thick all along it."""
+def _seen_edge(thick_mm: Floats, run: int) -> float:
+    """How thick a table is at its first edge, where it is seen in a run of lines and is as thick all along it; or 0."""
     seen = np.flatnonzero(np.isfinite(thick_mm))
     first = thick_mm[seen[0] : seen[0] + run] if len(seen) else thick_mm[:0]
     known = first[np.isfinite(first)]
     enough = len(known) >= 0.8 * run and float(np.ptp(known)) <= 2.0 * ALIKE_MM
-    return float(np.median(known)) if enough else None
+    return float(np.median(known)) if enough else 0.0
 
 
-def flat_sides(above: NDArray[np.floating], body: Bools, spacing_mm: Floats) -> tuple[TableSide, ...]:
-    """The sides at which a body ends in a plane across its image's axes.
-
-    Args:
-        above: Shape (nx, ny, nz), Hounsfield units above those of the body's surface, axis 2 along the bed.
-        body: Same shape.
-        spacing_mm: Shape (3,).
-    """
-    return tuple(_flat_sides(above, body, spacing_mm))
+def flat_sides(hu: NDArray[np.floating], body: Bools, spacing_mm: Floats, level: float = 0.0) -> tuple[TableSide, ...]:
+    """The sides at which a body ends in a plane across its image's axes; arguments as of `touching_tables`."""
+    return tuple(_flat_sides(surface_ends(hu, body, level), body, spacing_mm))
 
 
-def _flat_sides(above: NDArray[np.floating], body: Bools, spacing_mm: Floats) -> Iterator[TableSide]:
-    for axis, end in itertools.product((0, 1), (0, -1)):
+def _flat_sides(surfaces: dict[Side, Floats], body: Bools, spacing_mm: Floats) -> Iterator[TableSide]:
+    for (axis, end), ends in surfaces.items():
         step_mm, across_mm = float(spacing_mm[axis]), float(spacing_mm[1 - axis])
-        ends = surface_ends(above, body, axis, end)
         plane = _commonest(ends[np.isfinite(ends)], FLAT_MM / step_mm)
         outward_mm = (ends - plane) * (step_mm if end else -step_mm)
         width_mm = _flat_width((np.abs(outward_mm) <= FLAT_MM / 2).sum(axis=0), float(spacing_mm[2])) * across_mm
@@ -271,30 +267,27 @@ def _flat_sides(above: NDArray[np.floating], body: Bools, spacing_mm: Floats) ->
             yield TableSide(axis, end, lines, np.full(len(lines), plane), (0.0, 0.0), width_mm, True, 0.0)
 
 
-def surface_ends(above: NDArray[np.floating], body: Bools, axis: int, end: int) -> Floats:
-    """Where a body's surface is along each line of an axis, seen from one of its ends.
+def surface_ends(hu: NDArray[np.floating], body: Bools, level: float = 0.0) -> dict[Side, Floats]:
+    """Where a body's surface is along each line of an axis, seen from each end of it.
 
     Args:
-        above: Shape (nx, ny, nz), Hounsfield units above those of the body's surface, axis 2 along the bed.
+        hu: Shape (nx, ny, nz), axis 2 along the bed.
         body: Same shape.
-        axis: 0 or 1, along the lines.
-        end: 0 or -1, from which end of the axis.
+        level: Where the surface is, of the values.
 
     Returns:
-        Voxels along the axis, shape (n, nz); NaN where there is no body, and where the image cuts it.
+        By face, voxels along its axis, shape (n, nz); NaN where there is no body, and where the image cuts it.
     """
-    turn = slice(None, None, -1) if end else slice(None)
-    inside = np.moveaxis(body, axis, 0)[turn]
-    values = np.moveaxis(above, axis, 0)[turn]
-    first = np.argmax(inside, axis=0)
-    known = inside.any(axis=0) & (first > 0)
-    first = np.maximum(first, 1)
-    within = np.take_along_axis(values, first[None], axis=0)[0].astype(np.float64)
-    beside = np.take_along_axis(values, first[None] - 1, axis=0)[0].astype(np.float64)
-    crossed = known & (within > 0.0) & (beside < 0.0)
-    at = first - np.divide(within, within - beside, out=np.full(within.shape, 0.5), where=crossed)
-    at = np.where(known, at, np.nan)
-    return np.asarray(len(inside) - 1 - at if end else at)
+    surfaces = {}
+    for (axis, end), at in zip(FACES, ends_of(body), strict=True):
+        values, out = np.moveaxis(hu, axis, 0), 1 if end else -1
+        known = (at >= 0) & (at != (len(values) - 1 if end else 0))
+        at = np.where(known, at, 1)
+        within, beside = (np.take_along_axis(values, k[None], axis=0)[0] - float(level) for k in (at, at + out))
+        crossed = known & (within > 0.0) & (beside < 0.0)
+        share = np.divide(within, within - beside, out=np.full(within.shape, 0.5), where=crossed)
+        surfaces[axis, end] = np.where(known, at + out * share, np.nan)
+    return surfaces
 
 
 def _flat_width(flat: NDArray[np.integer], step_mm: float) -> float:
@@ -344,6 +337,14 @@ class _Ends(NamedTuple):
         """Of the image, along the bed."""
         return float(self.ends_mm.shape[1] * self.spacing_mm[2])
 
+    def sampled(self) -> _Ends:
+        """Some of its lines of sight in some of its slices."""
+        axes = [1 - self.axis, 2]
+        step = np.maximum(1, (TILT_SAMPLING_MM / self.spacing_mm[axes]).astype(int))
+        spacing_mm, some = self.spacing_mm.copy(), np.s_[:: step[0], :: step[1]]
+        spacing_mm[axes] *= step
+        return self._replace(ends_mm=self.ends_mm[some], firm=self.firm[some], spacing_mm=spacing_mm)
+
 
 class _Bed(NamedTuple):
     """Ends of lines of sight (n,), mm, in slice 0 of a bed that may run at an angle to the slices' axis.
@@ -363,20 +364,18 @@ class _Bed(NamedTuple):
     width_mm: float
 
 
-def drawn_sides(above: NDArray[np.floating], trunk: Bools, spacing_mm: Floats) -> tuple[TableSide, ...]:
+def drawn_sides(
+    hu: NDArray[np.floating], trunk: Bools, spacing_mm: Floats, level: float = 0.0
+) -> tuple[TableSide, ...]:
     """The sides at which a body, or what holds together with it, ends in one section along the bed; edges count.
 
-    Args:
-        above: Shape (nx, ny, nz), Hounsfield units above those of the body's surface, axis 2 along the bed.
-        trunk: Same shape; what is as dense and connected with it counts too, however thin.
-        spacing_mm: Shape (3,).
+    Arguments are those of `touching_tables`.
     """
-    solid = _connected(above > 0.0, trunk)
-    views, middle_mm = [], _middle_mm(trunk, spacing_mm)
-    for axis, end in itertools.product((0, 1), (0, -1)):
-        ends_mm = _smooth(surface_ends(above, solid, axis, end) * spacing_mm[axis], float(spacing_mm[2]))
-        views.append(_Ends(axis, end, ends_mm, np.isfinite(ends_mm), spacing_mm, DRAWN_MM, middle_mm))
-    sides = _sides(views)
+    if trunk.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
+        return ()
+    parts = parts_of((hu > level) | trunk)
+    surfaces = surface_ends(hu, parts.painted(parts.counts(trunk) > 0), level)
+    sides = _sides(_views(surfaces, trunk, spacing_mm))
     return tuple(side._replace(edge_mm=EDGE_MM) if side.whole else side for side in sides)
 
 
@@ -391,39 +390,33 @@ def support_side(outside: Bools, body: Bools, spacing_mm: Floats) -> TableSide |
         body: Same shape.
         spacing_mm: Shape (3,).
     """
-    views, middle_mm = [], _middle_mm(body, spacing_mm)
-    solid = outside | body
-    for axis, end in itertools.product((0, 1), (0, -1)):
-        first = _first(solid, axis, end)
-        ends_mm = _smooth(first * spacing_mm[axis], float(spacing_mm[2]))
-        near_mm = max(DRAWN_MM, float(spacing_mm[axis]))
-        firm = np.isfinite(ends_mm) & (_first(outside, axis, end) == first)
-        views.append(_Ends(axis, end, ends_mm, firm, spacing_mm, near_mm, middle_mm))
-    sides = [side for side in _sides(views) if side.whole]
+    surfaces, own = {}, {}
+    for face, first, outer in zip(FACES, ends_of(outside | body), ends_of(outside), strict=True):
+        surfaces[face] = np.where(first < 0, np.nan, first + (0.5 if face[1] else -0.5))  # the voxel's outer face
+        own[face] = outer == first
+    sides = [side for side in _sides(_views(surfaces, body, spacing_mm, own)) if side.whole]
     return max(sides, key=lambda side: side.width_mm, default=None)
 
 
-def _middle_mm(body: Bools, spacing_mm: Floats) -> Floats:
-    """The body's middle, shape (3,), from the first voxel's centre."""
-    return np.asarray(scipy.ndimage.center_of_mass(body)) * spacing_mm
-
-
-def _first(mask: Bools, axis: int, end: int) -> Floats:
-    """Outer face of the first voxel of a mask along each line of an axis, from one end; NaN without any."""
-    seen = np.moveaxis(mask, axis, 0)[:: -1 if end else 1]
-    first = np.where(seen.any(axis=0), np.argmax(seen, axis=0) - 0.5, np.nan)
-    return np.asarray(len(seen) - 1 - first if end else first)
+def _views(
+    surfaces: dict[Side, Floats], body: Bools, spacing_mm: Floats, own: dict[Side, Bools] | None = None
+) -> list[_Ends]:
+    """What is seen of surfaces from each side; where ``own`` says which ends count, they are known to a voxel."""
+    views, middle_mm = [], middle_of(body) * spacing_mm
+    for (axis, end), ends in surfaces.items():
+        ends_mm = _smooth(ends * spacing_mm[axis], float(spacing_mm[2]))
+        firm = np.isfinite(ends_mm) & (True if own is None else own[axis, end])
+        near_mm = DRAWN_MM if own is None else max(DRAWN_MM, float(spacing_mm[axis]))
+        views.append(_Ends(axis, end, ends_mm, firm, spacing_mm, near_mm, middle_mm))
+    return views
 
 
 def _sides(views: Sequence[_Ends]) -> tuple[TableSide, ...]:
-    """The drawn sides of one bed: of the directions that each side suggests, the one under which most is drawn."""
+    """The drawn sides of one bed."""
     if views[0].length_mm < LEAST_LENGTH_MM:
         return ()
-    suggested = [bed.slopes for bed in map(_own_bed, views) if bed.width_mm >= DRAWN_WIDTH_MM]
-    found = [[_bed_at(view, slopes) for view in views] for slopes in [(0.0, 0.0), *suggested]]
-    widths = [sum(bed.width_mm for bed in beds) for beds in found]
-    nearly = [beds for beds, width in zip(found, widths, strict=True) if width >= NEARLY * max(widths)]
-    beds = min(nearly, key=lambda beds: np.hypot(*beds[0].slopes))
+    slopes = _direction([view.sampled() for view in views])
+    beds = [_bed_at(view, slopes) for view in views]
     tables = [bed.width_mm >= DRAWN_WIDTH_MM for bed in beds]
     sides = []
     for view, bed, table in zip(views, beds, tables, strict=True):
@@ -433,30 +426,16 @@ def _sides(views: Sequence[_Ends]) -> tuple[TableSide, ...]:
     return tuple(side for side in sides if side is not None)
 
 
-def _connected(dense: Bools, body: Bools) -> Bools:
-    """What is dense and holds together with the body, which is part of it."""
-    labels, count = scipy.ndimage.label(dense | body)
-    kept = np.zeros(count + 1, bool)
-    kept[np.unique(labels[body])] = True
-    kept[0] = False
-    return np.asarray(kept[labels])
-
-
-def _own_bed(view: _Ends) -> _Bed:
-    """The bed under whose direction most lines of sight of one side are drawn."""
-    if view.length_mm < TILTS_FROM_MM:
-        return _bed_at(view, (0.0, 0.0))
-    beds = [_bed_at(view, (0.0, 0.0))]
-    for across in np.tan(sorted(TILTS_RAD, key=abs)):
-        along = _commonest_slope(_sheared(view, across), float(view.spacing_mm[2]))
-        beds.append(_bed_at(view, (along, across) if view.axis == 0 else (across, along)))
-    return _straightest(beds)
-
-
-def _straightest(beds: Sequence[_Bed]) -> _Bed:
-    """Of the beds under which nearly most is drawn the one with the least tilt."""
-    most = max(bed.width_mm for bed in beds)
-    return min((bed for bed in beds if bed.width_mm >= NEARLY * most), key=lambda bed: np.hypot(*bed.slopes))
+def _direction(views: Sequence[_Ends]) -> tuple[float, float]:
+    """A bed's slopes under which most is drawn at one side; of those under which nearly most is, the least."""
+    widths = {(0.0, 0.0): max(_bed_at(view, (0.0, 0.0)).width_mm for view in views)}
+    for view in views if views[0].length_mm >= TILTS_FROM_MM else ():
+        for across in np.tan(TILTS_RAD):
+            along = _commonest_slope(_sheared(view, across), float(view.spacing_mm[2]))
+            tilt = (along, float(across)) if view.axis == 0 else (float(across), along)
+            widths[tilt] = max(widths.get(tilt, 0.0), _bed_at(view, tilt).width_mm)
+    most = max(widths.values())
+    return min((tilt for tilt, width in widths.items() if width >= NEARLY * most), key=lambda tilt: np.hypot(*tilt))
 
 
 def _smooth(ends_mm: Floats, step_mm: float) -> Floats:
@@ -475,30 +454,32 @@ def _bed_at(view: _Ends, slopes: tuple[float, float]) -> _Bed:
     firm = _sheared(view._replace(ends_mm=np.where(view.firm, view.ends_mm, np.nan)), slopes[1 - view.axis])
     firm -= slopes[view.axis] * along_bed
     outward = 1.0 if view.end else -1.0
-    at, farthest = _over_slices(np.nanmedian, firm), outward * _over_slices(np.nanmax, outward * level)
+    at, farthest = _medians(firm), outward * np.fmax.reduce(outward * level, axis=1)
     middle = view.middle_mm[view.axis] - slopes[view.axis] * view.middle_mm[2]
     drawn = (np.abs(firm - at[:, None]) <= view.near_mm).mean(axis=1) >= DRAWN_FRACTION
     drawn &= outward * at > outward * middle
     return _Bed(at, farthest, drawn, slopes, float(drawn.sum() * view.spacing_mm[1 - view.axis]))
 
 
-def _over_slices(measure: Callable[..., Floats], ends_mm: Floats) -> Floats:
-    """Median or the like of every line of sight that ends anywhere; NaN for others."""
-    known = np.isfinite(ends_mm).any(axis=1)
-    found = np.full(len(ends_mm), np.nan)
-    found[known] = measure(ends_mm[known], axis=1)
-    return found
+def _medians(ends_mm: Floats) -> Floats:
+    """Of every line of sight the median over the slices in which it ends anywhere; NaN without any."""
+    ends_mm, rows = np.sort(ends_mm, axis=1), np.arange(len(ends_mm))  # NaN comes last
+    count = np.isfinite(ends_mm).sum(axis=1)
+    return np.asarray((ends_mm[rows, (count - 1) // 2] + ends_mm[rows, count // 2 - (count == 0)]) / 2.0)
 
 
 def _sheared(view: _Ends, across_slope: float) -> Floats:
     """Ends (n, nz) of the lines of sight that move with the bed across their direction."""
-    across_mm, step_mm = float(view.spacing_mm[1 - view.axis]), float(view.spacing_mm[2])
-    lines = np.arange(len(view.ends_mm)) * across_mm
-    columns = [
-        np.interp(lines + across_slope * k * step_mm, lines, column, left=np.nan, right=np.nan)
-        for k, column in enumerate(view.ends_mm.T)
-    ]
-    return np.stack(columns, axis=1)
+    count, slices = view.ends_mm.shape
+    shift = across_slope * np.arange(slices) * view.spacing_mm[2] / view.spacing_mm[1 - view.axis]
+    at = np.arange(count)[:, None] + shift
+    low = np.floor(at).astype(int)
+    between = at - low
+    below, above = (
+        np.take_along_axis(view.ends_mm, np.clip(k, 0, count - 1), axis=0) for k in (low, low + (between > 0.0))
+    )
+    found = below + between * (above - below)
+    return np.asarray(np.where((at >= 0.0) & (at <= count - 1), found, np.nan))
 
 
 def _commonest_slope(ends_mm: Floats, step_mm: float) -> float:

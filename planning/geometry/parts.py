@@ -1,0 +1,186 @@
+"""What of a mask holds together, by runs of voxels along its last axis: no grid of numbers is made, nor gone through.
+
+A large scan has a hundred million voxels and a few hundred thousand runs. Two runs of neighbouring lines that overlap
+are of one part (union-find, the older run is the root, so that one pass forward numbers them all).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32
+from puncture_twin.planning.base.numba_kernels import nb
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The parts of a mask, whose voxels share faces; numbered from 0, as they are met.
+
+    Attributes:
+        shape: Of the mask.
+        runs: Shape (n, 4), of each run the line's two indices, its first voxel and the one after its last.
+        part: Shape (n,), its number.
+    """
+
+    shape: tuple[int, ...]
+    runs: Ints32
+    part: Ints32
+
+    @cached_property
+    def sizes(self) -> Ints:
+        """Voxels of each part."""
+        return np.bincount(self.part, self.runs[:, 3] - self.runs[:, 2]).astype(np.int64)
+
+    def counts(self, where: Bools) -> Ints:
+        """How many voxels of each part another mask has, of the same shape."""
+        held = np.zeros(len(self.runs), np.int64)
+        _count(_plain(where), self.runs, held)
+        return np.bincount(self.part, held, len(self.sizes)).astype(np.int64)
+
+    def painted(self, values: NDArray[Any]) -> NDArray[Any]:
+        """A grid that holds a value of its own in each part, and zero outside of all.
+
+        Args:
+            values: Shape (parts,), whole numbers or flags.
+        """
+        grid = np.zeros(self.shape, values.dtype)
+        _paint(self.runs, values[self.part], grid)
+        return grid
+
+
+def parts_of(mask: Bools) -> Parts:
+    """The parts of a mask, shape (nx, ny, nz)."""
+    return Parts(mask.shape, *_runs_and_parts(_plain(mask)))
+
+
+def largest_part(mask: Bools) -> Bools:
+    """The largest part of a mask; the mask itself where it is empty."""
+    parts = parts_of(mask)
+    return parts.painted(np.arange(len(parts.sizes)) == np.argmax(parts.sizes)) if len(parts.sizes) else mask
+
+
+def slice_counts(mask: Bools) -> tuple[Ints, Ints, Ints]:
+    """How many voxels of a mask each slice across an axis has, by axis."""
+    lines = mask.sum(axis=0, dtype=np.uint32)
+    across = np.array([np.count_nonzero(plane) for plane in mask])
+    return across, lines.sum(axis=1, dtype=np.int64), lines.sum(axis=0, dtype=np.int64)
+
+
+def middle_of(mask: Bools) -> Floats:
+    """The middle of a mask's voxels, shape (3,), voxels; NaN of none."""
+    counts = slice_counts(mask)
+    return np.array([np.arange(len(some)) @ some for some in counts]) / np.float64(counts[0].sum())
+
+
+def ends_of(mask: Bools) -> tuple[Ints32, Ints32, Ints32, Ints32]:
+    """Where lines along axes 0 and 1 first and last meet a mask.
+
+    Returns:
+        The first along axis 0, shape (ny, nz), the last, and both along axis 1, shape (nx, nz); -1 of a line that does
+        not meet it.
+    """
+    nx, ny, nz = mask.shape
+    ends = [np.full(shape, -1, np.int32) for shape in ((ny, nz), (ny, nz), (nx, nz), (nx, nz))]
+    _find_ends(_plain(mask), *ends)
+    return ends[0], ends[1], ends[2], ends[3]
+
+
+def _plain(mask: Bools) -> Bools:
+    """As kernels take it: in one piece, writable."""
+    return np.require(mask, requirements=["C", "W"])
+
+
+@nb.njit(cache=True)
+def _find_ends(mask: Any, first_i: Any, last_i: Any, first_j: Any, last_j: Any) -> None:
+    for i in range(mask.shape[0]):
+        for j in range(mask.shape[1]):
+            for k in range(mask.shape[2]):
+                if mask[i, j, k]:
+                    first_i[j, k] = i if first_i[j, k] < 0 else first_i[j, k]
+                    first_j[i, k] = j if first_j[i, k] < 0 else first_j[i, k]
+                    last_i[j, k], last_j[i, k] = i, j
+
+
+@nb.njit(cache=True)
+def _runs_and_parts(mask: Any) -> Any:
+    """Runs (n, 4), and the part (n,) of each."""
+    nx, ny, nz = mask.shape
+    count = 0
+    for i in range(nx):
+        for j in range(ny):
+            count += mask[i, j, 0]
+            for k in range(1, nz):
+                count += mask[i, j, k] > mask[i, j, k - 1]
+    runs, root = np.empty((count, 4), np.int32), np.empty(count, np.int32)
+    first = np.zeros(nx * ny + 1, np.int64)
+    n = 0
+    for i in range(nx):
+        for j in range(ny):
+            inside = False
+            for k in range(nz):
+                if mask[i, j, k] != inside:
+                    inside = not inside
+                    if inside:
+                        runs[n, 0], runs[n, 1], runs[n, 2], root[n] = i, j, k, n
+                    else:
+                        runs[n, 3] = k
+                        n += 1
+            if inside:
+                runs[n, 3] = nz
+                n += 1
+            line = i * ny + j
+            first[line + 1] = n
+            if i > 0:
+                _join(runs, root, first, line - ny, line)
+            if j > 0:
+                _join(runs, root, first, line - 1, line)
+    parts = 0
+    for r in range(count):
+        if root[r] == r:
+            root[r] = parts
+            parts += 1
+        else:
+            root[r] = root[root[r]]
+    return runs, root
+
+
+@nb.njit(cache=True)
+def _join(runs: Any, root: Any, first: Any, line: Any, other: Any) -> None:
+    """Make one part of the runs of two lines that overlap."""
+    a, b = first[line], first[other]
+    while a < first[line + 1] and b < first[other + 1]:
+        if runs[a, 2] < runs[b, 3] and runs[b, 2] < runs[a, 3]:
+            p, q = _root(root, a), _root(root, b)
+            root[max(p, q)] = min(p, q)
+        if runs[a, 3] < runs[b, 3]:
+            a += 1
+        else:
+            b += 1
+
+
+@nb.njit(cache=True)
+def _root(root: Any, r: Any) -> Any:
+    while root[r] != r:
+        root[r] = root[root[r]]
+        r = root[r]
+    return r
+
+
+@nb.njit(cache=True)
+def _count(mask: Any, runs: Any, held: Any) -> None:
+    for r in range(len(runs)):
+        for k in range(runs[r, 2], runs[r, 3]):
+            held[r] += mask[runs[r, 0], runs[r, 1], k]
+
+
+@nb.njit(cache=True)
+def _paint(runs: Any, values: Any, grid: Any) -> None:
+    for r in range(len(runs)):
+        if values[r]:
+            for k in range(runs[r, 2], runs[r, 3]):
+                grid[runs[r, 0], runs[r, 1], k] = values[r]

@@ -1,0 +1,39 @@
+"""What of a mask holds together, by runs: held against numbers in a grid."""
+
+import numpy as np
+import pytest
+import scipy
+
+from puncture_twin.planning.geometry.parts import ends_of, largest_part, middle_of, parts_of
+
+MASKS = [
+    np.random.default_rng(seed).random(shape) < dense
+    for seed, (shape, dense) in enumerate(
+        [((9, 8, 17), 0.3), ((9, 8, 17), 0.6), ((1, 5, 9), 0.5), ((6, 1, 1), 0.5), ((4, 4, 4), 0.0), ((4, 4, 4), 1.1)]
+    )
+]
+
+
+@pytest.mark.parametrize("mask", MASKS)
+def test_parts_are_those_that_share_faces(mask):
+    """The same as by numbering every voxel; sizes and counts are theirs."""
+    labels, count = scipy.ndimage.label(mask)
+    other = np.random.default_rng(9).random(mask.shape) < 0.5
+    parts = parts_of(mask)
+    numbers = parts.painted(np.arange(1, len(parts.sizes) + 1, dtype=np.int32))
+    assert len(parts.sizes) == count
+    assert len(np.unique(np.stack([labels, numbers]).reshape(2, -1), axis=1).T) == len(np.unique(labels))
+    assert np.array_equal(numbers > 0, mask)
+    assert np.array_equal(parts.sizes, np.bincount(numbers.ravel(), minlength=count + 1)[1:])
+    assert np.array_equal(parts.counts(other), np.bincount(numbers[other], minlength=count + 1)[1:])
+    assert np.count_nonzero(largest_part(mask)) == parts.sizes.max(initial=0)
+
+
+@pytest.mark.parametrize("mask", MASKS[:4])
+def test_ends_and_middle(mask):
+    """Where lines first and last meet a mask, and its middle."""
+    for axis, (first, last) in enumerate((ends_of(mask)[:2], ends_of(mask)[2:])):
+        none = ~mask.any(axis=axis)
+        assert np.array_equal(first, np.where(none, -1, mask.argmax(axis=axis)))
+        assert np.array_equal(last, np.where(none, -1, mask.shape[axis] - 1 - np.flip(mask, axis).argmax(axis=axis)))
+    assert np.allclose(middle_of(mask), np.argwhere(mask).mean(axis=0))
