@@ -73,7 +73,7 @@ def skin_of_image(image: CtImage) -> Skin:
     Raises:
         InputError: If no body is found, or no air around it.
     """
-    body, above = image.found.body, image.hu - BODY_HU
+    body, above = image.found.body, np.subtract(image.hu, BODY_HU, dtype=np.float32)
     unlike = ((above > 0) != body) | (above == 0)  # what counts as body, or as air, whatever its value
     field = np.abs(above, out=above)
     field[unlike] = HU_RANGE

@@ -10,6 +10,7 @@ import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
@@ -63,7 +64,7 @@ class OutsideImage:
         measured: What was not measured, where it was found before.
     """
 
-    hu: NDArray[np.float32]
+    hu: NDArray[Any]
     body: Bools
     T_ct_index: Floats
     spacing_mm: Floats
@@ -119,7 +120,7 @@ def _mark_dense(hu, body, size, air_hu, dense):  # type: ignore[no-untyped-def] 
                 for y in range(j - before[1], j + after[1] + 1):
                     line = hu[min(max(x, 0), ni - 1), min(max(y, 0), nj - 1)]
                     for k in range(nk):
-                        sums[k] += max(line[k], least)
+                        sums[k] += max(np.float32(line[k]), least)
             for k in range(nk):
                 mean = np.float32(0.0)
                 for z in range(k - before[2], k + after[2] + 1):
@@ -233,7 +234,7 @@ def _facing_outward(vertices: Floats, faces: Ints32) -> Ints32:
     return faces[:, ::-1] if inward else faces
 
 
-def _stiff_pieces(mask: Bools, hu: NDArray[np.float32], spacing_mm: Floats) -> Bools:
+def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
     """The pieces that are bulky, and of others what is solid with its rim: the rest is noise, or cloth on the skin."""
     stiff = _bulky(mask, spacing_mm)
     solid = hu > BODY_HU
