@@ -241,7 +241,7 @@ def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
     solid &= mask
     if not solid.any():
         return stiff
-    box = tuple(slice(max(0, one.start - 2), one.stop + 2) for one in box_in(solid))
+    box = box_in(solid, beside=2)
     near = pieces(widened(solid[box], (1, 1, 1)), corners=True)
     large = near.sizes(solid[box]) >= MIN_PIECE_MM3 / np.prod(spacing_mm)
     stiff[box] |= widened(near.mask(large), (1, 1, 1)) & mask[box]
@@ -262,8 +262,7 @@ def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_m
     ends = widened(dense, (1, 1, 1)) & unscanned.voxels & ~body
     if not ends.any():
         return np.zeros_like(dense)
-    rim, beside = np.ceil(RIM_MM / spacing_mm).astype(int), np.zeros_like(dense)
-    box = tuple(slice(max(0, one.start - n), one.stop + n) for one, n in zip(box_in(ends), rim, strict=True))
+    beside, box = np.zeros_like(dense), box_in(ends, np.ceil(RIM_MM / spacing_mm).astype(int))
     beside[box] = scipy.ndimage.distance_transform_edt(~ends[box], sampling=spacing_mm) <= RIM_MM
     beside &= unscanned.voxels
     cut = unscanned.padded & widened(body, (1, 1, 1))
