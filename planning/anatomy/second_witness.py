@@ -17,7 +17,7 @@ from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.base.arrays import Bools, grown, widened
 from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.pieces import pieces
+from puncture_twin.planning.geometry.parts import parts_of
 from puncture_twin.planning.geometry.voxelize import mark_inside
 
 GAS_HU = -300.0
@@ -96,7 +96,7 @@ def _surface(mask: Bools, ct: CtImage) -> TriangleMesh | None:
     if not mask.any():
         return None
     box = box_in(mask)
-    found = pieces(mask[box], corners=True)
-    large = found.sizes() >= MIN_COMPONENT_MM3 / float(np.prod(ct.spacing_mm))
-    mask[box] = found.mask(large)
+    found = parts_of(mask[box], corners=True)
+    large = found.sizes >= MIN_COMPONENT_MM3 / float(np.prod(ct.spacing_mm))
+    mask[box] = found.painted(large)
     return mask_surface(mask, ct.T_ct_index, where=ct.where) if large.any() else None

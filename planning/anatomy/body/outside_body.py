@@ -23,7 +23,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, widened
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box, joined
-from puncture_twin.planning.geometry.pieces import pieces
+from puncture_twin.planning.geometry.parts import parts_of
 from puncture_twin.planning.geometry.rigid import apply, pose
 
 SMOOTH_MM = 3.0
@@ -242,16 +242,16 @@ def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
     if not solid.any():
         return stiff
     box = box_in(solid, beside=2)
-    near = pieces(widened(solid[box], (1, 1, 1)), corners=True)
-    large = near.sizes(solid[box]) >= MIN_PIECE_MM3 / np.prod(spacing_mm)
-    stiff[box] |= widened(near.mask(large), (1, 1, 1)) & mask[box]
+    near = parts_of(widened(solid[box], (1, 1, 1)), corners=True)
+    large = near.counts(solid[box]) >= MIN_PIECE_MM3 / np.prod(spacing_mm)
+    stiff[box] |= widened(near.painted(large), (1, 1, 1)) & mask[box]
     return stiff
 
 
 def _bulky(mask: Bools, spacing_mm: Floats) -> Bools:
     """The bulky pieces of a mask."""
-    found = pieces(mask, corners=True)
-    return found.mask(found.sizes() * np.prod(spacing_mm) >= 1000.0 * BULKY_ML)
+    found = parts_of(mask, corners=True)
+    return found.painted(found.sizes * np.prod(spacing_mm) >= 1000.0 * BULKY_ML)
 
 
 def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_mm: Floats) -> Bools:

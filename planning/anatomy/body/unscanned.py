@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, widened
-from puncture_twin.planning.geometry.pieces import pieces
+from puncture_twin.planning.geometry.parts import parts_of
 
 UNSCANNED_HU = -1500.0
 """Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
@@ -136,9 +136,9 @@ def _padded(hu: NDArray[Any], circle: Bools) -> Bools:
         if not any(cube.all() for cube in cubes):
             continue
         blocks = _block((hu == value) & ~circle[:, :, None])
-        found, at_corners = pieces(blocks, corners=False), np.zeros_like(blocks)
+        found, at_corners = parts_of(blocks), np.zeros_like(blocks)
         at_corners[_corners(hu)] = True
-        padded |= found.mask(found.sizes(at_corners) > 0)
+        padded |= found.painted(found.counts(at_corners) > 0)
     if not padded.any():
         return padded
     for value in np.unique(hu[padded]):
