@@ -108,8 +108,8 @@ class EdgeImage:
         By the central difference over one voxel to each side along the normal.
         """
         strength = np.empty(len(points_ct))
-        plain = (np.ascontiguousarray(one, np.float64) for one in (points_ct, normals_ct))
-        _strength(self.values, np.linalg.inv(self.T_ct_index), *plain, strength)
+        points, normals = (np.ascontiguousarray(one, np.float64) for one in (points_ct, normals_ct))
+        _strength(self.values, np.linalg.inv(self.T_ct_index), points, normals, strength)
         return strength
 
 

@@ -90,7 +90,8 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     hu, body, unscanned = image.hu, image.body, image.unscanned
     size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(np.int64)
     dense = np.zeros(hu.shape, bool)
-    _mark_dense(*(np.require(one, requirements=["C", "W"]) for one in (hu, body)), size, float(air_hu), dense)
+    plain_hu, plain_body = (np.require(one, requirements=["C", "W"]) for one in (hu, body))
+    _mark_dense(plain_hu, plain_body, size, float(air_hu), dense)
     if not unscanned.voxels.any():
         return _stiff_pieces(dense, hu, image.spacing_mm)
     dense = _stiff_pieces(dense & ~unscanned.voxels, hu, image.spacing_mm)
