@@ -3,7 +3,8 @@
 `init` and then `search` run each in a new process, with an empty cache folder and compiled kernels. A row is processor
 time (user and system, all threads) of the innermost of what was going on. Beside it, in the same run, stands the floor:
 reading both files and marching cubes in the box of every label, without which nobody can look; and the most memory that
-was in use. With ``--growth``: how the time of `init` grows when voxels, labels or triangles are doubled.
+was in use. With ``--growth``: how the time of `init` grows when voxels, labels or triangles are doubled. With
+``--batch``: what ten targets in one CT take as a cohort, beside one, with nothing kept and again.
 
 The scans: the abdomen at .78 x .78 x 1.0 mm, where the shared data are on this machine, and two that are drawn here,
 with a seed: ellipsoids, ribs and a table, of 512 x 512 x 133 voxels with 89 labels and 512 x 512 x 600 with 100.
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -67,6 +69,8 @@ AIR_HU, FAT_HU, SOFT_HU, BONE_HU, LUNG_HU, TABLE_HU, NOISE_HU = -1000, -95, 45, 
 WALL_MM, INNER_HU = 26.0, 46
 """Nothing that is drawn lies so near to the skin: a thinner wall about a lung would count as a sheet."""
 SEED = 7
+APART_MM = 6.0
+"""So far from the first the other targets of a batch lie, along each axis."""
 
 
 @dataclass(frozen=True)
@@ -283,11 +287,39 @@ def print_growth(folder: Path) -> None:
         print(f"| {name} | {seconds:.1f} | {log2(seconds / base):.2f} |", flush=True)
 
 
+def print_batch(name: str, scan: Scan, folder: Path) -> None:
+    """What ten targets in one CT take beside one, processor seconds of the whole command; cold, and once more."""
+    looked(scan, folder / f"kept_{name}", search=False)
+    target = tomllib.loads((scan.folder / "case.toml").read_text())["target"]["position_mm"]
+    apart = np.random.default_rng(SEED).uniform(-APART_MM, APART_MM, (9, 3))
+    targets = [target, *np.round(np.add(target, apart), 1).tolist()]
+    print(f"\n| {name}, batch, processor s | one | ten | ratio |\n|---|---|---|---|")
+    kept = {count: folder / f"kept_{name}_{count}" for count in (1, 10)}
+    for state in ("cold", "warm"):
+        seconds = [cohort(scan, targets[:count], kept[count], folder / f"{name}_{count}_{state}") for count in kept]
+        print(f"| {state} | {seconds[0]:.1f} | {seconds[1]:.1f} | {seconds[1] / seconds[0]:.2f} |", flush=True)
+
+
+def cohort(scan: Scan, targets: list[list[float]], kept: Path, out: Path) -> float:
+    """Processor seconds of one worker's `batch run` of some targets."""
+    listed = out.with_suffix(".toml")
+    listed.write_text(f"cases = ['{scan.folder / 'case.toml'}']\ntargets = {targets}\n")
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PUNCTURE_TWIN_CACHE": str(kept)}
+    for words in (("plan", str(listed), "--no-arm"), ("run", "--jobs", "1")):
+        before = wait_probe.used()
+        command = [sys.executable, str(REPOSITORY / "run_twin.py"), "batch", *words, "--out", str(out)]
+        ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        if ended.returncode:
+            raise SystemExit(f"{' '.join(words)}: {ended.stderr}{ended.stdout}")
+    return wait_probe.used() - before
+
+
 def main() -> None:
     """Parse, run, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", help=f"some of abdomen_fine,{','.join(DRAWN)}")
     parser.add_argument("--growth", action="store_true", help="how the time grows with voxels, labels and triangles")
+    parser.add_argument("--batch", action="store_true", help="what ten targets in one CT take beside one")
     chosen = parser.parse_args()
     only = None if chosen.only is None else set(chosen.only.split(","))
     with tempfile.TemporaryDirectory() as temporary:
@@ -295,7 +327,10 @@ def main() -> None:
         print(f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} processors")
         for name, make in makers(folder).items():
             if only is None or name in only:
-                print_table(name, make(), folder)
+                scan = make()
+                print_table(name, scan, folder)
+                if chosen.batch:
+                    print_batch(name, scan, folder)
         if chosen.growth:
             print_growth(folder)
 

@@ -14,9 +14,10 @@ import numpy as np
 import scipy
 
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
-from puncture_twin.planning.base.arrays import Bools, counts_of, grown, widened
+from puncture_twin.planning.base.arrays import Bools, grown, widened
 from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.parts import parts_of
 from puncture_twin.planning.geometry.voxelize import mark_inside
 
 GAS_HU = -300.0
@@ -32,8 +33,6 @@ GAS_HOLDERS = (
 """How words begin that name structures which hold gas in a healthy body."""
 GAS_WORDS = ("sinus", "sinuses", "nasal", "nose", "oral", "mouth", "gas", "air", "cavity")
 """Whole words that do: "oral" is not to be found in "femoral"."""
-
-FULL = np.ones((3, 3, 3), bool)
 
 
 class Named(NamedTuple):
@@ -97,8 +96,7 @@ def _surface(mask: Bools, ct: CtImage) -> TriangleMesh | None:
     if not mask.any():
         return None
     box = box_in(mask)
-    labels, count = scipy.ndimage.label(mask[box], FULL)
-    large = counts_of(labels, count) >= MIN_COMPONENT_MM3 / float(np.prod(ct.spacing_mm))
-    large[0] = False
-    mask[box] = large[labels]
+    found = parts_of(mask[box], corners=True)
+    large = found.sizes >= MIN_COMPONENT_MM3 / float(np.prod(ct.spacing_mm))
+    mask[box] = found.painted(large)
     return mask_surface(mask, ct.T_ct_index, where=ct.where) if large.any() else None

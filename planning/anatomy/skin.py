@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, filled_slices
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, WIDE, Box, FieldOfView, shifted, spacing_of
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.labels.label_surface import box_in, field_surface
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.orientation import canonical
 from puncture_twin.planning.geometry.creases import split_at_creases
@@ -73,13 +73,14 @@ def skin_of_image(image: CtImage) -> Skin:
     Raises:
         InputError: If no body is found, or no air around it.
     """
-    body, above = image.found.body, image.hu - BODY_HU
+    box = box_in(image.found.body, beside=1)  # beyond it the field is negative
+    body, above = image.found.body[box], np.subtract(image.hu[box], BODY_HU, dtype=np.float32)
     unlike = ((above > 0) != body) | (above == 0)  # what counts as body, or as air, whatever its value
     field = np.abs(above, out=above)
     field[unlike] = HU_RANGE
     np.clip(field, HU_LEAST, HU_RANGE, out=field)
     np.negative(field, out=field, where=~body)
-    return _skin(field, image.found, image.T_ct_index, image.where)
+    return _skin(field, image.found, image.T_ct_index, image.where, [one.start for one in box])
 
 
 def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> Skin:
@@ -164,8 +165,9 @@ def _skin(
     found: BodyMask,
     T_ct_index: Floats,
     where: str | Path,
+    first: ArrayLike = 0,
 ) -> Skin:
-    mesh = field_surface(field, T_ct_index, where=where)
+    mesh = field_surface(field, T_ct_index, where=where, first=first)
     view = field_of_view(found.body, T_ct_index)
     centres = mesh.triangles.mean(axis=1)
     cut_faces = _on_cut_border(view, spacing_of(T_ct_index), centres) | _at_unscanned(found, T_ct_index, centres)

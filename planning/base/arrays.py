@@ -52,10 +52,10 @@ def _add_beside(wide: Bools, mask: Bools, axis: int, step: int) -> None:
     out[:-step] |= of[step:]
 
 
-def counts_of(numbers: NDArray[np.integer], count: int, where: Bools | None = None) -> Ints:
-    """How many voxels have each number from 0 to ``count``, of those where a mask is True; plane by plane."""
+def counts_of(numbers: NDArray[np.integer], count: int) -> Ints:
+    """How many voxels have each number from 0 to ``count``; plane by plane."""
     counts = np.zeros(count + 1, np.int64)
-    for i, plane in enumerate(numbers):
-        found = np.bincount(plane.ravel() if where is None else plane[where[i]])
+    for plane in numbers:
+        found = np.bincount(plane.ravel())
         counts[: len(found)] += found
     return counts

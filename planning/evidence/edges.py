@@ -26,6 +26,7 @@ import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 
@@ -106,16 +107,9 @@ class EdgeImage:
 
         By the central difference over one voxel to each side along the normal.
         """
-        T_index_ct = np.linalg.inv(self.T_ct_index)
-        index, along = apply(T_index_ct, points_ct), normals_ct @ T_index_ct[:3, :3].T
-        half_mm = 1.0 / np.linalg.norm(along, axis=1)
-        step = along * half_mm[:, None]
-        ends = [
-            scipy.ndimage.map_coordinates(self.values, (index + side * step).T, order=1, mode="nearest")
-            for side in (1.0, -1.0)
-        ]
-        strength = np.abs(ends[0] - ends[1]) / (2.0 * half_mm)
-        strength[np.any((index < 1.0) | (index > np.array(self.values.shape) - 2.0), axis=1)] = np.nan
+        strength = np.empty(len(points_ct))
+        points, normals = (np.ascontiguousarray(one, np.float64) for one in (points_ct, normals_ct))
+        _strength(self.values, np.linalg.inv(self.T_ct_index), points, normals, strength)
         return strength
 
     def hu_at(self, points_ct: Floats) -> Floats:
@@ -124,11 +118,44 @@ class EdgeImage:
         return np.asarray(scipy.ndimage.map_coordinates(self.values, index, order=1, cval=np.nan))
 
 
+@nb.njit(cache=True, error_model="numpy")
+def _strength(values, T, points, normals, strength):  # type: ignore[no-untyped-def]  # numba infers
+    """As `EdgeImage.strength`; ``T`` maps LPS mm to an index."""
+    ni, nj, nk = values.shape
+    for n in range(len(points)):
+        p, d = points[n], normals[n]
+        x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+        y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+        z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+        u = T[0, 0] * d[0] + T[0, 1] * d[1] + T[0, 2] * d[2]
+        v = T[1, 0] * d[0] + T[1, 1] * d[1] + T[1, 2] * d[2]
+        w = T[2, 0] * d[0] + T[2, 1] * d[1] + T[2, 2] * d[2]
+        per_mm = np.sqrt(u * u + v * v + w * w)
+        u, v, w = u / per_mm, v / per_mm, w / per_mm
+        strength[n] = np.nan
+        if 1.0 <= x <= ni - 2.0 and 1.0 <= y <= nj - 2.0 and 1.0 <= z <= nk - 2.0:
+            change = _between(values, x + u, y + v, z + w) - _between(values, x - u, y - v, z - w)
+            strength[n] = abs(change) * per_mm / 2.0
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _between(values, x, y, z):  # type: ignore[no-untyped-def]
+    """Trilinear between the voxels about an index."""
+    i, j, k = min(int(x), values.shape[0] - 2), min(int(y), values.shape[1] - 2), min(int(z), values.shape[2] - 2)
+    x, y, z = x - i, y - j, z - k
+    total = 0.0
+    for a in range(2):
+        for b in range(2):
+            line = values[i + a, j + b, k] * (1.0 - z) + values[i + a, j + b, k + 1] * z
+            total += line * (x if a else 1.0 - x) * (y if b else 1.0 - y)
+    return total
+
+
 def edge_image(hu: NDArray[np.generic], T_ct_index: Floats) -> EdgeImage:
     """The CT as the edge test sees it.
 
     Args:
-        hu: Shape (nx, ny, nz), Hounsfield units, of any type.
+        hu: Shape (nx, ny, nz), Hounsfield units, of any type that holds `HU_RANGE`.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
     """
     spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
@@ -137,7 +164,7 @@ def edge_image(hu: NDArray[np.generic], T_ct_index: Floats) -> EdgeImage:
     values = np.zeros(count, np.float32)
     for first in itertools.product(*(range(n) for n in factor)):
         part = tuple(slice(f, f + n * s, s) for f, n, s in zip(first, count, factor, strict=True))
-        values += np.clip(hu[part], *HU_RANGE)
+        values += np.clip(hu[part], *np.array(HU_RANGE, hu.dtype))
     values /= np.float32(factor.prod())
     T_index_copy = np.diag([*factor.astype(float), 1.0])
     T_index_copy[:3, 3] = (factor - 1) / 2

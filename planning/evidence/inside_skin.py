@@ -16,12 +16,15 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.geometry.containment import settled_crossings
+from puncture_twin.planning.geometry.containment import crossings, settled_crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 SAMPLES = 1000
 """Points on a structure's surface, each for the same area: a fraction is found to 0.1 %."""
+
+AIMS = 100
+"""Lines along which a point inside the skin is sought."""
 
 LEAST_TOLERANCE_MM = 2.0
 """A point this near to the skin counts as inside. Surfaces of label maps run up to half a voxel outside of the organ, a
@@ -61,21 +64,20 @@ class Inside:
         return self.inside / max(self.inside + self.outside, 1)
 
 
-def inside_skin(meshes: Sequence[TriangleMesh], skin: Skin, inner_ct: Floats, tolerance_mm: Floats) -> list[Inside]:
+def inside_skin(meshes: Sequence[TriangleMesh], skin: Skin, tolerance_mm: Floats) -> list[Inside]:
     """Count which part of each surface lies inside a closed skin.
 
     A ray from a point inside the body leaves it an odd number of times. A sample lies inside if an even number of these
-    crossings comes before it.
+    crossings comes before it. The point is the skin's own, so that the answer is the same for every target.
 
     Args:
         meshes: The k structures, mm.
         skin: Closed; an open one has no inside.
-        inner_ct: Shape (3,), a point inside the skin, such as the target.
         tolerance_mm: Shape (k,); a sample of a structure this near to the skin counts as inside.
     """
     points = np.concatenate([spread_on(mesh, SAMPLES).points for mesh in meshes] or [np.empty((0, 3))])
     reach = np.repeat(np.asarray(tolerance_mm, dtype=np.float64), SAMPLES)
-    outside = np.flatnonzero(~_before_skin(points, skin, inner_ct))
+    outside = np.flatnonzero(~_before_skin(points, skin))
     outside = outside[~near_surface(points[outside], skin.mesh, reach[outside])]
     beyond = _beyond_cut(points[outside], skin.field_of_view, reach[outside])
     lost = np.bincount(outside[~beyond] // SAMPLES, minlength=len(meshes))
@@ -83,9 +85,7 @@ def inside_skin(meshes: Sequence[TriangleMesh], skin: Skin, inner_ct: Floats, to
     return [Inside(SAMPLES - int(o) - int(c), int(o), int(c)) for o, c in zip(lost, cut, strict=True)]
 
 
-def kept_inside_skin(
-    meshes: Sequence[TriangleMesh], skin: Skin, inner_ct: Floats, tolerance_mm: Floats, cache: Cache
-) -> list[Inside]:
+def kept_inside_skin(meshes: Sequence[TriangleMesh], skin: Skin, tolerance_mm: Floats, cache: Cache) -> list[Inside]:
     """`inside_skin`, from the cache where it is there."""
     view = skin.field_of_view
     seen = None if view is None else [view.T_ct_box.tolist(), view.size_mm.tolist(), view.cut.tolist()]
@@ -93,11 +93,11 @@ def kept_inside_skin(
         "what": "inside the skin",
         "skin": [skin.mesh.digest, seen],
         "meshes": [mesh.digest for mesh in meshes],
-        "at": [inner_ct.tolist(), np.asarray(tolerance_mm).tolist()],
+        "at": np.asarray(tolerance_mm).tolist(),
     }
 
     def make() -> Arrays:
-        found = inside_skin(meshes, skin, inner_ct, tolerance_mm)
+        found = inside_skin(meshes, skin, tolerance_mm)
         return {"counts": np.array([(one.inside, one.outside, one.beyond) for one in found], np.int64).reshape(-1, 3)}
 
     return [Inside(*counts) for counts in cache.arrays(made_from, make, by=__name__)["counts"].tolist()]
@@ -127,8 +127,23 @@ def near_surface(points: Floats, mesh: TriangleMesh, distance_mm: Floats) -> Boo
     return near
 
 
-def _before_skin(points: Floats, skin: Skin, inner_ct: Floats) -> Bools:
+def _inner_point(mesh: TriangleMesh) -> Floats:
+    """A point deep in a closed surface: of some lines from beside it the middle of the longest first way through."""
+    (low, high), beside = mesh.bounds, np.array([LEAST_TOLERANCE_MM, 0.0, 0.0])
+    start = np.array([low[0], *(low + high)[1:] / 2.0]) - beside
+    away = spread_on(mesh, AIMS).points - start
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    found = crossings(mesh, start, away)
+    first = found.first[(found.count > 0) & (found.count % 2 == 0)]
+    if len(first) == 0:
+        return np.asarray((low + high) / 2.0)
+    into = first[np.argmax(found.depth[first + 1] - found.depth[first])]
+    return np.asarray(start + away[found.ray[into]] * found.depth[into : into + 2].mean())
+
+
+def _before_skin(points: Floats, skin: Skin) -> Bools:
     """Which points the ray from inside meets before it has left the skin, or after it has come in again."""
+    inner_ct = _inner_point(skin.mesh)
     away = points - inner_ct
     distance = np.linalg.norm(away, axis=1)
     away[distance == 0] = (0.0, 0.0, 1.0)
@@ -161,9 +176,7 @@ def outside_skin(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding
         return
     tolerances = np.array([_surface_tolerance_mm(case, structure) for structure in placed])
     meshes = [structure.mesh for structure in placed]
-    for structure, part in zip(
-        placed, kept_inside_skin(meshes, anatomy.skin, case.target_ct, tolerances, cache), strict=True
-    ):
+    for structure, part in zip(placed, kept_inside_skin(meshes, anatomy.skin, tolerances, cache), strict=True):
         if part.inside + part.outside == 0:
             said = f"structure '{structure.name}' lies wholly beyond a side at which the skin was cut"
             yield Finding("beyond_skin", Severity.WARNING, said)

@@ -1,6 +1,6 @@
 """What of a mask holds together, by runs of voxels along its last axis: no grid of numbers is made, nor gone through.
 
-A large scan has a hundred million voxels and a few hundred thousand runs. Two runs of neighbouring lines that overlap
+A large scan has a hundred million voxels and a few hundred thousand runs. Two runs of neighbouring lines that touch
 are of one part (union-find, the older run is the root, so that one pass forward numbers them all).
 """
 
@@ -19,7 +19,7 @@ from puncture_twin.planning.base.numba_kernels import nb
 
 @dataclass(frozen=True, eq=False)
 class Parts:
-    """The parts of a mask, whose voxels share faces; numbered from 0, as they are met.
+    """The parts of a mask, numbered from 0, as they are met.
 
     Attributes:
         shape: Of the mask.
@@ -53,9 +53,9 @@ class Parts:
         return grid
 
 
-def parts_of(mask: Bools) -> Parts:
-    """The parts of a mask, shape (nx, ny, nz)."""
-    return Parts(mask.shape, *_runs_and_parts(_plain(mask)))
+def parts_of(mask: Bools, *, corners: bool = False) -> Parts:
+    """The parts of a mask, shape (nx, ny, nz), whose voxels share faces; with ``corners`` edges and corners too."""
+    return Parts(mask.shape, *_runs_and_parts(_plain(mask), int(corners)))
 
 
 def largest_part(mask: Bools) -> Bools:
@@ -107,8 +107,8 @@ def _find_ends(mask: Any, first_i: Any, last_i: Any, first_j: Any, last_j: Any) 
 
 
 @nb.njit(cache=True)
-def _runs_and_parts(mask: Any) -> Any:
-    """Runs (n, 4), and the part (n,) of each."""
+def _runs_and_parts(mask: Any, beside: Any) -> Any:
+    """Runs (n, 4), and the part (n,) of each; ``beside`` is 1 where edges and corners count."""
     nx, ny, nz = mask.shape
     count = 0
     for i in range(nx):
@@ -135,10 +135,10 @@ def _runs_and_parts(mask: Any) -> Any:
                 n += 1
             line = i * ny + j
             first[line + 1] = n
-            if i > 0:
-                _join(runs, root, first, line - ny, line)
+            for y in range(max(0, j - beside), min(ny, j + beside + 1) if i > 0 else 0):
+                _join(runs, root, first, line - ny + y - j, line, beside)
             if j > 0:
-                _join(runs, root, first, line - 1, line)
+                _join(runs, root, first, line - 1, line, beside)
     parts = 0
     for r in range(count):
         if root[r] == r:
@@ -150,11 +150,11 @@ def _runs_and_parts(mask: Any) -> Any:
 
 
 @nb.njit(cache=True)
-def _join(runs: Any, root: Any, first: Any, line: Any, other: Any) -> None:
-    """Make one part of the runs of two lines that overlap."""
+def _join(runs: Any, root: Any, first: Any, line: Any, other: Any, beside: Any) -> None:
+    """Make one part of the runs of two lines that overlap, or are so many voxels apart."""
     a, b = first[line], first[other]
     while a < first[line + 1] and b < first[other + 1]:
-        if runs[a, 2] < runs[b, 3] and runs[b, 2] < runs[a, 3]:
+        if runs[a, 2] < runs[b, 3] + beside and runs[b, 2] < runs[a, 3] + beside:
             p, q = _root(root, a), _root(root, b)
             root[max(p, q)] = min(p, q)
         if runs[a, 3] < runs[b, 3]:

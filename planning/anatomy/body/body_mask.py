@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -23,7 +23,7 @@ from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown, TableSide
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned, measured_hu
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, grown
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.volumes.orientation import canonical
+from puncture_twin.planning.formats.volumes.orientation import canonical, in_order
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.parts import largest_part, middle_of, parts_of
 
@@ -85,21 +85,24 @@ class CtImage:
     """A CT, and the body that it shows by itself.
 
     Attributes:
-        hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head.
+        hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head; of 16 bits
+            where the file has such, else of single precision.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         where: The file.
         shown: What a person says that it shows.
         as_stored: Shape of ``hu``, as the file has them, where that differs.
+        measured: What was not, where that is known.
     """
 
-    hu: NDArray[np.float32]
+    hu: NDArray[Any]
     T_ct_index: Floats
     where: Path
     shown: Shown = PATIENT
-    as_stored: NDArray[np.float32] | None = None
+    as_stored: NDArray[Any] | None = None
+    measured: Unscanned | None = None
 
     @property
-    def stored(self) -> NDArray[np.float32]:
+    def stored(self) -> NDArray[Any]:
         """Hounsfield units as the file has them."""
         return self.hu if self.as_stored is None else self.as_stored
 
@@ -120,7 +123,7 @@ class CtImage:
     @cached_property
     def unscanned(self) -> Unscanned:
         """What was not measured."""
-        return find_unscanned(self.hu)
+        return self.measured or find_unscanned(self.hu)
 
     @property
     def content(self) -> Content:
@@ -130,6 +133,8 @@ class CtImage:
     def within(self, box: Box, shown: Shown = PATIENT) -> CtImage:
         """The part of it in a box, and what a person says that it shows."""
         part = tuple(slice(*ends) for ends in box)
+        if self.hu[part].shape == self.hu.shape:
+            return replace(self, shown=shown)
         T_ct_index = shifted(self.T_ct_index, box)
         return CtImage(self.hu[part], T_ct_index, self.where, shown, self.stored[part])
 
@@ -137,8 +142,9 @@ class CtImage:
 def ct_image(volume: Volume) -> CtImage:
     """A CT in Hounsfield units, whichever way its file runs."""
     oriented = canonical(volume.values, volume.T_ct_index)
-    stored = oriented.values.astype(np.float32, order="C")  # every mask that is made of it runs so too
-    return CtImage(measured_hu(stored), oriented.T_ct_index, volume.path, as_stored=stored)
+    stored = in_order(oriented.values, np.int16 if np.can_cast(oriented.values.dtype, np.int16) else np.float32)
+    hu, measured = measured_hu(stored)
+    return CtImage(hu, oriented.T_ct_index, volume.path, as_stored=stored, measured=measured)
 
 
 def body_mask(

@@ -10,6 +10,7 @@ import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy
@@ -18,13 +19,17 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.tables import TableSide
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, counts_of, widened
-from puncture_twin.planning.formats.labels.label_surface import mask_surface
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, widened
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box, joined
+from puncture_twin.planning.geometry.parts import parts_of
 from puncture_twin.planning.geometry.rigid import apply, pose
 
 SMOOTH_MM = 3.0
 """Means over a cube of this edge are compared with air: noise of a finer image falls below that of 3 mm voxels."""
+LEAST_HU = -1024.0
+"""What is below counts as this in a mean: some scanners write less than air has."""
 DENSE_HU = -700.0
 """A single voxel above this is no noise (ten times that of a low-dose image)."""
 MIN_PIECE_MM3 = 100.0
@@ -45,9 +50,6 @@ every needle, and the search would measure most axes from most of them."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
-FULL = np.ones((3, 3, 3), bool)
-"""Voxels that share a face, an edge or a corner are neighbours."""
-
 
 @dataclass(frozen=True, eq=False)
 class OutsideImage:
@@ -62,7 +64,7 @@ class OutsideImage:
         measured: What was not measured, where it was found before.
     """
 
-    hu: NDArray[np.float32]
+    hu: NDArray[Any]
     body: Bools
     T_ct_index: Floats
     spacing_mm: Floats
@@ -85,16 +87,48 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
         image: The CT and its body.
         air_hu: Voxels whose surroundings are denser than this are not air.
     """
-    hu, body = image.hu, image.body
-    unscanned = image.unscanned
-    size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(int)
-    mean = np.maximum(hu, np.float32(-1024.0))
-    scipy.ndimage.uniform_filter(mean, size=tuple(size), output=mean, mode="nearest")
-    dense = (mean > air_hu) | (hu > max(DENSE_HU, air_hu))
-    dense &= ~widened(body, size // 2 + 1)
-    dense = (dense | (hu > BODY_HU)) & ~unscanned.voxels & ~body
-    dense = _stiff_pieces(dense, hu > BODY_HU, float(np.prod(image.spacing_mm)))
+    hu, body, unscanned = image.hu, image.body, image.unscanned
+    size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(np.int64)
+    dense = np.zeros(hu.shape, bool)
+    plain_hu, plain_body = (np.require(one, requirements=["C", "W"]) for one in (hu, body))
+    _mark_dense(plain_hu, plain_body, size, float(air_hu), dense)
+    if not unscanned.voxels.any():
+        return _stiff_pieces(dense, hu, image.spacing_mm)
+    dense = _stiff_pieces(dense & ~unscanned.voxels, hu, image.spacing_mm)
     return dense | (_unscanned_beside(dense | body, body, unscanned, image.spacing_mm) & ~body)
+
+
+@nb.njit(cache=True)
+def _mark_dense(hu, body, size, air_hu, dense):  # type: ignore[no-untyped-def]  # numba infers
+    """Set what is no air beside the body: by itself, and farther off by the mean over a cube of ``size`` voxels too."""
+    ni, nj, nk = hu.shape
+    before, after = size // 2, (size - 1) // 2
+    least, alone = np.float32(LEAST_HU), max(DENSE_HU, air_hu)
+    sums, wide = np.empty(nk, np.float32), np.empty(nk, np.uint8)
+    for i in range(ni):
+        for j in range(nj):
+            wide[:] = 0
+            for x in range(max(0, i - before[0] - 1), min(ni, i + before[0] + 2)):
+                for y in range(max(0, j - before[1] - 1), min(nj, j + before[1] + 2)):
+                    for k in range(nk):
+                        wide[k] |= body[x, y, k]
+            for k in range(nk):
+                dense[i, j, k] = hu[i, j, k] > BODY_HU and not body[i, j, k]
+            if wide.all():
+                continue
+            sums[:] = 0.0
+            for x in range(i - before[0], i + after[0] + 1):
+                for y in range(j - before[1], j + after[1] + 1):
+                    line = hu[min(max(x, 0), ni - 1), min(max(y, 0), nj - 1)]
+                    for k in range(nk):
+                        sums[k] += max(np.float32(line[k]), least)
+            for k in range(nk):
+                mean = np.float32(0.0)
+                for z in range(k - before[2], k + after[2] + 1):
+                    mean += sums[min(max(z, 0), nk - 1)]
+                if mean > air_hu * size.prod() or hu[i, j, k] > alone:
+                    beside = wide[max(0, k - before[2] - 1) : k + before[2] + 2].any()
+                    dense[i, j, k] |= not beside
 
 
 def outside_surface(image: OutsideImage, mask: Bools, *, where: str | Path) -> TriangleMesh | None:
@@ -201,20 +235,24 @@ def _facing_outward(vertices: Floats, faces: Ints32) -> Ints32:
     return faces[:, ::-1] if inward else faces
 
 
-def _stiff_pieces(mask: Bools, solid: Bools, voxel_mm3: float) -> Bools:
+def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
     """The pieces that are bulky, and of others what is solid with its rim: the rest is noise, or cloth on the skin."""
-    bulky = _pieces(mask, mask, 1000.0 * BULKY_ML / voxel_mm3)
-    near = widened(solid & mask, (1, 1, 1))
-    stiff = _pieces(near, solid & mask, MIN_PIECE_MM3 / voxel_mm3)
-    return mask & (bulky | widened(stiff, (1, 1, 1)))
+    stiff = _bulky(mask, spacing_mm)
+    solid = hu > BODY_HU
+    solid &= mask
+    if not solid.any():
+        return stiff
+    box = box_in(solid, beside=2)
+    near = parts_of(widened(solid[box], (1, 1, 1)), corners=True)
+    large = near.counts(solid[box]) >= MIN_PIECE_MM3 / np.prod(spacing_mm)
+    stiff[box] |= widened(near.painted(large), (1, 1, 1)) & mask[box]
+    return stiff
 
 
-def _pieces(mask: Bools, counted: Bools, least_voxels: float) -> Bools:
-    """The pieces of a mask that hold enough voxels of another."""
-    labels, count = scipy.ndimage.label(mask, FULL)
-    kept = counts_of(labels, count, counted) >= least_voxels
-    kept[0] = False
-    return np.asarray(kept[labels])
+def _bulky(mask: Bools, spacing_mm: Floats) -> Bools:
+    """The bulky pieces of a mask."""
+    found = parts_of(mask, corners=True)
+    return found.painted(found.sizes * np.prod(spacing_mm) >= 1000.0 * BULKY_ML)
 
 
 def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_mm: Floats) -> Bools:
@@ -222,14 +260,14 @@ def _unscanned_beside(dense: Bools, body: Bools, unscanned: Unscanned, spacing_m
 
     A padding that cuts the body is not free anywhere, as what is beyond a face of the image that cuts it.
     """
-    if not unscanned.voxels.any():
-        return np.zeros_like(dense)
     ends = widened(dense, (1, 1, 1)) & unscanned.voxels & ~body
     if not ends.any():
         return np.zeros_like(dense)
-    beside = (scipy.ndimage.distance_transform_edt(~ends, sampling=spacing_mm) <= RIM_MM) & unscanned.voxels
+    beside, box = np.zeros_like(dense), box_in(ends, np.ceil(RIM_MM / spacing_mm).astype(int))
+    beside[box] = scipy.ndimage.distance_transform_edt(~ends[box], sampling=spacing_mm) <= RIM_MM
+    beside &= unscanned.voxels
     cut = unscanned.padded & widened(body, (1, 1, 1))
-    return np.asarray(beside | unscanned.padded if cut.any() else beside)
+    return beside | unscanned.padded if cut.any() else beside
 
 
 def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
@@ -264,12 +302,9 @@ def _hulls_beyond(mask: Bools, image: OutsideImage) -> list[TriangleMesh]:
     """
     if not any(mask.take(end, axis=axis).any() for axis in (0, 1) for end in (0, -1)):
         return []
-    labels, count = scipy.ndimage.label(mask, FULL)
-    sizes = counts_of(labels, count) * float(np.prod(image.spacing_mm)) / 1000.0
-    sizes[0] = 0.0
-    prisms = []
+    bulky, prisms = _bulky(mask, image.spacing_mm), []
     for axis, end in itertools.product((0, 1), (0, -1)):
-        cut = np.argwhere((sizes >= BULKY_ML)[labels.take(end, axis=axis)])
+        cut = np.argwhere(bulky.take(end, axis=axis))
         corners = (cut[:, None] + np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])).reshape(-1, 2)
         if len(corners):
             rim = corners[scipy.spatial.ConvexHull(corners).vertices]  # whole voxels have an area

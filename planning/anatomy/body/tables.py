@@ -191,7 +191,8 @@ def touching_tables(
             cut.add(side.face)
     if cut:
         trunk = trunk & ~cut_off
-        hu = np.where(cut_off, level - np.abs(hu - level), hu)
+        hu = hu.copy()
+        hu[cut_off] = level - np.abs(hu[cut_off] - level)
         drawn = drawn_sides(hu, trunk, spacing_mm, level)
     flat = flat_sides(hu, trunk, spacing_mm, level)
     prism = {side.face for side in (*flat, *drawn) if side.whole} == set(FACES)

@@ -1,4 +1,4 @@
-"""NDArray[np.float32] of a CT that the scanner did not measure: what is there is neither body nor air.
+"""Parts of a CT that the scanner did not measure: what is there is neither body nor air.
 
 Scanners and programs write one value where they did not look: beyond the circle of reconstruction, beyond the slab of a
 tilted gantry that was resampled to a straight image, in slices that fill a volume up. Some write -3024, some the value
@@ -11,10 +11,10 @@ import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, widened
+from puncture_twin.planning.geometry.parts import parts_of
 
 UNSCANNED_HU = -1500.0
 """Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
@@ -51,20 +51,23 @@ class Unscanned(NamedTuple):
     padded: Bools
 
 
-def measured_hu(hu: NDArray[np.float32]) -> NDArray[np.float32]:
+def measured_hu(hu: NDArray[Any]) -> tuple[NDArray[Any], Unscanned | None]:
     """The image with ``BLANK_HU`` where a padding is denser than air, so that no padding counts as body.
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units.
 
     Returns:
-        The image itself where there is none.
+        The image itself where there is none, and then what of it was not measured.
     """
-    dense = find_unscanned(hu).voxels & (hu >= NEARLY_AIR_HU)
-    return np.where(dense, np.float32(BLANK_HU), hu) if dense.any() else hu
+    found = find_unscanned(hu)
+    if not found.voxels.any():
+        return hu, found
+    dense = found.voxels & (hu >= NEARLY_AIR_HU)
+    return (np.where(dense, hu.dtype.type(BLANK_HU), hu), None) if dense.any() else (hu, found)
 
 
-def find_unscanned(hu: NDArray[np.float32]) -> Unscanned:
+def find_unscanned(hu: NDArray[Any]) -> Unscanned:
     """Find what the scanner did not measure.
 
     It is far below air; or it has one value that fills what is outside a circle, or a corner or a slice of the image.
@@ -73,15 +76,19 @@ def find_unscanned(hu: NDArray[np.float32]) -> Unscanned:
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
     """
-    below = np.asarray(hu < UNSCANNED_HU)
+    below = np.asarray(hu < UNSCANNED_HU) if hu.min() < UNSCANNED_HU else np.zeros(hu.shape, bool)
     circle = _outside_circle(hu, below)
     padded = _padded(hu, circle)
-    return Unscanned(below | circle | padded, padded)
+    if circle.any():
+        below |= circle[:, :, None]
+    if padded.any():
+        below |= padded
+    return Unscanned(below, padded)
 
 
-def _outside_circle(hu: NDArray[np.float32], below: Bools) -> Bools:
-    """NDArray[np.float32] outside a circle of reconstruction; where there is none, nothing."""
-    none = np.zeros(hu.shape, bool)
+def _outside_circle(hu: NDArray[Any], below: Bools) -> Bools:
+    """Pixels (nx, ny) outside a circle of reconstruction; where there is none, nothing."""
+    none = np.zeros(hu.shape[:2], bool)
     if below.all():
         return none
     least = np.min(hu, where=~below, initial=hu.max()) if below.any() else hu.min()
@@ -90,18 +97,16 @@ def _outside_circle(hu: NDArray[np.float32], below: Bools) -> Bools:
         if _is_outside_a_circle(padding):
             air = hu[(hu < NEARLY_AIR_HU) & ~padding[:, :, None]]
             if len(air) == 0 or np.mean(air == value) < STILL_AIR:
-                return none | padding[:, :, None]
+                return padding
     return none
 
 
-def _in_every_slice(hu: NDArray[np.float32], below: Bools, value: Any) -> Bools:
-    """Pixels (nx, ny) that have a value, or are below all, in every slice."""
-    padding, first, last = np.ones(hu.shape[:2], bool), 0, 1
-    while first < hu.shape[2] and padding.any():  # a few slices tell nearly always that there are none
-        z = slice(first, last)
-        padding &= ((hu[:, :, z] == value) | below[:, :, z]).all(axis=2)
-        first, last = last, 4 * last
-    return padding
+def _in_every_slice(hu: NDArray[Any], below: Bools, value: Any) -> Bools:
+    """Pixels (nx, ny) that have a value, or are below all, in every slice; none where those at the corners do not."""
+    corners = _corners(hu)[:2]
+    if not ((hu[corners] == value) | below[corners]).all():
+        return np.zeros(hu.shape[:2], bool)
+    return np.asarray(((hu == value) | below).all(axis=2))
 
 
 def _is_outside_a_circle(padding: Bools) -> bool:
@@ -118,26 +123,28 @@ def _is_outside_a_circle(padding: Bools) -> bool:
     return bool(farthest - nearest < CIRCLE_PIXELS)
 
 
-def _padded(hu: NDArray[np.float32], circle: Bools) -> Bools:
+def _padded(hu: NDArray[Any], circle: Bools) -> Bools:
     """Slices of one value, and what holds together with a corner of the image by cubes of its value.
 
-    Nothing of what is known to lie outside a circle, and nothing in an image without noise.
+    Nothing of what is known to lie outside a circle (pixels (nx, ny)), and nothing in an image without noise.
     """
     padded = np.zeros(hu.shape, bool)
     for z in np.flatnonzero(np.ptp(hu[_corners(hu)[:2]], axis=(0, 1)) == 0):
         padded[:, :, z] = (hu[:, :, z] == hu[0, 0, z]).all()
     for value in np.unique(hu[_corners(hu)]):
-        cubes = ((hu[cube] == value) & ~circle[cube] for cube in CUBES)
+        cubes = ((hu[cube] == value) & ~circle[cube[:2]][..., None] for cube in CUBES)
         if not any(cube.all() for cube in cubes):
             continue
-        same = (hu == value) & ~circle
-        labels, _ = scipy.ndimage.label(_block(same))
-        at_corners = np.unique(labels[_corners(hu)])
-        padded |= np.isin(labels, at_corners[at_corners > 0])
+        blocks = _block((hu == value) & ~circle[:, :, None])
+        found, at_corners = parts_of(blocks), np.zeros_like(blocks)
+        at_corners[_corners(hu)] = True
+        padded |= found.painted(found.counts(at_corners) > 0)
+    if not padded.any():
+        return padded
     for value in np.unique(hu[padded]):
         if not _measured_air_has_noise(hu, value):
             padded &= hu != value
-    return padded & ~circle
+    return padded & ~circle[:, :, None]
 
 
 def _corners(image: NDArray[Any]) -> tuple[slice, ...]:
@@ -151,7 +158,7 @@ def _block(same: Bools) -> Bools:
     return widened(blocks, (BLOCK_VOXELS - 1,) * 3) & same
 
 
-def _measured_air_has_noise(hu: NDArray[np.float32], value: np.float32) -> bool:
+def _measured_air_has_noise(hu: NDArray[Any], value: Any) -> bool:
     """Whether the image shows air of other values than one, and neighbours in it differ."""
     air = (hu < NEARLY_AIR_HU) & (hu > UNSCANNED_HU) & (hu != value)
     if np.count_nonzero(air) < MEASURED_AIR * np.count_nonzero(air | (hu == value)):

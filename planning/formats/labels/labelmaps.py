@@ -55,8 +55,8 @@ class LabelMap:
     @cached_property
     def boxes(self) -> dict[int, Box]:
         """The smallest index box around each label present."""
-        found = scipy.ndimage.find_objects(self.labels)
-        return {label: box for label, box in enumerate(found, start=1) if box is not None}
+        found = scipy.ndimage.find_objects(self.labels.T)  # as it lies in a file: the first index runs fastest
+        return {label: box[::-1] for label, box in enumerate(found, start=1) if box is not None}
 
     def labels_present(self) -> tuple[int, ...]:
         """The labels that at least one voxel has, rising, without the background."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +26,25 @@ class Oriented:
     def spacing_mm(self) -> NDArray[np.float64]:
         """Voxel size along each axis, shape (3,), mm."""
         return np.asarray(np.linalg.norm(self.T_ct_index[:3, :3], axis=0))
+
+
+TILE = (32, 64)
+"""Slices and rows that are copied at a time: what they take lies in a processor's own memory."""
+
+
+def in_order(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
+    """A copy that lies in memory in the order of its axes, the last one fastest, as every mask does that is made of it.
+
+    Args:
+        values: Shape (nx, ny, nz), in any order, such as a view of a file that runs the other way.
+        dtype: Of the copy.
+    """
+    found = np.empty(values.shape, dtype)
+    for k in range(0, values.shape[2], TILE[0]):
+        for j in range(0, values.shape[1], TILE[1]):
+            tile = (slice(None), slice(j, j + TILE[1]), slice(k, k + TILE[0]))
+            found[tile] = values[tile]
+    return found
 
 
 def canonical(values: NDArray[Any], T_ct_index: NDArray[np.float64]) -> Oriented:
