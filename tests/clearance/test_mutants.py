@@ -15,9 +15,8 @@ from puncture_twin.planning.reach.standoff import skin_gaps
 
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.mutant_patch import mutated
-from benchmarks.mutants import KERNELS, PLAIN
-from benchmarks.mutation import mutants
+from tools.mutants import KERNELS, PLAIN
+from tools.mutation import mutants, mutated
 
 SOURCE = inspect.getsource(puncture_twin.planning.reach.standoff)
 FILE = str(puncture_twin.planning.reach.standoff.__file__)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.servo_variants import varied
+from benchmarks.servo_rooms import varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.base.errors import InputError
