@@ -3,6 +3,7 @@
 python -m benchmarks.clearance            how fast
 python -m benchmarks.clearance --quick    a coarser grid and fewer FCL queries
 python -m benchmarks.clearance --proof    verdicts and distances instead; exit 1 where one differs
+python -m benchmarks.clearance --curves   how the cost grows, as docs/pictures/search-cost.png
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import fcl
+import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.shared import Scene, scenes, took, versions
+from benchmarks.shared import REPOSITORY, Scene, dense, least_seconds, scenes, took, versions
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.clearance.engine import NEAR_THRESHOLD_MM, too_near
 from puncture_twin.planning.clearance.fast_engine import FastEngine
@@ -31,6 +33,8 @@ RADII_MM = (0.5, 3.0, 5.5)
 PAIRS = 2000
 OTHER_DIRECTIONS, OTHER_PAIRS = 250, 60
 TOLERANCE_MM = 1e-6
+ROWS, DIRECTIONS = (71, 100, 142, 200, 283, 400), (1_000, 4_000, 16_000, 64_000, 250_000)
+"""Of the curves: rows of the dense scene's organs (50k to 1.6M triangles in all), and directions."""
 
 
 def trees(scene: Scene) -> list[fcl.CollisionObject]:
@@ -201,15 +205,53 @@ def brute_force_error(
     return worst
 
 
+def cost(rows: int, count: int) -> tuple[float, float]:
+    """Seconds to build and to search the dense scene, so many directions spread evenly over a hemisphere."""
+    scene, z = dense(rows), 1 - (np.arange(count) + 0.5) / count
+    beta, aside = np.pi * (1 + np.sqrt(5)) * np.arange(count), np.sqrt(1 - z * z)
+    rays, engine = (
+        np.stack([aside * np.cos(beta), aside * np.sin(beta), z], axis=1),
+        FastEngine(scene.meshes, threads=1),
+    )
+    build = least_seconds(lambda: FastEngine(scene.meshes, threads=1), 3)
+    return build, least_seconds(lambda: engine.measure(scene.target, rays, scene.length), 3)
+
+
+def curves() -> None:
+    """Draw both curves, print the exponents."""
+    by_triangles = {10 * rows**2: cost(rows, 32_760) for rows in ROWS}
+    by_directions = {count: cost(283, count)[1] for count in DIRECTIONS}
+    lines = {
+        "search, 32,760 directions": {n: seconds for n, (_, seconds) in by_triangles.items()},
+        "building": {n: seconds for n, (seconds, _) in by_triangles.items()},
+        "search, 801k triangles": by_directions,
+    }
+    figure, axes = plt.subplots(1, 2, figsize=(9, 4), constrained_layout=True)
+    for axis, name, points in zip(axes[[0, 0, 1]], lines, lines.values(), strict=True):
+        x, y = np.array(list(points)), np.array(list(points.values()))
+        slope = np.polyfit(np.log(x), np.log(y), 1)[0]
+        axis.loglog(x, y, "o-", label=f"{name}: exponent {slope:.2f}")
+        print(f"{name}: {y[0]:.3f} to {y[-1]:.3f} s, exponent {slope:.2f}")
+    for axis, across in zip(axes, ("triangles of five surfaces", "directions"), strict=True):
+        axis.set(xlabel=across, ylabel="processor time of one thread, s")
+        axis.grid(visible=True, which="major", alpha=0.4)
+        axis.legend(fontsize=8)
+    figure.savefig(REPOSITORY / "docs" / "pictures" / "search-cost.png", dpi=110)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a coarser grid and fewer FCL queries")
     parser.add_argument("--proof", action="store_true", help="every verdict of the grid against FCL instead")
+    parser.add_argument("--curves", action="store_true", help="how the cost grows instead")
     parser.add_argument("--scene", default="", help="only scenes whose name holds this")
     parser.add_argument("--step", type=float, default=1.0, help="of the grid, degrees")
     chosen = parser.parse_args(arguments)
     print(versions("numpy", "numba", "python-fcl"))
+    if chosen.curves:
+        curves()
+        return 0
     if chosen.proof:
         answers = [prove(scene, chosen.step) for scene in scenes(chosen.scene) if scene.name != "dense synthetic"]
         return 0 if all(answers) else 1
