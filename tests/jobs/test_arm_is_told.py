@@ -35,12 +35,17 @@ def test_terminal_and_page_say_that_no_arm_was_checked(nowhere, tmp_path, capfd)
         assert words.replace("'", "&#39;") in page
 
 
-def test_json_says_so_too(nowhere, capfd):
-    """Verdict and arm stand beside each other."""
-    assert main(["check", str(nowhere), "--theta", "0", "--beta", "0", "--json"]) == OK
+@pytest.mark.parametrize("switch", [[], ["--no-arm"]])
+def test_check_says_so_too(nowhere, switch, capfd):
+    """Verdict and arm stand beside each other in JSON; in text nothing reads "safe" alone."""
+    candidate = ["check", str(nowhere), "--theta", "0", "--beta", "0", *switch]
+    assert main([*candidate, "--json"]) == OK
     found = json.loads(capfd.readouterr().out)
     assert (found["verdict"], found["arm"], found["reachable"]) == ("safe", NOT_CHECKED, None)
-    assert any(NAMED in warning for warning in found["warnings"])
+    assert switch or any(NAMED in warning for warning in found["warnings"])
+    assert main(candidate) == OK
+    said = capfd.readouterr().out
+    assert "theta 0 deg, beta 0 deg: safe for the organs\n" in said and f"arm {NOT_CHECKED}" in said
 
 
 def test_a_robot_with_a_place_is_no_warning(capfd):

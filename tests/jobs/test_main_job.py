@@ -176,13 +176,6 @@ def test_search_prints_counts_and_writes_the_table(carton, tmp_path, capfd):
     assert found["plan"] is None
 
 
-def test_pictures_can_be_left_out(carton, tmp_path, capfd):
-    """The table alone, for those who only want numbers."""
-    assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
-    capfd.readouterr()
-    assert {path.name for path in tmp_path.iterdir()} == {"candidates.parquet", "manifest.json", "timings.json"}
-
-
 def test_a_new_search_leaves_nothing_of_an_old_one(carton, tmp_path, capfd):
     """Pictures and page of an earlier search go with it; notes that somebody keeps there stay."""
     assert main(["search", str(carton), "--no-arm", "--out", str(tmp_path)]) == OK
@@ -345,27 +338,6 @@ def without_base(carton, tmp_path):
     start, end = text.index("[registration]"), text.index("[robot]")
     (other / "case_m.toml").write_text(text[:start] + text[end:])
     return other / "case_m.toml"
-
-
-NO_BASE = "not checked: the case does not say where the robot's base is"
-
-
-@pytest.mark.parametrize("switch", [[], ["--no-arm"]])
-def test_a_case_without_a_base_is_safe_for_the_organs_only(without_base, switch, tmp_path, capfd):
-    """Search and check name the arm that was not checked, in text and in JSON; nothing reads "safe" alone."""
-    candidate = ["check", without_base, "--theta", 0, "--beta", 0, *switch]
-    code, found = run(capfd, *candidate)
-    assert (code, found["verdict"], found["arm"]) == (OK, "safe", NO_BASE)
-    main([str(word) for word in candidate])
-    said = capfd.readouterr().out
-    assert "theta 0 deg, beta 0 deg: safe for the organs\n" in said
-    assert f"arm {NO_BASE}" in said
-    search = ["search", without_base, "--out", tmp_path / "out", "--no-pictures", *switch]
-    assert run(capfd, *search)[1]["arm"] == NO_BASE
-    main([str(word) for word in search])
-    said = capfd.readouterr().out
-    assert "  safe for the organs\n" in said
-    assert f"arm {NO_BASE}" in said
 
 
 def test_an_arm_that_was_switched_off_is_named(carton, capfd):
