@@ -1,1 +1,1 @@
-"""What makes the project's own files, what breaks its modules on purpose, and what attacks it; nothing here is installed."""
+"""What makes the project's own files, breaks its modules on purpose, and attacks it; nothing here is installed."""
