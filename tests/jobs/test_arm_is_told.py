@@ -1,9 +1,9 @@
 """A result that asked no arm says so wherever it is read: terminal, JSON, page; pytest is in tests/collision_cases."""
 
 import json
-import shutil
 
 import pytest
+from case_world import coarse_carton
 
 from puncture_twin.meshes import folder
 from puncture_twin.run_twin import main
@@ -16,10 +16,8 @@ NAMED = "the case names a robot (ur3), but not where its base is: the arm is not
 @pytest.fixture(scope="module")
 def nowhere(tmp_path_factory):
     """The carton, coarse, which names a robot and does not say where its base is."""
-    here = tmp_path_factory.mktemp("nowhere") / "carton"
-    shutil.copytree(folder() / "carton", here)
-    case = here / "case_m.toml"
-    text = case.read_text().replace("step_deg = 2.0", "step_deg = 20.0")
+    case = coarse_carton(tmp_path_factory.mktemp("nowhere") / "carton", 20.0)
+    text = case.read_text()
     start, end = text.index("[registration]"), text.index("[robot]")
     case.write_text(text[:start] + text[end:])
     return case

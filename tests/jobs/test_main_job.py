@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from case_world import coarse_carton
 from PIL import Image
 
-from puncture_twin.meshes import folder
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems, read_manifest
 from puncture_twin.planning.search.context import prepare
@@ -25,11 +25,7 @@ from puncture_twin.twin.report.scene.film import FilmTimes
 @pytest.fixture(scope="module")
 def carton(tmp_path_factory):
     """The carton with a grid of 12°."""
-    here = tmp_path_factory.mktemp("carton") / "case"
-    shutil.copytree(folder() / "carton", here)
-    case = here / "case_m.toml"
-    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 12.0"))
-    return case
+    return coarse_carton(tmp_path_factory.mktemp("carton") / "case")
 
 
 @pytest.fixture(scope="module")
@@ -231,17 +227,22 @@ def test_a_rehearsal_beside_its_plan_keeps_the_plan(carton, rehearsed, tmp_path,
     assert problems(copy) == ()
 
 
-def test_ctrl_c_is_exit_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_path, monkeypatch, capfd):
-    """In the middle of a search: one line, and nothing has changed."""
+@pytest.mark.parametrize(
+    ("where", "command"),
+    [("main_job.write_table", ["search", "--no-arm"]), ("pictures.draw_map", ["rehearse"])],
+    ids=["one process", "while a second one executes the plan"],
+)
+def test_ctrl_c_is_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_path, monkeypatch, capfd, where, command):
+    """In the middle of a command: one line, and nothing has changed."""
 
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
     copy = tmp_path / "copy"
     shutil.copytree(rehearsed, copy)
-    monkeypatch.setattr("puncture_twin.twin.jobs.patient.main_job.write_table", interrupted)
-    assert main(["search", str(carton), "--no-arm", "--out", str(copy)]) == INTERRUPTED
-    assert capfd.readouterr().err.strip() == "interrupted"
+    monkeypatch.setattr(f"puncture_twin.twin.jobs.patient.{where}", interrupted)
+    assert main([*command, str(carton), "--out", str(copy)]) == INTERRUPTED
+    assert capfd.readouterr().err.splitlines()[-1] == "interrupted"
     assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
     assert problems(copy) == ()
 
@@ -272,21 +273,6 @@ def test_the_page_links_the_film_that_there_is(carton, rehearsed, tmp_path, monk
         "timings.json",
     }
     assert problems(tmp_path) == ()
-
-
-def test_ctrl_c_while_a_second_process_works(carton, rehearsed, tmp_path, monkeypatch, capfd):
-    """While a picture is drawn here and the plan executed there: one line, and nothing has changed."""
-
-    def interrupted(*arguments, **options):
-        raise KeyboardInterrupt
-
-    copy = tmp_path / "copy"
-    shutil.copytree(rehearsed, copy)
-    monkeypatch.setattr("puncture_twin.twin.jobs.patient.pictures.draw_map", interrupted)
-    assert main(["rehearse", str(carton), "--out", str(copy)]) == INTERRUPTED
-    assert capfd.readouterr().err.splitlines()[-1] == "interrupted"
-    assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
-    assert problems(copy) == ()
 
 
 def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, capfd):
