@@ -57,7 +57,7 @@ fuzz: install
 	cd tests && PYTHONPATH=..:. ../$(BIN)/python -m fuzz --runs $(RUNS) --first $(FIRST) --keep ../out/fuzz
 
 mutants: install
-	$(BIN)/python benchmarks/mutants.py --out out/mutants.json
+	$(BIN)/python -m tools.mutants --out out/mutants.json
 
 install: links $(VENV)/installed
 

@@ -1,25 +1,24 @@
 """How fast the arm answers: inverse kinematics, states, and the reach of every organ-safe direction.
 
-    python benchmarks/arm.py [--quick] [--data FOLDER_WITH_THE_CT]
+    python -m benchmarks.arm [--quick]
 
 Compared with ur-analytic-ik (per pose, all branches) and with FCL alone (states, reach). Times are CPU seconds of this
-process, so that other work on the machine counts little. The folder holds ct.nii.gz and labels_v2_fast.nii.gz
-(TotalSegmentator's example). Every comparison also counts the answers that differ.
+process, so that other work on the machine counts little. Every comparison also counts the answers that differ.
 """
 
 import argparse
-import platform
 import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from time import process_time
 
 import numpy as np
 import ur_analytic_ik
 
+from benchmarks.shared import real_ct, versions
+from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.inverse_kinematics import inverse, wrap_to_pi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
@@ -31,7 +30,6 @@ from puncture_twin.planning.search.constraints import reach_request
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.search import organ_candidates
 
-ROOT = Path(__file__).parents[1]
 CHUNK = 200
 """Poses between changes from one to the other, so that both meet the machine in the same mood."""
 SAME_ANGLE = 1e-5
@@ -42,33 +40,17 @@ def main() -> None:
     """Run all of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer poses and states, 6 degrees instead of 2")
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data" / "totalseg_abdomen_3mm")
     arguments = parser.parse_args()
-    names = ("numpy", "numba", "python-fcl", "ur-analytic-ik")
-    print(platform.processor() or platform.machine(), platform.python_version(), *(f"{n} {version(n)}" for n in names))
+    print(versions("numpy", "numba", "python-fcl", "ur-analytic-ik"))
     for name in UR_MODELS:
         kinematics(name, 2_000 if arguments.quick else 20_000)
     step = 6.0 if arguments.quick else 2.0
-    with tempfile.TemporaryDirectory() as folder:
-        reach("abdomen", abdomen(Path(folder) / "abdomen"), step, 1_000 if arguments.quick else 10_000)
-        if arguments.data.is_dir():
-            reach("real CT", real(Path(folder) / "real", arguments.data), step, 0)
-        else:
-            print(f"real CT: not here ({arguments.data})")
-
-
-def abdomen(here: Path) -> Path:
-    """The embedded abdomen, copied."""
-    shutil.copytree(ROOT / "meshes" / "abdomen", here)
-    return here / "case.toml"
-
-
-def real(here: Path, data: Path) -> Path:
-    """The real CT beside its case."""
-    shutil.copytree(ROOT / "tests" / "real", here)
-    for file in data.glob("*.nii.gz"):
-        shutil.copy(file, here)
-    return here / "case_v2.toml"
+    with tempfile.TemporaryDirectory() as name:
+        here = Path(name)
+        shutil.copytree(folder() / "abdomen", here / "abdomen")
+        reach("abdomen", here / "abdomen" / "case.toml", step, 1_000 if arguments.quick else 10_000)
+        if real_ct(here):
+            reach("real CT", here / "case_v2.toml", step, 0)
 
 
 def kinematics(name: str, count: int) -> None:

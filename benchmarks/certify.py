@@ -1,25 +1,19 @@
 """How long a certified map takes, against the dense grids; and a million random directions thrown at it.
 
-python benchmarks/certify.py             times and queries of three anatomies at 0.25 degrees, and at half of that
-python benchmarks/certify.py --million   a million random directions into certified cells of three anatomies
+python -m benchmarks.certify             times and queries of three anatomies at 0.25 degrees, and at half of that
+python -m benchmarks.certify --million   a million random directions into certified cells of three anatomies
 """
 
 from __future__ import annotations
 
 import argparse
-import platform
-import shutil
-import sys
 import tempfile
 import time
 from pathlib import Path
 
-import numba
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
-
-from benchmarks.timing import least_seconds
+from benchmarks.shared import least_seconds, real_ct, versions
 from puncture_twin.meshes import folder
 from puncture_twin.planning.case.entry import Directions, grid, outward
 from puncture_twin.planning.certify.certificate import Certificate
@@ -29,16 +23,13 @@ from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.search import organ_candidates
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-DATA = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"
 CHUNK = 50_000
 SEED = 20190401
 
 
 def times(size_deg: float, repeats: int) -> None:
     """Certify each anatomy; compare with the exact distances alone on the dense grids."""
-    versions = f"Python {platform.python_version()}, numba {numba.__version__}, numpy {np.__version__}"
-    print(f"{platform.machine()}, {versions}; processor time of one thread, best of {repeats}")
+    print(f"{versions('numba', 'numpy')}; processor time of one thread, best of {repeats}")
     print(f"fewer queries: than a {size_deg:g}-degree grid; the grid's time: of 1 degree, exact, and with its trees")
     head = "anatomy (triangles) | size, deg | map / grid (+ trees) | fewer queries | safe | undecided | really mixed"
     print(f"| {head} | map, s | grid, s (+ trees) | queries | cells |")
@@ -110,14 +101,7 @@ def million(total: int, size_deg: float) -> int:
 
 def _anatomies(temporary: Path) -> dict[str, Path]:
     cases = {"abdomen": folder() / "abdomen", "carton": folder() / "carton" / "case_m.toml"}
-    if not DATA.is_dir():
-        print(f"the real CT is not on this machine ({DATA.name}): two anatomies only")
-        return cases
-    for file in (REPOSITORY / "tests" / "real").iterdir():
-        shutil.copy(file, temporary)
-    for file in DATA.glob("*.nii.gz"):
-        (temporary / file.name).symlink_to(file)
-    return {**cases, "real CT": temporary / "case_v2.toml"}
+    return {**cases, "real CT": temporary / "case_v2.toml"} if real_ct(temporary) else cases
 
 
 def _contradictions(name: str, context: CaseContext, found: Certificate, total: int) -> int:

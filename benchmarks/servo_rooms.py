@@ -1,28 +1,27 @@
 """Does the needle's predicted error by the cameras hold? Many rooms without pictures, each drawn anew.
 
-    python -m benchmarks.servo_rooms [--rooms 2000] [--sessions 40] [--jobs 2] [--only WORD]
+    python -m benchmarks.servo_rooms [--rooms 2000] [--jobs 2] [--only WORD]
 
 A fast room draws everything that a servo case declares: arm, cameras, lenses, rod, needle, head, readings. The arm
 holds the ball at the calibration's points, the cameras see balls and markers with normal errors of the declared size,
 the arm is sent to one target by the mapping alone, then corrected by one look. Left out are pictures, contacts and the
-play's memory: each arrival errs by itself. A session has all but the pictures, the paper's chain among it.
+play's memory: each arrival errs by itself.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import platform
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from benchmarks.servo_variants import pixel_detector, varied
+from benchmarks.shared import versions
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.base.arrays import Floats
@@ -30,8 +29,8 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.twin.guidance.stereo.detection import Detector
-from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, needle_statistics, trial
+from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, Search, Spot
+from puncture_twin.twin.guidance.stereo.experiment import needle_statistics
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, adjust
 from puncture_twin.twin.guidance.stereo.joint.needle_error import (
     NeedleOutcome,
@@ -42,7 +41,6 @@ from puncture_twin.twin.guidance.stereo.joint.needle_error import (
 from puncture_twin.twin.guidance.stereo.robot_calibration import calibrating_rod, carried_rod, grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, ball_jacobian, flange_poses
-from puncture_twin.twin.guidance.stereo.session import run_session
 from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, planned_cameras
 
 PIXEL_PX = 0.03
@@ -63,6 +61,30 @@ class RoomOutcome(NamedTuple):
     chi_squared: float
     """Of the joint estimate's residuals."""
     freedom: int
+
+
+def pixel_detector(room: StereoWorkcell, sigma_px: float, rng: np.random.Generator) -> Detector:
+    """True pixels with normal errors of a standard deviation per axis."""
+
+    def see(number: int, ball: LocatedPair, search: Search) -> Spot:
+        del search
+        pixel = room.cameras[number].project(ball.center_c) + rng.normal(0.0, sigma_px, 2)
+        return Spot(pixel, max(sigma_px, 1e-6) ** 2 * np.eye(2))
+
+    return see
+
+
+def varied(case: ServoCase, **sections: dict[str, Any]) -> ServoCase:
+    """The case with some keys of its sections changed, checked as when read.
+
+    Args:
+        case: The case.
+        sections: Such as ``cameras={"noise_grey": 6.0}``.
+    """
+    content = case.file.model_dump(by_alias=True)
+    for section, keys in sections.items():
+        content[section] = (content[section] or {}) | keys
+    return replace(case, file=type(case.file).model_validate(content))
 
 
 @cache
@@ -215,46 +237,21 @@ def fast_rooms(name: str, case: ServoCase, count: int, jobs: int) -> None:
     print(line(f"{'':{len(name)}s}  servoed", [one.servoed for one in found], doubted), flush=True)
 
 
-def pixels_alone(workcell: StereoWorkcell, rng: np.random.Generator) -> Detector:
-    """True pixels with normal errors of ``PIXEL_PX``."""
-    return pixel_detector(workcell, PIXEL_PX, rng)
-
-
-def _session(case: ServoCase, seed: int) -> ServoTrial:
-    return trial(run_session(case, seed, detector_of=pixels_alone))
-
-
-def sessions(name: str, case: ServoCase, count: int, jobs: int) -> None:
-    """Whole sessions: 16 targets in one room, so rooms count, not targets."""
-    with process_pool(jobs, count) as pool:
-        trials = list(pool.map(partial(_session, case), range(count)))
-    doubted = float(np.mean([one.declaration is None or one.declaration.p < DOUBTED for one in trials]))
-    for way in ("open_loop", "servoed"):
-        needles = [getattr(row, f"needle_{way}") for one in trials for row in one.rows]
-        print(line(f"{name}: {way}", [one for one in needles if one is not None], doubted), flush=True)
-
-
 def main() -> None:
     """Parse, run, print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rooms", type=int, default=2000)
-    parser.add_argument("--sessions", type=int, default=40)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", default="", help="rows whose name contains a word")
     asked = parser.parse_args()
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # for the processes that are started: one thread each
     start = time.perf_counter()
-    print(f"numpy {np.__version__}, Python {platform.python_version()}, {os.cpu_count()} cores, {asked.jobs} processes")
+    print(f"{versions('numpy')}, {os.cpu_count()} cores, {asked.jobs} processes")
     print(f"fast rooms: {asked.rooms} a row; realised, predicted\n{HEAD}")
     for name, case in rows().items():
         if asked.only in name:
             fast_rooms(name, case, asked.rooms, asked.jobs)
-    if asked.sessions:
-        head = told_of_pixels(load_servo_case(folder() / "head"))
-        print(f"sessions without pictures: {asked.sessions} of 16 targets\n{HEAD}")
-        sessions("meshes/head as declared", head, asked.sessions, asked.jobs)
-        sessions("no play", told_of_pixels(head, backlash_deg=0.0), asked.sessions, asked.jobs)
     print(f"{time.perf_counter() - start:.0f} s")
 
 

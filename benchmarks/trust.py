@@ -2,7 +2,7 @@
 
 python -m benchmarks.trust                     100,000 rooms of each anatomy and set of markers, minutes
 python -m benchmarks.trust --quick             a tenth of the directions and 4,000 rooms
-python -m benchmarks.trust --rooms N --out F   N rooms; the table in a file too
+python -m benchmarks.trust --rooms N           N rooms
 
 Every room has its own truth: markers read and touched with errors, registered, and the needle driven by exact
 kinematics. Where the noise is ``found``, the declaration gives the errors' shape alone, and each room's residuals
@@ -14,7 +14,6 @@ rooms with s between 1/8 and 2 of the declaration.
 from __future__ import annotations
 
 import argparse
-import shutil
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -25,7 +24,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.special import chdtri, fdtri
 
-from benchmarks.scenes import DATA
+from benchmarks.shared import real_ct
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
@@ -52,8 +51,6 @@ from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, hit_mo
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-REAL_CT = DATA / "totalseg_abdomen_3mm"
 REAL_ERRORS = "\n[errors]\nct_pixel_mm = 1.5\nct_spacing_mm = 3.0\nsurface_mm = 0\n"
 """Its contours are taken for true: what is held against rooms here is the needle's own error."""
 MARKERS = (3, 4, 6)
@@ -392,11 +389,9 @@ def scenes(directions: int, temporary: Path) -> Iterator[Scene]:
     """Three anatomies: the embedded abdomen and carton, and a real CT where it is on this machine."""
     yield scene("abdomen", folder() / "abdomen", directions)
     yield scene("carton-m", folder() / "carton" / "case_m.toml", directions)
-    if not REAL_CT.is_dir():
+    if not real_ct(temporary):
         yield scene("carton-l", folder() / "carton" / "case_l.toml", directions)
         return
-    for source in (*REAL_CT.iterdir(), *(REPOSITORY / "tests" / "real").iterdir()):
-        shutil.copy(source, temporary)
     text = (temporary / "case_v2.toml").read_text("utf-8")
     for simpler in ("fle_mm = 1.0\n", "fle_ct_mm = 0.9\n", "fle_touch_mm = 0.1\n"):
         text = text.replace(simpler, "")
@@ -409,12 +404,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", type=int, default=100_000, help="of each anatomy and set of markers")
     parser.add_argument("--quick", action="store_true", help="fewer directions, 4,000 rooms")
-    parser.add_argument("--out", type=Path, help="a file that gets the table too")
     options = parser.parse_args()
     rooms, directions = (4_000, 4) if options.quick else (options.rooms, 10)
     head = "anatomy | markers | noise | realised / predicted rms | 95 % region | ECE hit | ECE touch | warned | holds"
-    lines = [f"{rooms} rooms a row; targets: {TARGETS}", f"| {head} |", "|" + "---|" * 9]
-    print("\n".join(lines), flush=True)
+    print(f"{rooms} rooms a row; targets: {TARGETS}\n| {head} |\n|" + "---|" * 9, flush=True)
     with tempfile.TemporaryDirectory() as temporary:
         for of in scenes(directions, Path(temporary)):
             for markers in MARKERS:
@@ -425,10 +418,7 @@ def main() -> None:
                     aimed_at = tally(of, markers, rooms // 4, truth=truth, found=False, corrected=True)
                     rows.append((name, aimed_at["known"]))
                 for noise, figures in rows:
-                    lines.append(f"| {of.name} | {markers} | {noise} | {figures.text()} |")
-                    print(lines[-1], flush=True)
-    if options.out is not None:
-        options.out.write_text("\n".join(lines) + "\n", "utf-8")
+                    print(f"| {of.name} | {markers} | {noise} | {figures.text()} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Draw what a wall feels of each control of the tip, for its page: ``python -m docs.control_picture``."""
+"""Draw what a wall feels of each control of the tip: ``PYTHONPATH=tests python -m docs.control_picture``."""
 
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from control_world import TIP_M, UR3, Position, impedance, press
 
-from benchmarks.experiment.workbench import TIP_M, UR3, Position, impedance, press
 from puncture_twin.twin.world.control import Admittance, VirtualMass
 
 PICTURE = Path(__file__).parent / "pictures" / "control.png"

@@ -5,11 +5,13 @@ and, in a label map, a vessel.
 """
 
 import json
+import shutil
 
 import numpy as np
 import SimpleITK
 import trimesh
 
+from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.body.body_mask import ct_image
 from puncture_twin.planning.anatomy.body.cut_ends import cut_ends
 from puncture_twin.planning.anatomy.skin import skin_of_image
@@ -143,6 +145,14 @@ def write_case(folder, *changes, text=CASE, labels=None, spacing=(2.0, 2.0, 2.0)
     write_markers(folder)
     (folder / "case.toml").write_text(changed(text, *changes))
     return folder / "case.toml"
+
+
+def coarse_carton(here, step_deg=12.0):
+    """The embedded carton, copied into a folder that is not there yet, with a coarser grid; its case file."""
+    shutil.copytree(folder() / "carton", here)
+    case = here / "case_m.toml"
+    case.write_text(changed(case.read_text(), ("step_deg = 2.0", f"step_deg = {step_deg}")))
+    return case
 
 
 def skin_from_ct(volume):

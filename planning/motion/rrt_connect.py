@@ -9,8 +9,7 @@ OMPL keeps one random generator for the whole process and reseeds it here; two p
 OMPL's space of joint angles: its bounds, and its states as angles.
 
 OMPL measures distances in it with the wrist's joints counted for half: what a robot's arm touches is decided by the
-first three joints most of the time, and branches that reach farther in those find the way through a gap sooner
-(``python -m benchmarks.approach_planners``).
+first three joints most of the time, and branches that reach farther in those find the way through a gap sooner.
 
 OMPL's shortcuts of a path, counted in steps, never in time.
 """

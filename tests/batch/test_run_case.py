@@ -4,7 +4,7 @@ import shutil
 
 import pyarrow.parquet as pq
 import pytest
-from cohort_world import fail, full, plan_of, task_of, write_patient
+from cohort_world import fail, plan_of, task_of, write_patient
 
 from puncture_twin.planning.base.output.manifest import problems
 from puncture_twin.planning.batch.plan import commit, discard, is_final, new_draft, read_row, write_row
@@ -69,14 +69,6 @@ def test_a_bug_is_a_row_that_is_tried_again(path, tmp_path):
     assert run(row, tmp_path).exit_code == 0
 
 
-def test_a_full_disk_is_no_row(path, tmp_path):
-    """It says nothing of the case: the run stops, and the case is still to be run."""
-    (row,) = plan_of(path)
-    end = run(row, tmp_path, write_page=full)
-    assert (end.exit_code, end.full) == (None, "No space left on device")
-    assert not (tmp_path / row.id).exists()
-
-
 def test_a_changed_input_is_no_row(path, tmp_path):
     """Whatever the new bytes would give: safe, or a refusal. Nothing is committed under the old id."""
     (row,) = plan_of(path)
@@ -122,6 +114,6 @@ def test_the_same_bytes_give_the_same_files(path, tmp_path):
     run(one, tmp_path / "o1")
     run(other, tmp_path / "o2")
     names = {file.name for file in (tmp_path / "o1" / one.id).iterdir()} - {"timings.json", "row.json"}
-    assert names == {"candidates.parquet", "manifest.json"} or names
+    assert "candidates.parquet" in names
     for name in names - {"manifest.json"}:
         assert (tmp_path / "o1" / one.id / name).read_bytes() == (tmp_path / "o2" / one.id / name).read_bytes()

@@ -90,13 +90,6 @@ def test_a_second_run_of_the_same_folder_is_refused(planned):
             pass
 
 
-def test_the_parts_together_are_the_whole(planned):
-    """Each case is run in one of them."""
-    out, run = planned
-    assert sum(run(part=Part(number, 4)).planned for number in (1, 2, 3, 4)) == 3
-    assert [code for code, _ in rows(out)] == [0, 0, 2]
-
-
 def test_the_same_case_twice_is_run_once(tmp_path, capfd):
     """Two rows, one result: the same bytes have one answer."""
     for name in ("a", "b"):

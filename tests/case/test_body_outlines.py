@@ -2,50 +2,30 @@
 
 import numpy as np
 import pytest
-import SimpleITK as sitk  # noqa: N813
-from case_world import ball, image_of
+from case_world import ball
+from round_body import BODY, X, Z, inside, roles, run_init, write_ct, write_mask
 
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
 from puncture_twin.planning.init.outlines import MOST_OF_SKIN, PART_OF_SKIN, agreement
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.run_twin import main
 
-SPACING = (4.0, 4.0, 4.0)
-AT = np.arange(50) * 4.0 - 98.0
-Z, Y, X = np.meshgrid(AT, AT, AT, indexing="ij")
 TARGET = (-40.0, 0.0, 10.0)
 BODY_MM = 90.0
 NAMES = ["External", "patient", "Body", "skin", "Outline", "body_trunc", "body envelope"]
 
 
-def inside(middle, radius):
-    """Voxels (z, y, x) of a ball."""
-    return (X - middle[0]) ** 2 + (Y - middle[1]) ** 2 + (Z - middle[2]) ** 2 < radius**2
-
-
-BODY = inside((0.0, 0.0, 0.0), BODY_MM)
-
-
 def write_case(folder, **masks):
     """A CT of a round body, with a tumour about the target, an aorta, and further masks."""
-    noise = np.random.default_rng(5).normal(0.0, 12.0, X.shape)
-    hu = np.where(BODY, 40.0, -1000.0) + noise
-    sitk.WriteImage(image_of(hu.astype(np.int16), SPACING), str(folder / "scan.nii.gz"))
+    write_ct(folder / "scan.nii.gz")
     (folder / "seg").mkdir()
     named = {"tumor": inside(TARGET, 6.0), "aorta": inside((36.0, 36.0, 0.0), 8.0), **masks}
     for name, voxels in named.items():
-        sitk.WriteImage(image_of(voxels.astype(np.uint8), SPACING), str(folder / "seg" / f"{name}.nii.gz"))
+        write_mask(folder / "seg" / f"{name}.nii.gz", voxels)
 
 
 def init(capfd, folder, *words):
     """Run it; returns exit code and stderr's lines."""
-    code = main(["init", str(folder), *(words or ("--target", ",".join(map(str, TARGET))))])
-    return code, capfd.readouterr().err.splitlines()
-
-
-def roles(folder):
-    """Name to role and margin of the case's structures, as a search reads them."""
-    return {one.name: (str(one.role), one.margin_mm) for one in prepare(folder, arm=False).anatomy.structures}
+    return run_init(capfd, folder, *(words or ("--target", ",".join(map(str, TARGET)))))[::2]
 
 
 @pytest.mark.parametrize("name", NAMES)

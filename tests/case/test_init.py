@@ -9,6 +9,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 import trimesh
 from case_world import MARKERS, ball, image_of
+from round_body import AT, SPACING, X, Y, Z, body_hu, inside, roles, run_init as init, write_ct, write_image, write_mask
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
@@ -17,11 +18,7 @@ from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.errors import error_model
 from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.run_twin import main
 
-SPACING = (4.0, 4.0, 4.0)
-AT = np.arange(50) * 4.0 - 98.0
-Z, Y, X = np.meshgrid(AT, AT, AT, indexing="ij")
 ORGANS = {
     "right lung": ((-40.0, 0.0, 10.0), 18.0),
     "aorta": ((36.0, 36.0, 0.0), 8.0),
@@ -29,18 +26,6 @@ ORGANS = {
 }
 """Middle (LPS, mm) and radius of balls in the body."""
 TARGET = "-40,0,10"
-
-
-def inside(middle, radius):
-    """Voxels (z, y, x) of a ball."""
-    return (X - middle[0]) ** 2 + (Y - middle[1]) ** 2 + (Z - middle[2]) ** 2 < radius**2
-
-
-def write_ct(path):
-    """A body of 90 mm about the origin, with noise, in HU."""
-    noise = np.random.default_rng(5).normal(0.0, 12.0, X.shape)
-    hu = np.where(inside((0, 0, 0), 90.0), 40.0, -1000.0) + noise
-    sitk.WriteImage(image_of(hu.astype(np.int16), SPACING), str(path))
 
 
 def labels():
@@ -55,8 +40,8 @@ def write_masks(folder):
     """A mask an organ, and an empty one."""
     folder.mkdir(exist_ok=True)
     for name, (middle, radius) in ORGANS.items():
-        sitk.WriteImage(image_of(inside(middle, radius).astype(np.uint8), SPACING), str(folder / f"{name}.nii.gz"))
-    sitk.WriteImage(image_of(np.zeros(X.shape, np.uint8), SPACING), str(folder / "spleen.nii.gz"))
+        write_mask(folder / f"{name}.nii.gz", inside(middle, radius))
+    write_mask(folder / "spleen.nii.gz", np.zeros(X.shape))
 
 
 def write_seg_nrrd(path):
@@ -85,19 +70,6 @@ def write_layered_seg_nrrd(path):
     path.write_bytes(("\n".join(lines) + "\n\n").encode() + voxels.tobytes())
 
 
-def init(capfd, folder, *words):
-    """Run it; returns exit code, stdout, stderr's lines that are no progress."""
-    code = main(["init", str(folder), *words])
-    out, err = capfd.readouterr()
-    return code, out, [line for line in err.splitlines() if not line.startswith("stage") and ", took " not in line]
-
-
-def roles(folder):
-    """Name to role and margin of the case's structures, as a search reads them."""
-    context = prepare(folder, arm=False)
-    return {one.name: (str(one.role), one.margin_mm) for one in context.anatomy.structures}
-
-
 EXPECTED = {"right lung": ("target", 0.0), "aorta": ("avoid", 5.0), "odd thing": ("avoid", 5.0)}
 
 
@@ -118,7 +90,7 @@ def segmentation_of(kind, folder):
     elif kind == "layered seg.nrrd":
         write_layered_seg_nrrd(folder / "Segmentation.seg.nrrd")
     elif kind == "csv":
-        sitk.WriteImage(image_of(labels(), SPACING), str(folder / "map.nii.gz"))
+        write_image(folder / "map.nii.gz", labels())
         (folder / "organs.csv").write_text("Structure,Value\nright lung,1\naorta,2\nodd thing,3\n")
         (folder / "notes.txt").write_text("seen by two\n")
     elif kind == "json":
@@ -154,8 +126,7 @@ def test_every_kind_of_segmentation_becomes_the_same_case(tmp_path, capfd, kind)
 
 def write_series(folder, number):
     """The CT as a DICOM series, and a scout among its slices."""
-    noise = np.random.default_rng(5).normal(0.0, 12.0, X.shape)
-    hu = np.where(inside((0, 0, 0), 90.0), 40.0, -1000.0) + noise
+    hu = body_hu()
     T = np.diag([4.0, 4.0, 4.0, 1.0])
     T[:3, 3] = -98.0
     slices = world.series((hu + 1024).astype(np.int16).transpose(2, 1, 0), T)
@@ -250,8 +221,7 @@ def test_a_lesion_in_an_organ_is_the_target_and_the_organ_is_crossed(tmp_path, c
     """Of two masks that hold the target the lesion is meant; the other cannot be avoided."""
     write_ct(tmp_path / "scan.nii.gz")
     write_masks(tmp_path / "seg")
-    lesion = image_of(inside((-40, 0, 10), 6.0).astype(np.uint8), SPACING)
-    sitk.WriteImage(lesion, str(tmp_path / "seg" / "lung tumor.nii.gz"))
+    write_mask(tmp_path / "seg" / "lung tumor.nii.gz", inside((-40, 0, 10), 6.0))
     code, _, said = init(capfd, tmp_path, "--target", TARGET, "--region", "chest")
     assert code == 0, said
     assert roles(tmp_path)["lung tumor"] == ("target", 0.0)
@@ -263,9 +233,7 @@ def test_a_vessel_that_holds_the_target_too_is_not_crossed(tmp_path, capfd):
     """Masks overlap: the artery beside a tumour became `traverse`, and every path through it was safe."""
     write_ct(tmp_path / "scan.nii.gz")
     for name, radius in (("lung tumor", 6.0), ("pulmonary_artery", 9.0)):
-        sitk.WriteImage(
-            image_of(inside((-40, 0, 10), radius).astype(np.uint8), SPACING), str(tmp_path / f"{name}.nii.gz")
-        )
+        write_mask(tmp_path / f"{name}.nii.gz", inside((-40, 0, 10), radius))
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert code == 2 and "lies inside 'pulmonary_artery', which is to be avoided" in said[-1]
 
@@ -278,8 +246,7 @@ def test_a_brainstem_that_holds_the_target_too_is_crossed_in_no_region(tmp_path,
     write_masks(tmp_path)
     (tmp_path / "right lung.nii.gz").unlink()
     for one, radius in (("tumor", 6.0), (name, 9.0)):
-        mask = image_of(inside((-40, 0, 10), radius).astype(np.uint8), SPACING)
-        sitk.WriteImage(mask, str(tmp_path / f"{one}.nii.gz"))
+        write_mask(tmp_path / f"{one}.nii.gz", inside((-40, 0, 10), radius))
     code, _, said = init(capfd, tmp_path, "--target", TARGET, "--region", region)
     assert code == 2 and f"lies inside '{name}', which is to be avoided" in said[-1]
 
@@ -290,8 +257,7 @@ def around_the_lesion(folder, name, lesion="lung tumor"):
     write_masks(folder)
     (folder / "right lung.nii.gz").unlink()
     for one, radius in ((lesion, 6.0), (name, 14.0)):
-        mask = image_of(inside((-40, 0, 10), radius).astype(np.uint8), SPACING)
-        sitk.WriteImage(mask, str(folder / f"{one}.nii.gz"))
+        write_mask(folder / f"{one}.nii.gz", inside((-40, 0, 10), radius))
 
 
 @pytest.mark.parametrize("name", ["AAA", "Rückenmark", "artère pulmonaire", "Lungenvene", "A. hepatica", "Segment_1"])
@@ -365,8 +331,7 @@ def test_a_lesion_of_the_other_space_is_asked_about(tmp_path, capfd):
     """Typed in RAS without saying so, the target lay in a lung on the other side, which became its structure."""
     write_ct(tmp_path / "scan.nii.gz")
     write_masks(tmp_path / "seg")
-    lesion = image_of(inside((40, 0, 10), 12.0).astype(np.uint8), SPACING)
-    sitk.WriteImage(lesion, str(tmp_path / "seg" / "liver_lesion.nii.gz"))
+    write_mask(tmp_path / "seg" / "liver_lesion.nii.gz", inside((40, 0, 10), 12.0))
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert code == 2 and "lies in 'right lung' (read in RAS it lies in 'liver_lesion': --space RAS)" in said[0]
     assert init(capfd, tmp_path, "--target", TARGET, "--space", "LPS")[0] == 0
@@ -384,7 +349,7 @@ def test_a_mask_that_is_none_is_no_structure_left_out(tmp_path, capfd, kind):
     """It was left out with a note, and its vessel was free."""
     write_ct(tmp_path / "scan.nii.gz")
     write_masks(tmp_path / "seg")
-    sitk.WriteImage(image_of(SPOILED[kind](), SPACING), str(tmp_path / "seg" / "vein.nii.gz"))
+    write_image(tmp_path / "seg" / "vein.nii.gz", SPOILED[kind]())
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert code == 2 and "seg/vein.nii.gz: values from " in said[0]
 
@@ -395,8 +360,7 @@ def test_a_mask_in_another_format_is_not_passed_over(tmp_path, capfd, ending):
     write_ct(tmp_path / "scan.nii.gz")
     write_masks(tmp_path / "seg")
     assert init(capfd, tmp_path, "--target", TARGET)[0] == 0
-    vein = image_of(inside((30, 0, 0), 9.0).astype(np.uint8), SPACING)
-    sitk.WriteImage(vein, str(tmp_path / "seg" / f"vein.{ending}"))
+    write_mask(tmp_path / "seg" / f"vein.{ending}", inside((30, 0, 0), 9.0))
     with pytest.raises(InputError, match=rf"vein.{ending} \(of a kind") as caught:
         prepare(tmp_path, arm=False)
     assert caught.value.code == "entries_not_read"
@@ -410,7 +374,7 @@ def test_a_mask_in_another_format_is_not_passed_over(tmp_path, capfd, ending):
 def test_tables_that_contradict_each_other_are_not_guessed(tmp_path, capfd):
     """The first by name was taken: its aorta was fat."""
     write_ct(tmp_path / "scan.nii.gz")
-    sitk.WriteImage(image_of(labels(), SPACING), str(tmp_path / "map.nii.gz"))
+    write_image(tmp_path / "map.nii.gz", labels())
     (tmp_path / "a.csv").write_text("id,name\n1,muscle\n2,torso_fat\n3,rib_left_7\n")
     (tmp_path / "b.csv").write_text("id,name\n1,right lung\n2,aorta\n3,odd thing\n")
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
@@ -422,7 +386,7 @@ def test_tables_that_contradict_each_other_are_not_guessed(tmp_path, capfd):
 def test_organs_on_the_other_side_are_taken_where_a_person_has_looked(tmp_path, capfd, third, refused):
     """Situs inversus: one pair is warned of, two are refused with a way out that is there, at this command too."""
     write_ct(tmp_path / "scan.nii.gz")
-    sitk.WriteImage(image_of(labels(), SPACING), str(tmp_path / "map.nii.gz"))
+    write_image(tmp_path / "map.nii.gz", labels())
     (tmp_path / "map.csv").write_text(f"id,name\n1,spleen\n2,liver\n3,{third}\n")
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert code == (2 if refused else 0), said
@@ -520,7 +484,7 @@ def test_a_folder_without_a_half_is_refused(tmp_path, capfd, write, missing):
 def test_a_numbering_that_is_not_told_is_asked_for(tmp_path, capfd):
     """Three balls lie in no order of a body: the option that decides is named, and decides."""
     write_ct(tmp_path / "scan.nii.gz")
-    sitk.WriteImage(image_of(labels(), SPACING), str(tmp_path / "map.nii.gz"))
+    write_image(tmp_path / "map.nii.gz", labels())
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert (code, len(said)) == (2, 1) and "--naming" in said[0], said
     code, _, said = init(capfd, tmp_path, "--target", TARGET, "--naming", "totalsegmentator-v2")

@@ -5,37 +5,28 @@ import json
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
-from case_world import SKIN, ball, case_text, image_of, structure
+from case_world import SKIN, ball, case_text, structure
+from round_body import inside, run_init, write_ct, write_mask
 
 from puncture_twin.planning.anatomy.default_roles import default_role
 from puncture_twin.planning.init.roles import likely_region
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 
-SPACING = (4.0, 4.0, 4.0)
-AT = np.arange(50) * 4.0 - 98.0
-Z, Y, X = np.meshgrid(AT, AT, AT, indexing="ij")
 HERE, THERE = (-40.0, 0.0, 10.0), (40.0, 0.0, 10.0)
 """A place of the body and what the same numbers, read in the other space, mean; LPS, mm."""
 
 
-def inside(middle, radius):
-    """Voxels (z, y, x) of a ball."""
-    return (X - middle[0]) ** 2 + (Y - middle[1]) ** 2 + (Z - middle[2]) ** 2 < radius**2
-
-
 def patient(folder, *organs):
     """A round body with an aorta, and a mask for each organ (name, voxels)."""
-    hu = np.where(inside((0, 0, 0), 90.0), 40.0, -1000.0) + np.random.default_rng(5).normal(0.0, 12.0, X.shape)
-    sitk.WriteImage(image_of(hu.astype(np.int16), SPACING), str(folder / "scan.nii.gz"))
+    write_ct(folder / "scan.nii.gz")
     for name, voxels in (("aorta", inside((36, 36, 0), 8.0)), *organs):
-        sitk.WriteImage(image_of(voxels.astype(np.uint8), SPACING), str(folder / f"{name}.nii.gz"))
+        write_mask(folder / f"{name}.nii.gz", voxels)
 
 
 def init(capfd, folder, *words):
     """Run it; returns exit code and stderr's lines that are no progress."""
-    code = main(["init", str(folder), *words, "--force"])
-    return code, [line for line in capfd.readouterr().err.splitlines() if not line.startswith("stage")]
+    return run_init(capfd, folder, *words, "--force")[::2]
 
 
 def results_warn(capfd, case, text):

@@ -4,33 +4,16 @@ import json
 
 import numpy as np
 import pytest
-import SimpleITK as sitk  # noqa: N813
-from case_world import ball, image_of
+from case_world import ball
+from round_body import BODY, X, inside, write_ct, write_image, write_mask
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.init.overrides import overrides_of, with_keys
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 
-SPACING = (4.0, 4.0, 4.0)
-AT = np.arange(50) * 4.0 - 98.0
-Z, Y, X = np.meshgrid(AT, AT, AT, indexing="ij")
 TARGET = ("--target=-40,0,10",)
 BALLS = {"nodule": ((-40.0, 0.0, 10.0), 8.0), "aorta": ((36.0, 36.0, 0.0), 8.0), "odd": ((30.0, -40.0, 0.0), 7.0)}
-
-
-def inside(middle, radius):
-    """Voxels (z, y, x) of a ball."""
-    return (X - middle[0]) ** 2 + (Y - middle[1]) ** 2 + (Z - middle[2]) ** 2 < radius**2
-
-
-BODY = inside((0.0, 0.0, 0.0), 90.0)
-
-
-def write_ct(folder):
-    """A round body with noise."""
-    hu = np.where(BODY, 40.0, -1000.0) + np.random.default_rng(5).normal(0.0, 12.0, X.shape)
-    sitk.WriteImage(image_of(hu.astype(np.int16), SPACING), str(folder / "ct.nii.gz"))
 
 
 def write_labels(folder, names=(*BALLS, "rest")):
@@ -39,7 +22,7 @@ def write_labels(folder, names=(*BALLS, "rest")):
     voxels[BODY & (len(names) > len(BALLS))] = len(BALLS) + 1
     for number, (middle, radius) in enumerate(BALLS.values(), start=1):
         voxels[inside(middle, radius)] = number
-    sitk.WriteImage(image_of(voxels, SPACING), str(folder / "map.nii.gz"))
+    write_image(folder / "map.nii.gz", voxels)
     (folder / "map.json").write_text(json.dumps({str(n): name for n, name in enumerate(names, start=1)}))
 
 
@@ -47,7 +30,7 @@ def write_masks(folder):
     """A mask a ball."""
     folder.mkdir()
     for name, place in BALLS.items():
-        sitk.WriteImage(image_of(inside(*place).astype(np.uint8), SPACING), str(folder / f"{name}.nii.gz"))
+        write_mask(folder / f"{name}.nii.gz", inside(*place))
 
 
 def init(capfd, folder, *words):
@@ -63,7 +46,7 @@ def roles(folder):
 
 def test_keys_are_written_and_read_again(tmp_path, capfd):
     """A word needs no quotes; what stands in every result is there; a table that the case lacked is made."""
-    write_ct(tmp_path)
+    write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path, tuple(BALLS))
     words = ("--set", "ct.arms=none", "--set", "needle.shaft_mm=120", "--set", "place.up=anterior")
     assert init(capfd, tmp_path, *words)[0] == 0
@@ -77,7 +60,7 @@ def test_keys_are_written_and_read_again(tmp_path, capfd):
 @pytest.mark.parametrize("words", ["needle.length=3", "ct.arms=some", "search.step_deg=fine"])
 def test_a_key_that_cannot_be_is_refused_and_leaves_nothing(tmp_path, capfd, words):
     """As a case that states it is."""
-    write_ct(tmp_path)
+    write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path, tuple(BALLS))
     code, said = init(capfd, tmp_path, "--set", words)
     assert code == 2 and words.partition("=")[0].partition(".")[2] in said
@@ -107,7 +90,7 @@ def test_a_key_takes_the_place_of_the_one_that_is_there():
 @pytest.mark.parametrize("write", [write_labels, lambda folder: write_masks(folder / "seg")])
 def test_roles_are_stated_by_name(tmp_path, capfd, write):
     """In a label map as in a folder of masks; what is ignored is told."""
-    write_ct(tmp_path)
+    write_ct(tmp_path / "ct.nii.gz")
     write(tmp_path)
     code, said = init(capfd, tmp_path, "--ignore", "odd", "--unknown", "aorta")
     assert code == 0 and "left out as stated (ignore)" in said
@@ -117,7 +100,7 @@ def test_roles_are_stated_by_name(tmp_path, capfd, write):
 
 def test_what_is_left_out_holds_no_target(tmp_path, capfd):
     """Else the rest of the body would be the target's structure, and every path into it safe."""
-    write_ct(tmp_path)
+    write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path, (*BALLS, "rest"))
     assert init(capfd, tmp_path, "--target=-10,0,10", "--ignore", "rest")[0] == 0
     context = prepare(tmp_path, arm=False)
@@ -130,7 +113,7 @@ def test_what_is_left_out_holds_no_target(tmp_path, capfd):
 )
 def test_a_name_that_nothing_has_is_refused(tmp_path, capfd, words, option):
     """With what there is; a file can be left out, and not be unknown."""
-    write_ct(tmp_path)
+    write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path)
     code, said = init(capfd, tmp_path, *words)
     assert code == 2 and option in said and "aorta" in said
@@ -138,7 +121,7 @@ def test_a_name_that_nothing_has_is_refused(tmp_path, capfd, words, option):
 
 def test_a_file_that_is_not_read_can_be_left_out(tmp_path, capfd):
     """The refusal names the option, and with it the case is read; the masks beside the file are all there."""
-    write_ct(tmp_path)
+    write_ct(tmp_path / "ct.nii.gz")
     write_masks(tmp_path / "seg")
     (tmp_path / "seg" / "portal_vein.mgz").write_bytes(b"in another format")
     code, said = init(capfd, tmp_path)
@@ -166,7 +149,7 @@ def test_a_label_map_alone_starts(tmp_path, capfd, name):
 def test_a_folder_of_masks_alone_starts(tmp_path, capfd):
     """The body's mask is the skin, and no structure."""
     write_masks(tmp_path / "seg")
-    sitk.WriteImage(image_of(BODY.astype(np.uint8), SPACING), str(tmp_path / "seg" / "body.nii.gz"))
+    write_mask(tmp_path / "seg" / "body.nii.gz", BODY)
     assert init(capfd, tmp_path)[0] == 0
     assert set(roles(tmp_path)) == set(BALLS)
 
@@ -186,7 +169,7 @@ def test_meshes_alone_start_with_the_skin_that_is_stated(tmp_path, capfd):
 
 def test_a_stated_skin_goes_before_the_cts_body(tmp_path, capfd):
     """The CT stays beside it: what it shows outside of the skin is seen."""
-    write_ct(tmp_path)
+    write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path)
     assert init(capfd, tmp_path, "--skin", "rest")[0] == 0
     context = prepare(tmp_path, arm=False)
@@ -195,7 +178,7 @@ def test_a_stated_skin_goes_before_the_cts_body(tmp_path, capfd):
 
 def test_the_image_is_proposed_as_statements(tmp_path, capfd):
     """Commented keys: without its # each is one that the case takes; a picture shows what was found."""
-    write_ct(tmp_path)
+    write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path, tuple(BALLS))
     assert init(capfd, tmp_path)[0] == 0
     case = tmp_path / "case.toml"
@@ -212,7 +195,7 @@ def test_the_image_is_proposed_as_statements(tmp_path, capfd):
 
 def test_a_phantom_is_taken_as_one(tmp_path, capfd):
     """The region is written, and no limb is looked for."""
-    write_ct(tmp_path)
+    write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path, tuple(BALLS))
     code, said = init(capfd, tmp_path, "--region", "phantom")
     assert code == 0 and "no limb is looked for" in said

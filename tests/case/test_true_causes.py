@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-import SimpleITK as sitk  # noqa: N813
-from case_world import CASE, image_of, write_case
+from case_world import CASE, write_case
+from round_body import X, body_hu, inside, write_image
 
 from puncture_twin.planning.anatomy.default_roles import NOT_ANNOTATED, default_role
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE
@@ -15,21 +15,6 @@ from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.init.finder import Wanted
 from puncture_twin.planning.init.start import Request, start_case
-
-SPACING = (4.0, 4.0, 4.0)
-AT = np.arange(40) * 4.0 - 78.0
-Z, Y, X = np.meshgrid(AT, AT, AT, indexing="ij")
-
-
-def inside(middle, radius):
-    """Voxels (z, y, x) of a ball."""
-    return (X - middle[0]) ** 2 + (Y - middle[1]) ** 2 + (Z - middle[2]) ** 2 < radius**2
-
-
-def ct():
-    """A body of 70 mm about the origin with noise, HU."""
-    noise = np.random.default_rng(5).normal(0.0, 12.0, X.shape)
-    return np.where(inside((0, 0, 0), 70.0), 40.0, -1000.0) + noise
 
 
 def labels():
@@ -42,9 +27,8 @@ def labels():
 
 def patient(folder, image=None, labelmap=None, names=None):
     """A CT and a label map; what is given replaces what is right."""
-    sitk.WriteImage(image_of(ct().astype(np.int16) if image is None else image, SPACING), str(folder / "ct.nii.gz"))
-    labelmap = labels() if labelmap is None else labelmap
-    sitk.WriteImage(image_of(labelmap, SPACING), str(folder / "labels.nii.gz"))
+    write_image(folder / "ct.nii.gz", body_hu().astype(np.int16) if image is None else image)
+    write_image(folder / "labels.nii.gz", labels() if labelmap is None else labelmap)
     if names is not None:
         (folder / "dataset.json").write_text(json.dumps({"labels": names}))
     return folder
@@ -68,7 +52,7 @@ def refused(folder):
 
 def test_an_image_without_hounsfield_units_is_no_label_map(tmp_path):
     """It was asked who numbered its labels; its air tells the offset."""
-    error = refused(patient(tmp_path, image=np.clip(ct() + 1024, 0, None).astype(np.uint16), names=NAMES))
+    error = refused(patient(tmp_path, image=np.clip(body_hu() + 1024, 0, None).astype(np.uint16), names=NAMES))
     assert error.code == "no_ct"
     assert "ct.nii.gz (no Hounsfield units, its air is 2" in error.what and "-1024 missing" in error.what
 
@@ -77,7 +61,7 @@ def test_an_image_without_hounsfield_units_is_no_label_map(tmp_path):
     ("labelmap", "code", "said"),
     [
         (lambda: np.where(labels() > 0, labels().astype(np.uint32) + 70_000, 0), "no_segmentation", "from 0 to 70003"),
-        (lambda: ct().astype(np.float32) * 0.01 + 20, "no_segmentation", "is not whole"),
+        (lambda: body_hu().astype(np.float32) * 0.01 + 20, "no_segmentation", "is not whole"),
         (lambda: labels().astype(np.float32) - 2, "no_segmentation", "from -2.0 to 1.0"),
     ],
 )

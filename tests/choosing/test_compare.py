@@ -1,13 +1,12 @@
 """Two paths side by side: each side is what `check` says of it, whichever way it was chosen."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from case_world import coarse_carton
 
-from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.plan.planner import make_plan
@@ -102,10 +101,7 @@ def test_a_plan_and_a_case_are_not_mixed(tmp_path):
 
 def test_two_plans_by_what_they_state_and_with_their_case_by_what_holds(tmp_path, capsys):
     """Chances are those of the plans' own configurations; a plan that holds no more is refused."""
-    here = tmp_path / "carton"
-    shutil.copytree(folder() / "carton", here)
-    case = here / "case_m.toml"
-    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 12.0"))
+    case = coarse_carton(tmp_path / "carton")
     context = prepare(case)
     search, names = context.search(), [tmp_path / "a.json", tmp_path / "b.json"]
     plans = [make_plan(context, search, seed=context.case.rehearsal.seed, rows=search.ranked[k:]).plan for k in (0, 1)]

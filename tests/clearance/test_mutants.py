@@ -1,7 +1,7 @@
 """The mutator itself, on a few faults: `make mutants` runs them all."""
 
 import ast
-import importlib.util
+import importlib
 import inspect
 import sys
 
@@ -15,9 +15,8 @@ from puncture_twin.planning.reach.standoff import skin_gaps
 
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.mutant_patch import mutated
-from benchmarks.mutants import KERNELS, PLAIN
-from benchmarks.mutation import mutants
+from tools.mutants import KERNELS, PLAIN, source_of
+from tools.mutation import mutants, mutated
 
 SOURCE = inspect.getsource(puncture_twin.planning.reach.standoff)
 FILE = str(puncture_twin.planning.reach.standoff.__file__)
@@ -92,9 +91,16 @@ def test_what_a_mutant_raises_when_it_is_loaded_leaves_the_module_alone():
     assert skin_gaps(NEEDLE, 0.7) == before
 
 
+def functions_of(module):
+    """The plain functions of a module, within what wraps them."""
+    values = (getattr(value, "__wrapped__", getattr(value, "py_func", value)) for value in vars(module).values())
+    return [value for value in values if inspect.isfunction(value) and value.__module__ == module.__name__]
+
+
 def test_what_is_hunted_is_there():
     """Every module that is mutated, and every file of tests that is to notice: a name that has moved hunts nothing."""
     for module, tests in {**PLAIN, **KERNELS}.items():
-        assert importlib.util.find_spec(module) is not None, module
+        found = importlib.import_module(module)
+        assert str(source_of(module)) in {one.__code__.co_filename for one in functions_of(found)}, module
         missing = [test for test in tests if not (ROOT / test.partition("::")[0]).is_file()]
         assert not missing, missing

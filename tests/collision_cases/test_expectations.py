@@ -4,6 +4,7 @@ import re
 import shutil
 
 import pytest
+from case_world import coarse_carton
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.collision_cases.checks_file import CheckSection, WindowSection
@@ -23,11 +24,7 @@ from puncture_twin.planning.search.windows import find_windows
 @pytest.fixture(scope="module")
 def carton(tmp_path_factory):
     """The carton with a grid of 12°, and its search."""
-    here = tmp_path_factory.mktemp("carton") / "carton"
-    shutil.copytree(folder() / "carton", here)
-    case = here / "case_m.toml"
-    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 12.0"))
-    context = prepare(case)
+    context = prepare(coarse_carton(tmp_path_factory.mktemp("carton") / "carton"))
     return context, context.search()
 
 

@@ -191,19 +191,6 @@ def test_a_series_that_is_no_regular_stack_is_refused_naming_the_slice(tmp_path,
     assert "\n" not in str(caught.value)
 
 
-def test_simpleitk_takes_the_uneven_and_the_missing_slice(tmp_path):
-    """Why steps are checked: its reader moves what lies behind the gap, here by 1.7 mm in the middle of four slices."""
-    T = world.affine()
-    slices = world.series(world.phantom((7, 5, 6)), world.affine())
-    folder = world.write_series(tmp_path, slices[:1] + slices[2:])
-    theirs = with_simpleitk(folder)
-    truth = expected(T, world.phantom((7, 5, 6)).astype(np.float32) - 1024)
-    wrong = [where for where, value in theirs.items() if truth.get(where) != value]
-    assert len(wrong) >= 35
-    with pytest.raises(InputError, match="1 slice is missing"):
-        read_series(folder)
-
-
 def scout():
     """A localizer: a CT image by its class, in the same folder."""
     data = world.ct_slice(world.phantom()[:, :, 0], world.affine(TURNS["coronal"]), series=world.ROOT + "50", number=77)

@@ -1,9 +1,9 @@
 """A result that asked no arm says so wherever it is read: terminal, JSON, page; pytest is in tests/collision_cases."""
 
 import json
-import shutil
 
 import pytest
+from case_world import coarse_carton
 
 from puncture_twin.meshes import folder
 from puncture_twin.run_twin import main
@@ -16,10 +16,8 @@ NAMED = "the case names a robot (ur3), but not where its base is: the arm is not
 @pytest.fixture(scope="module")
 def nowhere(tmp_path_factory):
     """The carton, coarse, which names a robot and does not say where its base is."""
-    here = tmp_path_factory.mktemp("nowhere") / "carton"
-    shutil.copytree(folder() / "carton", here)
-    case = here / "case_m.toml"
-    text = case.read_text().replace("step_deg = 2.0", "step_deg = 20.0")
+    case = coarse_carton(tmp_path_factory.mktemp("nowhere") / "carton", 20.0)
+    text = case.read_text()
     start, end = text.index("[registration]"), text.index("[robot]")
     case.write_text(text[:start] + text[end:])
     return case
@@ -35,12 +33,17 @@ def test_terminal_and_page_say_that_no_arm_was_checked(nowhere, tmp_path, capfd)
         assert words.replace("'", "&#39;") in page
 
 
-def test_json_says_so_too(nowhere, capfd):
-    """Verdict and arm stand beside each other."""
-    assert main(["check", str(nowhere), "--theta", "0", "--beta", "0", "--json"]) == OK
+@pytest.mark.parametrize("switch", [[], ["--no-arm"]])
+def test_check_says_so_too(nowhere, switch, capfd):
+    """Verdict and arm stand beside each other in JSON; in text nothing reads "safe" alone."""
+    candidate = ["check", str(nowhere), "--theta", "0", "--beta", "0", *switch]
+    assert main([*candidate, "--json"]) == OK
     found = json.loads(capfd.readouterr().out)
     assert (found["verdict"], found["arm"], found["reachable"]) == ("safe", NOT_CHECKED, None)
-    assert any(NAMED in warning for warning in found["warnings"])
+    assert switch or any(NAMED in warning for warning in found["warnings"])
+    assert main(candidate) == OK
+    said = capfd.readouterr().out
+    assert "theta 0 deg, beta 0 deg: safe for the organs\n" in said and f"arm {NOT_CHECKED}" in said
 
 
 def test_a_robot_with_a_place_is_no_warning(capfd):

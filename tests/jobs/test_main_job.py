@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from case_world import coarse_carton
 from PIL import Image
 
-from puncture_twin.meshes import folder
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems, read_manifest
 from puncture_twin.planning.search.context import prepare
@@ -25,11 +25,7 @@ from puncture_twin.twin.report.scene.film import FilmTimes
 @pytest.fixture(scope="module")
 def carton(tmp_path_factory):
     """The carton with a grid of 12°."""
-    here = tmp_path_factory.mktemp("carton") / "case"
-    shutil.copytree(folder() / "carton", here)
-    case = here / "case_m.toml"
-    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 12.0"))
-    return case
+    return coarse_carton(tmp_path_factory.mktemp("carton") / "case")
 
 
 @pytest.fixture(scope="module")
@@ -176,13 +172,6 @@ def test_search_prints_counts_and_writes_the_table(carton, tmp_path, capfd):
     assert found["plan"] is None
 
 
-def test_pictures_can_be_left_out(carton, tmp_path, capfd):
-    """The table alone, for those who only want numbers."""
-    assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
-    capfd.readouterr()
-    assert {path.name for path in tmp_path.iterdir()} == {"candidates.parquet", "manifest.json", "timings.json"}
-
-
 def test_a_new_search_leaves_nothing_of_an_old_one(carton, tmp_path, capfd):
     """Pictures and page of an earlier search go with it; notes that somebody keeps there stay."""
     assert main(["search", str(carton), "--no-arm", "--out", str(tmp_path)]) == OK
@@ -238,17 +227,22 @@ def test_a_rehearsal_beside_its_plan_keeps_the_plan(carton, rehearsed, tmp_path,
     assert problems(copy) == ()
 
 
-def test_ctrl_c_is_exit_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_path, monkeypatch, capfd):
-    """In the middle of a search: one line, and nothing has changed."""
+@pytest.mark.parametrize(
+    ("where", "command"),
+    [("main_job.write_table", ["search", "--no-arm"]), ("pictures.draw_map", ["rehearse"])],
+    ids=["one process", "while a second one executes the plan"],
+)
+def test_ctrl_c_is_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_path, monkeypatch, capfd, where, command):
+    """In the middle of a command: one line, and nothing has changed."""
 
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
     copy = tmp_path / "copy"
     shutil.copytree(rehearsed, copy)
-    monkeypatch.setattr("puncture_twin.twin.jobs.patient.main_job.write_table", interrupted)
-    assert main(["search", str(carton), "--no-arm", "--out", str(copy)]) == INTERRUPTED
-    assert capfd.readouterr().err.strip() == "interrupted"
+    monkeypatch.setattr(f"puncture_twin.twin.jobs.patient.{where}", interrupted)
+    assert main([*command, str(carton), "--out", str(copy)]) == INTERRUPTED
+    assert capfd.readouterr().err.splitlines()[-1] == "interrupted"
     assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
     assert problems(copy) == ()
 
@@ -279,21 +273,6 @@ def test_the_page_links_the_film_that_there_is(carton, rehearsed, tmp_path, monk
         "timings.json",
     }
     assert problems(tmp_path) == ()
-
-
-def test_ctrl_c_while_a_second_process_works(carton, rehearsed, tmp_path, monkeypatch, capfd):
-    """While a picture is drawn here and the plan executed there: one line, and nothing has changed."""
-
-    def interrupted(*arguments, **options):
-        raise KeyboardInterrupt
-
-    copy = tmp_path / "copy"
-    shutil.copytree(rehearsed, copy)
-    monkeypatch.setattr("puncture_twin.twin.jobs.patient.pictures.draw_map", interrupted)
-    assert main(["rehearse", str(carton), "--out", str(copy)]) == INTERRUPTED
-    assert capfd.readouterr().err.splitlines()[-1] == "interrupted"
-    assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
-    assert problems(copy) == ()
 
 
 def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, capfd):
@@ -345,27 +324,6 @@ def without_base(carton, tmp_path):
     start, end = text.index("[registration]"), text.index("[robot]")
     (other / "case_m.toml").write_text(text[:start] + text[end:])
     return other / "case_m.toml"
-
-
-NO_BASE = "not checked: the case does not say where the robot's base is"
-
-
-@pytest.mark.parametrize("switch", [[], ["--no-arm"]])
-def test_a_case_without_a_base_is_safe_for_the_organs_only(without_base, switch, tmp_path, capfd):
-    """Search and check name the arm that was not checked, in text and in JSON; nothing reads "safe" alone."""
-    candidate = ["check", without_base, "--theta", 0, "--beta", 0, *switch]
-    code, found = run(capfd, *candidate)
-    assert (code, found["verdict"], found["arm"]) == (OK, "safe", NO_BASE)
-    main([str(word) for word in candidate])
-    said = capfd.readouterr().out
-    assert "theta 0 deg, beta 0 deg: safe for the organs\n" in said
-    assert f"arm {NO_BASE}" in said
-    search = ["search", without_base, "--out", tmp_path / "out", "--no-pictures", *switch]
-    assert run(capfd, *search)[1]["arm"] == NO_BASE
-    main([str(word) for word in search])
-    said = capfd.readouterr().out
-    assert "  safe for the organs\n" in said
-    assert f"arm {NO_BASE}" in said
 
 
 def test_an_arm_that_was_switched_off_is_named(carton, capfd):

@@ -94,8 +94,6 @@ def _joined(point):
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (("--arms", "up"), "--arms: 'up' is not known; allowed: none, beside, pressed, across"),
-        (("--bed", "soft"), "--bed: 'soft' is not known; allowed: none, flat, curved, pad"),
         (("--bed", "flat"), "--bed: the case has what stands in the scanner: table"),
         (("--lines", "13"), "--lines"),
     ],

@@ -78,6 +78,15 @@ def _answers(context, R):
     return search(context.case, context.anatomy, context.engine, directions)
 
 
+def started(out, report):
+    """What `init` makes of a scan, with the needle of the case of meshes."""
+    target = ",".join(str(round(one, 3)) for one in report["target_mm"])
+    assert main(["init", str(out), "--ct", "dicom", f"--target={target}"]) == 0
+    text = (out / "case.toml").read_text()
+    (out / "case.toml").write_text(text[: text.index("[needle]")] + NEEDLE + text[text.index("[search]") :])
+    return prepare(out, arm=False)
+
+
 def least_slack(context, found):
     """Clearance beyond the margin of the structure nearest to its own, mm, by direction."""
     demanding = [k for k, one in enumerate(context.anatomy.checked) if one.demands_margin]
@@ -104,11 +113,7 @@ def test_a_scanned_case_has_the_verdicts_of_its_meshes(truth, tmp_path, capsys, 
     assert main(["scan", str(folder), "--out", str(out), *flags]) == 0
     report = json.loads(capsys.readouterr().out)
     T = np.array(report["T_scan_case"])
-    target = ",".join(str(round(one, 3)) for one in report["target_mm"])
-    assert main(["init", str(out), "--ct", "dicom", f"--target={target}"]) == 0
-    text = (out / "case.toml").read_text()
-    (out / "case.toml").write_text(text[: text.index("[needle]")] + NEEDLE + text[text.index("[search]") :])
-    scanned = prepare(out, arm=False)
+    scanned = started(out, report)
     found = _answers(scanned, T[:3, :3] @ context.case.T_ct_entry[:3, :3])
 
     assert {s.name: s.margin_mm for s in scanned.anatomy.structures} == {
@@ -149,11 +154,7 @@ def test_what_is_thinner_than_a_voxel_is_not_lost(tmp_path, capsys):
     assert main(["scan", str(tmp_path), "--out", str(out), "--spacing", "2.5", "--pixel", "1.5", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["thin_voxels"]["colon"] > 50 and report["thin_voxels"]["ganglion"] >= 1
-    target = ",".join(str(round(one, 3)) for one in report["target_mm"])
-    assert main(["init", str(out), "--ct", "dicom", f"--target={target}"]) == 0
-    text = (out / "case.toml").read_text()
-    (out / "case.toml").write_text(text[: text.index("[needle]")] + NEEDLE + text[text.index("[search]") :])
-    scanned = prepare(out, arm=False)
+    scanned = started(out, report)
     found = _answers(scanned, context.case.T_ct_entry[:3, :3])
     names = [one.name for one in scanned.anatomy.structures]
     margin = {one.name: one.margin_mm for one in scanned.anatomy.structures}

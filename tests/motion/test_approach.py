@@ -213,16 +213,6 @@ def test_home_is_a_goal_too() -> None:
     assert path.trajectory.duration_s == 0.0 and np.array_equal(path.waypoints, np.stack([LEFT, LEFT]))
 
 
-def test_refusals_say_what_touches_what() -> None:
-    """Home in a box, a goal in a box: both named, at once."""
-    checker = CellChecker(UR3, TOOL, [wall()])
-    in_wall = on_the_way_in_contact(checker)
-    with pytest.raises(NoAnswerError, match=r"home is in collision: \w+ touches wall"):
-        plan_approach(checker, in_wall, RIGHT, seed=1)
-    with pytest.raises(NoAnswerError, match=r"every goal is in collision: \w+ touches wall"):
-        plan_approach(checker, LEFT, in_wall, seed=1)
-
-
 @KINDS
 def test_a_walled_in_goal_ends_in_a_bounded_number_of_samples(kind: type[CellChecker]) -> None:
     """No clock: the planner gives up after its samples, says which side is shut in, and by what."""

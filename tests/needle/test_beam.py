@@ -1,9 +1,10 @@
 """The shaft and the beam against closed forms; the bevel's path against the laws that it must keep."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
-from benchmarks.experiment.tissue import beyond, in_every_order, proven
 from puncture_twin.planning.needle.deflection import (
     ALLOWANCE,
     GAUGES,
@@ -19,6 +20,74 @@ from puncture_twin.planning.needle.deflection import (
 
 SOLID_18 = Shaft(200.0, 1.27)
 TUBE_18 = Shaft(150.0, *GAUGES[18])
+
+
+def beyond(slenderness: float, depth: float = 12.0) -> float:
+    """By which fraction a thin stiff layer before a gap takes the tip beyond the stiffest tissue alone, at most.
+
+    Args:
+        slenderness: lambda L.
+        depth: Of the path, over 1 / lambda.
+    """
+    rate, count = slenderness / SOLID_18.length_mm, int(16 * min(depth, slenderness))
+    stiffest, alpha = 4 * SOLID_18.bending_stiffness * rate**4, np.full(count, 0.01)
+    alone = bevel_path(SOLID_18, np.full(count, stiffest), alpha, 1 / 16 / rate).largest_mm[1:]
+    worst = 0.0
+    for thick in (5, 7, 10, 12, 14, 19):  # sixteenths of 1 / lambda
+        k = np.where(np.arange(count) < thick, stiffest, 0.0)
+        worst = max(worst, float((bevel_path(SOLID_18, k, alpha, 1 / 16 / rate).largest_mm[1:] / alone).max()) - 1)
+    return worst
+
+
+def in_every_order(shaft: Shaft, tissues: tuple[float, ...], layers: int, longest: float) -> float:
+    """The greatest deflection in any order of equally thick layers over the stiffest tissue's alone, at any depth.
+
+    Args:
+        shaft: The needle's.
+        tissues: k of each tissue, N/mm^2; a layer is one of them.
+        layers: Their number.
+        longest: Depth of the path, mm.
+    """
+    count = layers * int(np.ceil(longest / layers / step_for(shaft, max(tissues))))
+    alpha, step = np.full(count, 0.01), longest / count
+    alone = bevel_path(shaft, np.full(count, max(tissues)), alpha, step).largest_mm[1:]
+    orders = (np.repeat(order, count // layers) for order in product(tissues, repeat=layers))
+    return max(float((bevel_path(shaft, k, alpha, step).largest_mm[1:] / alone).max()) for k in orders)
+
+
+def proven(shaft: Shaft, alpha: float, stiffest: float, longest: float) -> np.ndarray:
+    """A bound that is proven for every order of layers, and bevels that turn: what `docs` call the bound by energy.
+
+    With W the energy of shaft and foundation, F the tip's lateral force, M the clamp's moment, a step of the insertion
+    adds dW/ds = alpha F + M^2 / 2 EI (the envelope theorem: the rest of the shape is a minimum). W is quadratic in the
+    tip's place and in the clamp's angle, so F^2 <= 2 K W and M^2 <= 2 R W, with K and R the stiffnesses there; both
+    grow with k, so those of the stiffest tissue bound them. Then with q^2 = W
+
+        q' <= alpha sqrt(K / 2) + q R / 2 EI,    |w| <= q sqrt(2 L^3 / 3 EI)
+
+    since no cantilever bends by w at less energy than 3 EI w^2 / 2 L^3.
+
+    Args:
+        shaft: The needle's.
+        alpha: The bevel's angle, rad.
+        stiffest: The largest k, N/mm^2.
+        longest: Depth of the path, mm.
+
+    Returns:
+        At depths of whole steps from 0 on, mm; at most `step_for` apart.
+    """
+    stiffness, step = shaft.bending_stiffness, step_for(shaft, stiffest)
+    elements, growth, bound = round(shaft.length_mm / step), 0.0, [0.0]
+    beam, rotated = Beam(stiffness, step, elements), -step * np.arange(elements + 1.0)
+    for inserted in range(1, int(np.ceil(longest / step)) + 1):
+        foundation = np.where(np.arange(elements) >= elements - inserted, stiffest, 0.0)
+        held = beam.bent(foundation, 0.0 * rotated, tip_mm=1.0)
+        turned = beam.bent(foundation, rotated, tip_mm=float(rotated[-1]))  # the clamp by 1, seen from its tangent
+        moment = 6.0 * turned.deflection[1] / step**2 - 2.0 * turned.slope[1] / step  # over EI, at the clamp
+        rate = abs(moment) / 2.0
+        growth = growth * np.exp(rate * step) + alpha * np.sqrt(held.tip_force / 2.0) * np.expm1(rate * step) / rate
+        bound.append(growth * np.sqrt(2.0 * shaft.length_mm**3 / (3.0 * stiffness)))
+    return np.array(bound)
 
 
 def straight(elements):

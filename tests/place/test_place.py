@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from chen2019_reach import SHARES, WINDOWS, our_share, our_windows
 
-from benchmarks.chen2019_reach import SHARES, WINDOWS, our_share, our_windows
 from puncture_twin import run_twin
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import link_poses

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from case_world import coarse_carton
 
-from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import SpeedLimits, flange_pose, tip_speeds
 from puncture_twin.planning.arm.ur import ur_model
@@ -23,12 +23,7 @@ from puncture_twin.planning.search.context import prepare
 @pytest.fixture(scope="module")
 def carton(tmp_path_factory):
     """The carton with a grid of 12°: few candidates, some of them reachable."""
-    here = tmp_path_factory.mktemp("carton")
-    for file in (folder() / "carton").iterdir():
-        (here / file.name).write_bytes(file.read_bytes())
-    case = here / "case_m.toml"
-    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 12.0"))
-    return prepare(case)
+    return prepare(coarse_carton(tmp_path_factory.mktemp("carton") / "carton"))
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
 
-from benchmarks.chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
 from puncture_twin.planning.arm.insertion import flange_poses, needle_lines, reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, flange_pose, link_poses, singularity

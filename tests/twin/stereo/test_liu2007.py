@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from servo_world import NoContacts
 
-from benchmarks.servo_variants import pixel_detector, varied
+from benchmarks.servo_rooms import pixel_detector, varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, TargetRow, run_trial, statistics, trial

@@ -7,8 +7,7 @@ import pytest
 from scipy.special import chdtrc
 from servo_world import CASE, HELD, NoContacts, simulate
 
-from benchmarks.servo_rooms import DOUBTED, drawn_from, room_outcome, told_of_pixels
-from benchmarks.servo_variants import pixel_detector, varied
+from benchmarks.servo_rooms import DOUBTED, drawn_from, pixel_detector, room_outcome, told_of_pixels, varied
 from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.stereo.joint.joint_model import N_ROD, adjust, rod_poses
 from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_error, servoed_error

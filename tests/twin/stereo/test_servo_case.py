@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.servo_variants import varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.base.errors import InputError
@@ -61,14 +60,6 @@ def test_a_missing_case_is_named(tmp_path):
     """A folder without one."""
     with pytest.raises(InputError, match=r"servo\.toml: cannot be read"):
         load_servo_case(tmp_path)
-
-
-def test_changed_keys_are_checked_as_when_read(case):
-    """``varied`` changes what it is told and refuses what the file would."""
-    assert varied(case, cameras={"noise_grey": 6.0}).file.cameras.noise_grey == 6.0
-    assert case.file.cameras.noise_grey == 2.0
-    with pytest.raises(ValueError, match="noise_grey"):
-        varied(case, cameras={"noise_grey": -1.0})
 
 
 def test_the_head_is_open_and_holds_its_targets(case):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from servo_world import CASE
 
-from benchmarks.servo_variants import varied
+from benchmarks.servo_rooms import varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import log_rotation

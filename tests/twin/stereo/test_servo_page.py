@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from servo_world import CASE
 
-from benchmarks.servo_variants import varied
+from benchmarks.servo_rooms import varied
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.guidance.stereo.experiment import (
     DeclarationTest,

@@ -75,22 +75,6 @@ def test_correlation_is_the_point_spreads(fields, depth_mm):
         assert width == pytest.approx(sigma, rel=0.12)
 
 
-def test_measured_correlation_widens_with_depth(fields):
-    """Deep speckle is coarser than shallow speckle, both ways, without asking what the point spread is."""
-    intensity = np.abs(fields) ** 2 - 1.0
-
-    def correlation(part, axis):
-        first, second = (
-            np.take(part, range(part.shape[axis] - 2), axis),
-            np.take(part, range(2, part.shape[axis]), axis),
-        )
-        return (first * second).mean() / (part**2).mean()
-
-    shallow, deep = intensity[:, :80], intensity[:, -80:]
-    assert correlation(deep, 1) > correlation(shallow, 1) + 0.02
-    assert correlation(deep, 2) > correlation(shallow, 2) + 0.05
-
-
 def test_needle_signal_is_the_plain_sum():
     """Every sample of the shaft, spread out one by one, at a few pixels."""
     pose, rng = needle(40.0), np.random.default_rng(3)

@@ -36,7 +36,7 @@ Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low
 MARGIN_PX = 8.0
 """Beyond search region and ball: what edges and their smoothing need."""
 HOUGH_SIGMA_PX = 0.4
-"""Of a centre by Hough alone, per axis (measured: benchmarks/ball.py)."""
+"""Of a centre by Hough alone, per axis (measured: benchmarks/detectors.py)."""
 CLOSER = 2
 """Times that the edges are read again around the measured circle: the second moves it by less than 0.001 px."""
 KEPT_AWAY = 2

@@ -150,7 +150,7 @@ class DetectorSettings:
         sure_step: Below it, the end is believed only where the search's own end agrees.
         tip_bias: How far the detected tip lies beyond the true one along the shaft, on average, over the standard
             deviation of the point spread in that direction; taken off. It comes from the tip's brightness: a property
-            of a needle in a machine, measured in the twin (benchmarks/bmode.py), to be measured anew elsewhere.
+            of a needle in a machine, measured in the twin (benchmarks/detectors.py), to be measured anew elsewhere.
         inclination_deg: Directions that are tried: angle to the probe's face, on either side.
     """
 

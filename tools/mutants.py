@@ -1,4 +1,4 @@
-"""How many faults the tests notice: ``python benchmarks/mutants.py [MODULE ...]`` (``make mutants``).
+"""How many faults the tests notice: ``python -m tools.mutants [MODULE ...]`` (``make mutants``).
 
 All mutants of six plain modules and a random sample of the kernels', each against the fast tests of its module, in one
 process. The kernels run as plain Python (NUMBA_DISABLE_JIT=1). A mutant is killed by a test that fails, by an
@@ -27,10 +27,7 @@ from types import MappingProxyType
 import pytest
 from hypothesis import Phase, settings
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
-
-from benchmarks.mutant_patch import mutated
-from benchmarks.mutation import Mutant, mutants
+from tools.mutation import Mutant, mutants, mutated
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -200,8 +197,8 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 
 def source_of(module: str) -> Path:
-    """The file of a module."""
-    return REPOSITORY / (module.replace(".", "/") + ".py")
+    """The file of a module as it is imported: code of another path is exchanged nowhere."""
+    return Path(str(importlib.import_module(module).__file__))
 
 
 def hunt(module: str, tests: tuple[str, ...], numbers: frozenset[int] | None = None) -> Result:
@@ -267,10 +264,18 @@ def main() -> int:
             sample = kernel_sample(options.sample, options.seed)
             report([hunt(module, KERNELS[module], numbers) for module, numbers in sample.items()], options.out)
         else:
-            again = [sys.executable, __file__, "kernels", "--out", options.out, "--sample", str(options.sample)]
-            subprocess.run(
-                [*again, "--seed", str(options.seed)], env=os.environ | {"NUMBA_DISABLE_JIT": "1"}, check=True
-            )
+            again = [
+                sys.executable,
+                "-m",
+                "tools.mutants",
+                "kernels",
+                "--out",
+                options.out.resolve(),
+                "--sample",
+                str(options.sample),
+            ]
+            plain = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+            subprocess.run([*again, "--seed", str(options.seed)], env=plain, cwd=REPOSITORY, check=True)
     return 0
 
 

@@ -1,6 +1,6 @@
 """Sixteen million verdicts of the product against FCL and against a plain brute force, on hostile scenes.
 
-``python benchmarks/long_proof.py --count 16000000 --log FILE`` writes one line per scene, without times, and prints the
+``python -m tools.long_proof --count 16000000 --log FILE`` writes one line per scene, without times, and prints the
 log's SHA-256: the same seed and count give the same digest. A log that is there is continued, and only reported where
 it is long enough. Exit 1 where a "safe" is wrong.
 
@@ -25,13 +25,11 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a script, beside the package
-
-from benchmarks.hostile_scenes import KINDS, HostileScene, make_scene
-from benchmarks.plain_distance import Inside, distances, exact_distance, least_distances
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.clearance.engine import measure
 from puncture_twin.planning.clearance.fast_engine import FastEngine
+from tools.hostile_scenes import KINDS, HostileScene, make_scene
+from tools.plain_distance import Inside, distances, exact_distance, least_distances
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -1,10 +1,14 @@
-"""Make ``meshes/ur`` from two wheels: link shapes as STL, a small URDF for each arm, and their manifest.
+"""Make ``meshes/ur`` from three wheels: link shapes as STL, a small URDF for each arm, and their manifest.
 
-    python benchmarks/ur_e_series.py airo_models-0.0.12-py3-none-any.whl compas_fab-2.0.1-py3-none-any.whl meshes/ur
+    python -m tools.ur_links AIRO COMPAS EXAMPLE meshes/ur
 
-airo-models has the UR3e and UR5e, compas-fab the UR10e. The shapes are the collision meshes as they ship, triangle by
-triangle; origins, masses and joints are the numbers of the packages' own URDFs, the turned ``base_link_inertia`` taken
-together with ``base_link``, ``flange`` with ``tool0``.
+airo_models-0.0.12-py3-none-any.whl has the UR3e and UR5e, compas_fab-2.0.1-py3-none-any.whl the UR10e. Their shapes
+are the collision meshes as they ship, triangle by triangle; origins, masses and joints are the numbers of the packages'
+own URDFs, the turned ``base_link_inertia`` taken together with ``base_link``, ``flange`` with ``tool0``.
+
+example_robot_data-6.0.0-0-py3-none-any.whl has the UR3, UR5 and UR10: the same shapes without its 440 MB. The collision
+meshes are copied byte by byte. Of the URDFs stay the seven links, their joints and ``tool0``, with every number as it
+is; a link is drawn as its collision mesh.
 """
 
 from __future__ import annotations
@@ -48,26 +52,36 @@ ARMS = {
 }
 """Arm to its wheel, URDF and meshes."""
 
+CB_ARMS = ("ur3", "ur5", "ur10")
+
+ROBOTS = "cmeel.prefix/share/example-robot-data/robots/ur_description"
+"""Where the wheel has them."""
+
+KEPT = frozenset({"tool0", *(f"{link}_link" for link in LINKS)})
+"""Links of those URDFs; the others are a second root, a frame without a body, and a 1 cm box at the flange."""
+
 UNBOUND = 'xmlns:drake="https://drake.mit.edu"'
 """The URDFs of airo-models use this prefix and do not declare it."""
 
 
 def main() -> None:
     """Parse, make, write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("airo", type=Path)
-    parser.add_argument("compas", type=Path)
-    parser.add_argument("out", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name in ("airo", "compas", "example", "out"):
+        parser.add_argument(name, type=Path)
     arguments = parser.parse_args()
     wheels, files = (arguments.airo, arguments.compas), []
     for name, (which, urdf, mesh) in ARMS.items():
         with zipfile.ZipFile(wheels[which]) as wheel:
-            files += _arm(name, wheel, wheels[which].name, urdf, mesh, arguments.out)
-    document = {"schema": 1, "made_by": "benchmarks/ur_e_series.py", "licence": "LICENSE", "files": files}
+            files += _e_series(name, wheel, wheels[which].name, urdf, mesh, arguments.out)
+    with zipfile.ZipFile(arguments.example) as wheel:
+        for name in CB_ARMS:
+            files += _cb_series(name, wheel, arguments.example.name, arguments.out)
+    document = {"schema": 1, "made_by": "tools/ur_links.py", "licence": "LICENSE", "files": files}
     (arguments.out / "manifest.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
-def _arm(name: str, wheel: zipfile.ZipFile, package: str, urdf: str, mesh: str, out: Path) -> list[dict[str, Any]]:
+def _e_series(name: str, wheel: zipfile.ZipFile, package: str, urdf: str, mesh: str, out: Path) -> list[dict[str, Any]]:
     """Write one arm's files; their entries."""
     (out / name).mkdir(parents=True, exist_ok=True)
     entries = []
@@ -147,6 +161,43 @@ def _joint(robot: ElementTree.Element, source: ElementTree.Element, at: int) -> 
 def _origin(element: ElementTree.Element) -> dict[str, str]:
     origin = element.find("origin")
     return {key: origin.get(key) for key in ("rpy", "xyz")}
+
+
+def _cb_series(name: str, wheel: zipfile.ZipFile, package: str, out: Path) -> list[dict[str, Any]]:
+    """Write one arm's files; their entries."""
+    (out / name).mkdir(parents=True, exist_ok=True)
+    entries = []
+    for link, file in LINKS.items():
+        source = f"{ROBOTS}/meshes/{name}/collision/{file}.stl"
+        data = wheel.read(source)
+        entries.append(manifest_entry(out, f"{name}/{link}.stl", data, package, source, data))
+        entries[-1]["triangles"] = int.from_bytes(data[80:84], "little")
+    source = f"{ROBOTS}/urdf/{name}_robot.urdf"
+    data = wheel.read(source)
+    written = _cb_urdf(name, ElementTree.fromstring(data))
+    entries.append(manifest_entry(out, f"{name}.urdf", written, package, source, data))
+    return entries
+
+
+def _cb_urdf(name: str, source: ElementTree.Element) -> bytes:
+    """The package's URDF without what no one here reads; every mesh is ours."""
+    robot = ElementTree.Element("robot", name=name)
+    for element in source:
+        ends = {end.get("link") for tag in ("parent", "child") for end in element.findall(tag)}
+        if element.tag == "link" and element.get("name") in KEPT:
+            robot.append(_cb_link(name, element))
+        if element.tag == "joint" and ends <= KEPT:
+            robot.append(element)
+    ElementTree.indent(robot, " ")
+    return ElementTree.tostring(robot, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def _cb_link(name: str, link: ElementTree.Element) -> ElementTree.Element:
+    for mesh in link.iter("mesh"):
+        file = mesh.get("filename").rpartition("/")[2].partition(".")[0]
+        ours = next(ours for ours, theirs in LINKS.items() if theirs == file)
+        mesh.set("filename", f"package://ur/{name}/{ours}.stl")
+    return link
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Approaches in random workcells, each checked again by FCL alone at ten times the density of its own check.
 
-    python -m benchmarks.approach_attack --out FILE [--cells N] [--first K] [--problems M]
+    python -m tools.approach_attack --out FILE [--cells N] [--first K] [--problems M]
 
 A workcell is three to eight boxes near a UR3 that stands on a table; home and three goals are free states anywhere. The
 arm is planned with 5 mm of padding. A path is invalid where the arm without it touches something for FCL, or comes

@@ -1,4 +1,4 @@
-"""A UR3 at the carton of Chen et al. 2019, alone with a wall, a weight or a piece of tissue at its needle's tip."""
+"""A UR3 at the carton of Chen et al. 2019, alone with a wall or a weight at its needle's tip, and what is measured."""
 
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -12,13 +12,9 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.motion.follow import Rates, time_law
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
-from puncture_twin.planning.needle.deflection import Layer, Shaft, Tissue, bevel_path
-from puncture_twin.planning.needle.insertion_force import insertion_force
 from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.search.bending import Insertion
-from puncture_twin.twin.plant.true_needle import StraightPath, TrueTissue
 from puncture_twin.twin.world.arm import load_arm
-from puncture_twin.twin.world.client import physics_client, pybullet
+from puncture_twin.twin.world.client import physics_client, pybullet, step
 from puncture_twin.twin.world.control import (
     Goals,
     Impedance,
@@ -44,11 +40,6 @@ OUTWARD = T_BASE_CT[:3, :3] @ [np.sin(THETA) * np.cos(BETA), np.sin(THETA) * np.
 TARGET = T_BASE_CT[:3, :3] @ [50.0, 130, 63] + T_BASE_CT[:3, 3]
 DOWN = -T_BASE_CT[:3, 2]
 EXACT = np.zeros(6)
-SHAFT = Shaft(200.0, 1.27)
-LAYERS = (
-    Layer(0.0, 25.0, Tissue(0.1, 0.9, 0.02, 4.0, 4.0)),
-    Layer(25.0, 50.0, Tissue(0.1, 0.9, 0.02, 2.0, 3.0)),
-)
 FRICTION_NM = np.array([0.3, 0.3, 0.15, 0.05, 0.05, 0.05])
 
 
@@ -170,9 +161,50 @@ def pressed_by(force_n):
     return lambda tip: [Push(force_n, tip.position_m[0])]
 
 
-def tissue(entry_base, into_base, degrees=1.0):
-    """Skin that ruptures at 4 N, a capsule at 25 mm, cutting and friction; a bevel that cuts to the flange's x."""
-    count = 50
-    path = bevel_path(SHAFT, np.full(count, 0.1), np.full(count, np.radians(degrees)), 1.0)
-    passed = Insertion(path, insertion_force(LAYERS), np.inf, np.inf)
-    return TrueTissue(passed, StraightPath(entry_base, into_base), 0.0, SHAFT.length_mm)
+def release(down, count=20, seed=1):
+    """The largest joint acceleration after a release under the model's torque: ours, and under PyBullet's own."""
+    rng, worst = np.random.default_rng(seed), [0.0, 0.0]
+    with bench(np.array(down, dtype=float)) as world:
+        world.arm.release()
+        for q in rng.uniform(-3.0, 3.0, (count, 6)):
+            own = np.array(
+                pybullet.calculateInverseDynamics(
+                    world.arm.body, q.tolist(), [0.0] * 6, [0.0] * 6, physicsClientId=world.client
+                )
+            )
+            for which, torque in enumerate((world.model.inverse_dynamics(q, np.zeros(6), np.zeros(6)), own)):
+                world.arm.place(q)
+                world.arm.torque(torque)
+                step(world.client)
+                worst[which] = max(worst[which], float(np.abs(world.arm.state().speed).max()) * 240.0)
+    return worst
+
+
+def free_space(speed_mm_s, friction=None, seed=1, length_mm=20.0):
+    """Mean and largest tip error of an insertion with true masses 10 % off, mm."""
+    factors = np.random.default_rng(seed).uniform(0.9, 1.1, 20)
+    with bench(factors=factors) as world:
+        controller = impedance(world)
+        controller = controller if friction is None else WithFriction(controller, friction)
+        _, error = follow(world, controller, along_needle(150.0, length_mm, speed_mm_s), settle_s=0.5)
+    return float(error.mean()), float(error.max())
+
+
+def compliance(K, force_n, direction):
+    """Displacement over F / K under a force at rest."""
+    still = along_needle(60.0, 1e-3, 1.0)
+    start = true_tip(still.q[-1])
+    across = start.R_base_tip[0, :, direction]
+    with bench() as world:
+        controller = impedance(world, K, K_i=0.0)
+        done, _ = follow(world, controller, still, hold_s=0.6, resistance=pressed_by(force_n * across))
+    return float((done.tip_m[-1] - start.position_m[0]) @ across * K / force_n)
+
+
+def hand_over():
+    """How far the tip moves when torques take over from motors at rest, mm."""
+    trajectory = along_needle(60.0, 1e-3, 1.0)
+    with bench() as world:
+        held, _ = follow(world, Position(), trajectory, hold_s=0.5)
+        taken, _ = follow(world, impedance(world), trajectory, hold_s=0.3, place=False)
+    return 1e3 * float(np.linalg.norm(taken.tip_m - held.tip_m[-1], axis=1).max())
