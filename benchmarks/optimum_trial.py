@@ -15,7 +15,7 @@ from puncture_twin.twin.guidance.stereo.detection import picture_detector
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, Unknowns, bound
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.session import DetectorOf, run_session
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell
 
 Floats = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from puncture_twin.twin.guidance.stereo.detection import Detector, picture_detec
 from puncture_twin.twin.guidance.stereo.experiment import Statistics, run_trials, statistics
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import DetectorOf
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell
 
 PIXEL_PX = 0.02
 """Error of a ball's centre, per axis, where the pictures are left out: what they give at noise 2."""

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, Search, Spot
+from puncture_twin.twin.guidance.stereo.detection import Detection, Detector, LocatedPair, Search
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell
 
 
 def pixel_detector(room: StereoWorkcell, sigma_px: float, rng: np.random.Generator) -> Detector:
     """True pixels with normal errors of a standard deviation per axis."""
 
-    def see(number: int, ball: LocatedPair, search: Search) -> Spot:
+    def see(number: int, ball: LocatedPair, search: Search) -> Detection:
         del search
         pixel = room.cameras[number].project(ball.center_c) + rng.normal(0.0, sigma_px, 2)
-        return Spot(pixel, max(sigma_px, 1e-6) ** 2 * np.eye(2))
+        return Detection(pixel, max(sigma_px, 1e-6) ** 2 * np.eye(2))
 
     return see
 

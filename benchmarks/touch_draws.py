@@ -28,7 +28,7 @@ from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding
 from puncture_twin.planning.uncertainty.hit import touch_chance
-from puncture_twin.planning.uncertainty.lines import NeedleDoubt, line_chance, needle_doubt, walked
+from puncture_twin.planning.uncertainty.lines import NeedleUncertainty, line_chance, needle_uncertainty, walked
 
 SEED, MARKERS = 20191104, 4
 SURE = 1e-3
@@ -57,7 +57,7 @@ def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
     for i, outward in enumerate(scene.outward_ct):
         errors = rng.multivariate_normal(np.zeros(6), cov_ct[i], draws, method="eigh")
         origins, along = case.target_ct + errors[:, :3], exp_rotation(errors[:, 3:]) @ outward
-        doubt = needle_doubt(case.target_ct, outward, cov_ct[i], 0.0)
+        doubt = needle_uncertainty(case.target_ct, outward, cov_ct[i], 0.0)
         for place, column in enumerate(columns):
             length = float(lengths[i, column])
             for threshold in case.needle.radius_mm + np.array([0.0, anatomy.checked[column].margin_mm]):
@@ -80,7 +80,9 @@ def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
     return np.array(rows).reshape(-1, 6)
 
 
-def one_line(faces: NearFaces, doubt: NeedleDoubt, length: float, threshold: float, gradient: np.ndarray) -> float:
+def one_line(
+    faces: NearFaces, doubt: NeedleUncertainty, length: float, threshold: float, gradient: np.ndarray
+) -> float:
     """The chance along the line that first order says is steepest, followed to where it truly touches."""
     slope = doubt.root.T @ gradient
     basis = np.zeros((6, 6))
@@ -89,7 +91,9 @@ def one_line(faces: NearFaces, doubt: NeedleDoubt, length: float, threshold: flo
     return float(walked(problem, doubt.root, 0.0, basis, np.zeros((1, 5)), np.ones(1))[0])
 
 
-def ten_distances(faces: NearFaces, doubt: NeedleDoubt, length: float, threshold: float, gradient: np.ndarray) -> float:
+def ten_distances(
+    faces: NearFaces, doubt: NeedleUncertainty, length: float, threshold: float, gradient: np.ndarray
+) -> float:
     """The chance of a normal distance, its mean and deviation those of ten displaced needles.
 
     They lie at sqrt(5) standard deviations along five axes, both ways: exact for polynomials of the third degree.

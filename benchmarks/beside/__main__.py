@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.beside.scene import Asked, judged
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.plant.outside_objects import Beside
+from puncture_twin.twin.plant.outside_objects import OutsideObjects
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 
 ARMS, BEDS = ("beside", "pressed", "across"), ("flat", "curved", "pad", "none")
@@ -31,7 +31,7 @@ def asked(number: int) -> Asked:
     """The scene of a number."""
     rng = np.random.default_rng([number, 15])
     spacing, pixel, noise = VOXELS[rng.integers(len(VOXELS))]
-    beside = Beside(ARMS[number % 3], BEDS[rng.integers(len(BEDS))], int(rng.integers(0, 5)))
+    beside = OutsideObjects(ARMS[number % 3], BEDS[rng.integers(len(BEDS))], int(rng.integers(0, 5)))
     fov = FIELDS[rng.integers(len(FIELDS))]
     return Asked(number, beside, ScanSettings(spacing, pixel, noise, seed=number, fov_mm=fov, length_mm=LENGTH_MM))
 

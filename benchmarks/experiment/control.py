@@ -24,7 +24,7 @@ from benchmarks.experiment.workbench import (
     true_tip,
 )
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.plant.true_needle import Felt
+from puncture_twin.twin.plant.true_needle import TissueForce
 from puncture_twin.twin.world.client import pybullet, step
 from puncture_twin.twin.world.control import Admittance, VirtualMass
 
@@ -78,7 +78,7 @@ class Inserted(NamedTuple):
     most_mm: float
     mean_mm: float
     cost: float
-    felt: Felt
+    felt: TissueForce
 
 
 def through_layers(speed_mm_s=10.0):

@@ -145,7 +145,7 @@ def blank_row(planned: PlannedCase, exit_code: int | None, reason: str | None) -
     return row | stated | {"exit_code": exit_code, "reason": reason, "directions": 0, "safe": 0, "page": False}
 
 
-def found_row(planned: PlannedCase, context: CaseContext, candidates: Candidates) -> dict[str, Any]:
+def searched_row(planned: PlannedCase, context: CaseContext, candidates: Candidates) -> dict[str, Any]:
     """The row of a case that was searched."""
     safe = int(candidates.safe.sum())
     row = blank_row(planned, 0 if safe else 1, None if safe else no_safe_reason(candidates))

@@ -18,7 +18,7 @@ from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.progress import Stages
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
-from puncture_twin.planning.batch.merge import blank_row, found_row
+from puncture_twin.planning.batch.merge import blank_row, searched_row
 from puncture_twin.planning.batch.plan import (
     PAGE_NAME,
     PROGRAM_FAILED,
@@ -139,11 +139,11 @@ def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
 
 
 def _searched(task: CaseTask, context: CaseContext, draft: Path) -> dict[str, Any]:
-    found = context.search()
-    write_table(found, context.provenance(), draft / TABLE_NAME)
-    row = found_row(task.planned, context, found)
+    candidates = context.search()
+    write_table(candidates, context.provenance(), draft / TABLE_NAME)
+    row = searched_row(task.planned, context, candidates)
     if task.write_page is not None:
-        task.write_page(context, found, draft)
+        task.write_page(context, candidates, draft)
         row["page"] = (draft / PAGE_NAME).is_file()
     return row
 

@@ -97,9 +97,9 @@ def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tupl
     )
 
 
-def best_change(found: tuple[Change, ...]) -> Change:
+def best_change(options: tuple[Change, ...]) -> Change:
     """The one that leaves the least error."""
-    return min(found, key=lambda one: one.rms_mm)
+    return min(options, key=lambda one: one.rms_mm)
 
 
 def _slices(chain: Chain, bed_ct: Floats) -> Iterator[Change]:

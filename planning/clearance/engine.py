@@ -19,7 +19,7 @@ from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats, Ints, Ints32
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.blocks import Blocks
-from puncture_twin.planning.geometry.containment import holds
+from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.triangle_distance import nearest_point
 
 
@@ -162,7 +162,7 @@ def measure(
         distance, depth = axes.distance.copy(order="K"), axes.depth.copy(order="K")  # a structure's row by row
     violated = np.zeros_like(distance, bool)
     for column, structure in enumerate(structures):
-        if holds(structure.mesh, target_ct):
+        if contains(structure.mesh, target_ct):
             distance[:, column] = depth[:, column] = 0.0
         if structure.demands_margin:
             limit = radius + structure.margin_mm

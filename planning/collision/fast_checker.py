@@ -26,8 +26,8 @@ from puncture_twin.planning.collision.kernels.segments import (
     NOT_FINITE,
     QUERY,
     Answer,
-    Room,
-    segment_room,
+    SegmentScratch,
+    segment_scratch,
 )
 from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES_OUTSIDE
 from puncture_twin.planning.collision.packed import ROUND
@@ -156,12 +156,12 @@ class FastChecker(CellChecker):
 
     def segment_checker(self, clear_mm: float = 0.0) -> SegmentChecker:
         """A check of many segments, which remembers what touched last; with a clearance where their ends have it."""
-        return SegmentChecker(self.model, self._tested, self._proofs, self._segment_room, clear_mm)
+        return SegmentChecker(self.model, self._tested, self._proofs, self._segment_scratch, clear_mm)
 
     @cached_property
-    def _segment_room(self) -> Room:
+    def _segment_scratch(self) -> SegmentScratch:
         """Where segments are checked, one after the other."""
-        return segment_room(self._proofs.scene, self._proofs.movers)
+        return segment_scratch(self._proofs.scene, self._proofs.movers)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
         """The questions at ``q`` (6,) that are left to FCL."""
@@ -210,7 +210,7 @@ QUESTIONS = 256
 class _Filled(NamedTuple):
     """What the compiled code fills."""
 
-    room: Room
+    scratch: SegmentScratch
     answer: Answer
 
 
@@ -224,19 +224,19 @@ class SegmentChecker:
         model: The arm.
         checks: The questions that may find a contact.
         proofs: The same, packed.
-        room: For them; several may share it, one after the other.
+        scratch: For them; several may share it, one after the other.
         clear_mm: What the padded arm is to keep from patient and boxes besides; of each body and obstacle that are
             nearer to one another at an end of the segment, most of their distance there. What is not proven to be kept
             counts as a contact.
     """
 
     def __init__(
-        self, model: UrModel, checks: Sequence[Check], proofs: Proofs, room: Room, clear_mm: float = 0.0
+        self, model: UrModel, checks: Sequence[Check], proofs: Proofs, scratch: SegmentScratch, clear_mm: float = 0.0
     ) -> None:
         self._model, self._checks, self._clear_mm = model, checks, clear_mm
         self._packed = (proofs.scene, proofs.movers, model.lengths)
         self._order = np.arange(len(checks), dtype=np.int64)
-        self._filled = _Filled(room, _empty_answer(QUESTIONS))
+        self._filled = _Filled(scratch, _empty_answer(QUESTIONS))
 
     def __call__(self, start: Floats, end: Floats) -> Contact | None:
         """A contact on the segment between two states (6,), rad, the needle being outside the patient; None if free.

@@ -92,7 +92,7 @@ class PackedHulls:
         axes = by_axes(corners)
         inner = np.concatenate([inscribed_prism(piece) if about else piece for piece, about in pieces])
         count = len(self._boxes)
-        boxes, arm = (kept_enclosed(some, cache) for some in (self._corners[:count], self._corners[count:]))
+        boxes, arm = (cached_enclosed(some, cache) for some in (self._corners[:count], self._corners[count:]))
         centres, radii, slack, sizes, few, degrees = (
             np.concatenate([boxes[key], arm[key]]) for key in ("centres", "radii", "slack", "sizes", "few", "degrees")
         )
@@ -124,7 +124,7 @@ def by_axes(points: Floats) -> Axes:
     return x, y, z
 
 
-def kept_enclosed(hulls: Sequence[Floats], cache: Cache) -> Arrays:
+def cached_enclosed(hulls: Sequence[Floats], cache: Cache) -> Arrays:
     """`enclosed` from the cache: boxes apart from the arm, which is the same for every patient."""
     return cache.arrays(made_from("hulls", hulls), lambda: enclosed(hulls), by=__name__)
 

@@ -103,7 +103,7 @@ class Proofs:
         packed = hulls.packed(cache)
         skin = packed_skin(patient, skin_triangles, cache)
         self.scene = ProofScene(np.array(rows, dtype=np.int64), skin, spheres, *packed)
-        self._beside = settled_kernels.beside_triangle(self.scene.hulls, STACK)
+        self._beside = settled_kernels.triangle_scratch(self.scene.hulls, STACK)
         self._levers = np.array([joint_levers(model, check) for check in checks])
         self.movers = packed_movers(checks)
         self._work = scratch(len(rows), len(self.scene.hulls.radii))

@@ -134,8 +134,8 @@ def is_harmless(name: str, names: Collection[str]) -> bool:
     about = about.removeprefix(APPLE_DOUBLE)
     if about != name and any(f"{one}.".startswith(f"{about}.") and not one.endswith(BESIDE) for one in names):
         return True
-    told = not STRUCTURE_LIKE.search(name) or stem in names
-    return told and any(fnmatchcase(name.lower(), pattern) for pattern in HARMLESS)
+    inferred = not STRUCTURE_LIKE.search(name) or stem in names
+    return inferred and any(fnmatchcase(name.lower(), pattern) for pattern in HARMLESS)
 
 
 def is_passed_over(folder: Path) -> bool:

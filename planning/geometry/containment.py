@@ -57,7 +57,7 @@ def side_of(mesh: TriangleMesh, point: NDArray[np.float64]) -> Side:
     return Side.INSIDE if inside else Side.OUTSIDE
 
 
-def holds(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
+def contains(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
     """Whether a point (3,), mm, lies inside a closed surface, see :func:`side_of`; not if the surface is open.
 
     Most points lie outside of a surface's box: of these nobody needs to know whether it is closed.

@@ -23,7 +23,7 @@ from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.bodies import prism, sphere_tree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
-BALL_MM = 30.0
+SPHERE_MM = 30.0
 """Bodies are cut until their spheres are no larger: half of a UR3 wrist's size."""
 
 FLANGE = 6
@@ -58,7 +58,7 @@ class ArmSpheres:
         bodies.append([prism(tool.holder_diameter_mm / 2, end - start) + [0.0, 0.0, (start + end) / 2]])
         if tool.body is not None:
             bodies.append([piece.vertices for piece in tool.body.pieces])
-        trees = [sphere_tree(pieces, BALL_MM) for pieces in bodies]
+        trees = [sphere_tree(pieces, SPHERE_MM) for pieces in bodies]
         rows = [np.insert(tree.leaves, 0, 0) for tree in trees]  # row 0 is the root
         return cls(
             np.concatenate([tree.centres[kept] for tree, kept in zip(trees, rows, strict=True)]),
@@ -180,10 +180,10 @@ def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
 def _is_clear(arm, surroundings, T_ct_base, frames, last):
     """One state: first the sphere ``last`` (body, sphere) that touched last; then the far bodies before the near."""
     centres, radii, starts, body_frames = arm
-    body, ball = last
-    if ball >= 0:
+    body, sphere = last
+    if sphere >= 0:
         T, first = frames[body_frames[body]], starts[body]
-        if _touches(surroundings, T_ct_base, T, centres[ball], radii[ball]) and _touches(
+        if _touches(surroundings, T_ct_base, T, centres[sphere], radii[sphere]) and _touches(
             surroundings, T_ct_base, T, centres[first], radii[first]
         ):
             return False
@@ -191,9 +191,9 @@ def _is_clear(arm, surroundings, T_ct_base, frames, last):
         T = frames[body_frames[body]]
         first = starts[body]
         if _touches(surroundings, T_ct_base, T, centres[first], radii[first]):
-            for ball in range(first + 1, starts[body + 1]):
-                if _touches(surroundings, T_ct_base, T, centres[ball], radii[ball]):
-                    last[0], last[1] = body, ball
+            for sphere in range(first + 1, starts[body + 1]):
+                if _touches(surroundings, T_ct_base, T, centres[sphere], radii[sphere]):
+                    last[0], last[1] = body, sphere
                     return False
     return True
 

@@ -432,7 +432,7 @@ def small_workcell() -> FastChecker:
     return FastChecker(ur_model("ur3"), NEEDLE, [table], body, outside=beside, padding_mm=1.0)
 
 
-def ask_arm(checker: FastChecker) -> list[ReachAnswer]:
+def check_small_workcell(checker: FastChecker) -> list[ReachAnswer]:
     """Of each of the small workcell's directions whether the arm reaches it."""
     outward = OUTWARD / np.linalg.norm(OUTWARD, axis=1, keepdims=True)
     return assess_reach_all(checker, [ReachRequest(TARGET, u, NEEDLE.needle_length_mm, STANDOFF_MM) for u in outward])

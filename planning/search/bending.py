@@ -26,7 +26,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.naming import REST
-from puncture_twin.planning.geometry.containment import crossings, holds
+from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.needle.deflection import (
     Bending,
     BevelPath,
@@ -232,13 +232,13 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
     around = np.array([inside_at(s, target_ct, outward_ct, depths) for s in anatomy.checked if s.mesh.closed])
     names = np.array([s.name for s in anatomy.checked if s.mesh.closed], dtype=object)
     keys = [(*names[around[:, row]], "" if depth <= path_length else "outside") for row, depth in enumerate(depths)]
-    found, first = [], 0
+    parts, first = [], 0
     for key, group in groupby(keys):
         rows = slice(first, first + len(list(group)))
         first = rows.stop
         end = depths[rows][-1] + PROFILE_STEP_MM
-        found.append(Stretch(float(depths[rows][0]), float(end), tuple(filter(None, key)), *_range(hu[rows])))
-    return tuple(found)
+        parts.append(Stretch(float(depths[rows][0]), float(end), tuple(filter(None, key)), *_range(hu[rows])))
+    return tuple(parts)
 
 
 def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
@@ -255,7 +255,7 @@ def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depth
     if not np.any(np.all((low <= points) & (points <= high), axis=1)):
         return np.zeros(len(depths), bool)
     crossed = np.sort(crossings(structure.mesh, target_ct, outward_ct[None]).depth)
-    inside = holds(structure.mesh, target_ct)
+    inside = contains(structure.mesh, target_ct)
     return np.asarray((np.searchsorted(crossed, depths) % 2 == 1) != inside)
 
 

@@ -40,11 +40,11 @@ from puncture_twin.planning.search.bedside import EntryFacts, Landmark, entry_fa
 from puncture_twin.planning.search.bending import check_tissues
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.constraints import ArmReach
-from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import breath_warnings
 from puncture_twin.planning.search.search import organ_candidates, search
 from puncture_twin.planning.search.sides import Side, sides_of
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, uncertainty_breakdown
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
@@ -103,7 +103,7 @@ class CaseContext:
     def search(self) -> Candidates:
         """Check the case's whole grid."""
         with self.stages.time("search"):
-            found = search(
+            candidates = search(
                 self.case,
                 self.anatomy,
                 self.engine,
@@ -112,22 +112,22 @@ class CaseContext:
                 chance=self.chance,
                 progress=partial(self.watcher.count, "directions of the arm"),
             )
-            others = tuple(alternatives(self.case, self.anatomy, self.engine, found))
-        return replace(found, arm_note=self.arm, findings=others)
+            others = tuple(alternatives(self.case, self.anatomy, self.engine, candidates))
+        return replace(candidates, arm_note=self.arm, findings=others)
 
     def check(self, theta: float, beta: float) -> Candidates:
         """Check a single direction (rad)."""
         directions = self.case.direction(theta, beta)
-        found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
-        return replace(found, arm_note=self.arm)
+        candidates = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
+        return replace(candidates, arm_note=self.arm)
 
     def explain(self, theta: float, beta: float) -> Explanation:
         """Check a single direction (rad), and say what it was checked against and how sure it is."""
-        found = self.check(theta, beta)
-        known = found.chances is not None and np.isfinite(found.chances.hit[0])
-        doubt = self.doubt_at(found.outward_ct[0], found.arm.q_insertion[0]) if known else None
-        facts = self.entry_facts(found.path.entry_ct[0], found.outward_ct[0])
-        return Explanation(self.case, self.anatomy, found, facts, doubt)
+        candidates = self.check(theta, beta)
+        known = candidates.chances is not None and np.isfinite(candidates.chances.hit[0])
+        breakdown = self.breakdown_at(candidates.outward_ct[0], candidates.arm.q_insertion[0]) if known else None
+        facts = self.entry_facts(candidates.path.entry_ct[0], candidates.outward_ct[0])
+        return Explanation(self.case, self.anatomy, candidates, facts, breakdown)
 
     def entry_facts(self, entry_ct: Floats, outward_ct: Floats) -> EntryFacts:
         """A path for whoever stands at the patient: its skin entry (3,), mm, and its direction outward (3,), unit."""
@@ -138,9 +138,9 @@ class CaseContext:
         markers = tuple(Landmark(f"marker {name}", point) for name, point in named)
         return entry_facts(self.case, markers, entry_ct, outward_ct)
 
-    def doubt_at(self, outward_ct: Floats, q: Floats) -> Doubt | None:
+    def breakdown_at(self, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown | None:
         """How sure one direction (3,) is in one configuration (6,), rad, as of a plan; None without declared errors."""
-        return None if self.chance is None else doubt_of(self.chance, outward_ct, q)
+        return None if self.chance is None else uncertainty_breakdown(self.chance, outward_ct, q)
 
     def region_ct(self, q: Floats) -> Floats | None:
         """Within x' inv(region) x <= 1 about the target the tip is expected in 95 of 100, shape (3, 3), mm^2, CT axes.
@@ -166,8 +166,8 @@ class CaseContext:
             case, outward = self.case, self.case.directions().outward_ct
             meshes = tuple(structure.mesh for structure in self.anatomy.checked)
             length, rng = own_lengths(case, self.anatomy, outward), np.random.default_rng(case.rehearsal.seed)
-            found = self.engine.measure(case.target_ct, outward, length)
-            return cross_check(found, meshes, case.target_ct, outward, length, count=count, rng=rng)
+            distances = self.engine.measure(case.target_ct, outward, length)
+            return cross_check(distances, meshes, case.target_ct, outward, length, count=count, rng=rng)
 
     def provenance(self) -> dict[str, Any]:
         """Where a result comes from: case, inputs, version, grid."""
@@ -224,21 +224,21 @@ def prepare(
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
         watcher.step("anatomy", "whether all fits together")
         read = (*case.warnings, *anatomy.warnings)
-        found = (
+        collected = (
             *(Finding("reading", Severity.WARNING, one) for one in read),
             *anatomy.findings,
             *findings(case, anatomy, placement, cache),
             *(Finding("breathing", Severity.WARNING, one) for one in breath_warnings(case, anatomy)),
         )
         check_tissues(case, anatomy)
-        shown = tuple(one.sentence for one in found if one.severity is not Severity.NOTE)
-        anatomy = replace(anatomy, warnings=shown, findings=found)
+        shown = tuple(one.sentence for one in collected if one.severity is not Severity.NOTE)
+        anatomy = replace(anatomy, warnings=shown, findings=collected)
         case.files.release()
         memory.limit(MEMORY_BYTES)
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
-        kept = {"cache": cache} if engine == "fast" else {}
-        measurer = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **kept)
+        cache_option = {"cache": cache} if engine == "fast" else {}
+        measurer = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **cache_option)
         reach = None
         if arm is not False and placement is not None:
             reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, memory), placement.T_base_ct)
@@ -249,7 +249,7 @@ def prepare(
 
 def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Iterator[Finding]:
     """What else would be safe for the organs; ``found`` are the case's directions, ranked."""
-    more = hangs_on_beyond(case, anatomy, candidates)
+    more = safe_without_beyond(case, anatomy, candidates)
     if more:
         said = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
         yield Finding("hangs_on_beyond_image", Severity.NOTE, said, {"directions": more})
@@ -257,7 +257,7 @@ def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidat
         yield _catalogue(case, anatomy, engine, candidates)
 
 
-def hangs_on_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) -> int:
+def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) -> int:
     """How many directions are kept from being safe by that alone by which a body is wider beyond its image."""
     clearance, named = candidates.clearance, candidates.verdict.structure == BEYOND_IMAGE
     others = ~np.isnan(clearance.margins) & (np.array(clearance.structures) != BEYOND_IMAGE)

@@ -19,7 +19,7 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.bending import Insertion, Stretch, insertion_along, stretches
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.doubt import Doubt
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
 
 NEAREST = 8
 """Structures that are listed where nobody wants all: a case has a hundred, and those far away decide nothing."""
@@ -45,7 +45,7 @@ class Explanation:
     Attributes:
         candidates: A search's result with this candidate alone.
         facts: The same path for whoever stands at the patient.
-        doubt: How sure it is; None where the case declares no errors, or the candidate was rejected before.
+        breakdown: How sure it is; None where the case declares no errors, or the candidate was rejected before.
         read: What was read beside the case to choose it.
     """
 
@@ -53,7 +53,7 @@ class Explanation:
     anatomy: Anatomy
     candidates: Candidates
     facts: EntryFacts
-    doubt: Doubt | None = None
+    breakdown: UncertaintyBreakdown | None = None
     read: tuple[Input, ...] = ()
 
     @brief
@@ -77,8 +77,8 @@ class Explanation:
 
     def clearances(self) -> dict[str, float]:
         """Structure to clearance, mm."""
-        found = self.candidates.clearance
-        return dict(zip(found.structures, map(float, found.distance[0]), strict=True))
+        clearance = self.candidates.clearance
+        return dict(zip(clearance.structures, map(float, clearance.distance[0]), strict=True))
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees; null where there is no number."""
@@ -123,13 +123,13 @@ class Explanation:
 
     def _breathing(self) -> dict[str, Any]:
         """Only of a case that declares its breathing."""
-        found = self.candidates.breathing
-        if found is None:
+        breathing = self.candidates.breathing
+        if breathing is None:
             return {}
         values = {
-            "safe_all_phases": bool(found.safe_all_phases[0]),
-            "worst_phase": finite(found.worst_phase[0]),
-            "breathing_clearance_mm": finite(found.clearance[0]),
+            "safe_all_phases": bool(breathing.safe_all_phases[0]),
+            "worst_phase": finite(breathing.worst_phase[0]),
+            "breathing_clearance_mm": finite(breathing.clearance[0]),
             "safe_means": self.candidates.safe_text,
         }
         return {"breathing": values}
@@ -138,7 +138,7 @@ class Explanation:
         """Only of a case that declares errors, so that others keep their keys."""
         if self.case.errors is None:
             return {}
-        return {"chances": None if self.doubt is None else self.doubt.summary()}
+        return {"chances": None if self.breakdown is None else self.breakdown.summary()}
 
     @cached_property
     def along_path(self) -> tuple[Stretch, ...]:
@@ -163,7 +163,7 @@ class Explanation:
             [
                 f"case {self.case.name}",
                 *self.head(),
-                *self._doubt(),
+                *self._breakdown(),
                 *self._path(),
                 self._target(),
                 *self._bending(),
@@ -180,9 +180,9 @@ class Explanation:
     def _reason(self) -> list[str]:
         return [] if self.safe else ["  because " + reason_text(self.candidates, 0)]
 
-    def _doubt(self) -> list[str]:
-        if self.doubt is not None:
-            return [f"  {line}" for line in self.doubt.lines()]
+    def _breakdown(self) -> list[str]:
+        if self.breakdown is not None:
+            return [f"  {line}" for line in self.breakdown.lines()]
         return [] if self.case.errors is None else [f"  {NO_CHANCES}"]
 
     def _path(self) -> list[str]:
@@ -218,13 +218,13 @@ class Explanation:
         """Only of a case that declares its tissue."""
         if self.candidates.deflection is None:
             return {}
-        found = self.insertion
+        insertion = self.insertion
         values = {
             "deflection_bound_mm": finite(self.candidates.deflection[0]),
-            "deflection_mm": None if found is None else found.tip_mm,
-            "peak_force_n": None if found is None else found.force.peak_n,
-            "buckling_free_n": None if found is None else found.buckling_free_n,
-            "buckling_pinned_n": None if found is None else found.buckling_pinned_n,
+            "deflection_mm": None if insertion is None else insertion.tip_mm,
+            "peak_force_n": None if insertion is None else insertion.force.peak_n,
+            "buckling_free_n": None if insertion is None else insertion.buckling_free_n,
+            "buckling_pinned_n": None if insertion is None else insertion.buckling_pinned_n,
         }
         return {"bending": values}
 

@@ -280,7 +280,7 @@ class BreathingBody:
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
         weights: Of skin and structures.
         bound: How far the needle may bend; None bends nothing.
-        found: The candidates, checked where the CT shows the body.
+        candidates: The candidates, checked where the CT shows the body.
     """
 
     case: Case
@@ -289,7 +289,7 @@ class BreathingBody:
     engine: ClearanceEngine
     weights: MovingWeights
     bound: DeflectionBound | None
-    found: Candidates
+    candidates: Candidates
 
     @cached_property
     def lengths(self) -> Floats:
@@ -297,7 +297,7 @@ class BreathingBody:
 
         Up to the farthest place at which the flange waits at any position.
         """
-        case, checked, outward = self.case, self.anatomy.checked, self.found.outward_ct
+        case, checked, outward = self.case, self.anatomy.checked, self.candidates.outward_ct
         at = [axis_lengths(case, checked, self.paths(outward, s)) for s in self.breathing.positions.tolist()]
         return np.asarray(np.max(at, axis=0))
 
@@ -323,7 +323,7 @@ class BreathingBody:
 
     def at(self, rows: Ints, s: float) -> Phase:
         """Some candidates, ``rows`` (m,), at a position, as if inserted there."""
-        case, checked, outward = self.case, self.anatomy.checked, self.found.outward_ct[rows]
+        case, checked, outward = self.case, self.anatomy.checked, self.candidates.outward_ct[rows]
         moved = self.breathing.moved_ct(s)
         paths = self.paths(outward, s)
         shifts = moved[None] * (1 - self.weights.structures)[:, None]
@@ -350,19 +350,19 @@ class BreathingBody:
             group = np.flatnonzero(weights == weight)
             origin = case.target_ct + (1 - weight) * self.breathing.moved_ct(s)
             part, length = self.engine.of(which[group]), self.lengths[np.ix_(rows, which[group])]
-            distance[:, group] = part.measure(origin, self.found.outward_ct[rows], length, shown=False).distance
+            distance[:, group] = part.measure(origin, self.candidates.outward_ct[rows], length, shown=False).distance
         return np.asarray(distance - case.needle.radius_mm - self.margins[columns])
 
     def _clearances(self, rows: Ints, shifts_ct: Floats) -> Clearances:
         """To all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
-        checked, found, radius = self.anatomy.checked, self.found, self.case.needle.radius_mm
-        clearance = found.clearance.distance[rows].copy()
+        checked, candidates, radius = self.anatomy.checked, self.candidates, self.case.needle.radius_mm
+        clearance = candidates.clearance.distance[rows].copy()
         depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
         moved = [one.demands_margin and (one.outside or by.any()) for one, by in zip(checked, shifts_ct, strict=True)]
         for shift in np.unique(shifts_ct[moved], axis=0):
             columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & moved)
             structures, length = tuple(checked[column] for column in columns), self.lengths[np.ix_(rows, columns)]
-            target, outward, part = self.case.target_ct + shift, found.outward_ct[rows], self.engine.of(columns)
+            target, outward, part = self.case.target_ct + shift, candidates.outward_ct[rows], self.engine.of(columns)
             at = measure(part, structures, target, outward, length=length, radius=radius)
             clearance[:, columns], depth[:, columns], violated[:, columns] = at.clearance, at.depth, at.violated
         return Clearances(clearance, depth, violated)

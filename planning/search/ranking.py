@@ -147,13 +147,13 @@ def pareto_front(terms: Floats) -> NDArray[np.bool_]:
     In ascending order of the sum a row can be dominated only by earlier ones, and then by one of the front.
     """
     front = np.zeros(len(terms), bool)
-    kept: list[int] = []
+    front_rows: list[int] = []
     for row in np.lexsort((*terms.T, terms.sum(axis=1))):
-        others = terms[kept]
+        others = terms[front_rows]
         dominated = np.all(others <= terms[row], axis=1) & np.any(others < terms[row], axis=1)
         if not dominated.any():
             front[row] = True
-            kept.append(int(row))
+            front_rows.append(int(row))
     return front
 
 

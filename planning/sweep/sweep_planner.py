@@ -117,11 +117,11 @@ def _allowed(context: CaseContext, angles: Floats, progress: Count) -> _SweepPat
     """As far as the search calls every direction safe, with the arm."""
     standoff, passed, stopped = 0.0, 0, ""
     for row, (theta, beta) in enumerate(angles.tolist()):
-        found = context.check(theta, beta % (2 * np.pi))
-        if not found.safe[0]:
-            stopped = f"{_place(angles[row])} is rejected: {reason_text(found, 0)}"
+        candidates = context.check(theta, beta % (2 * np.pi))
+        if not candidates.safe[0]:
+            stopped = f"{_place(angles[row])} is rejected: {reason_text(candidates, 0)}"
             break
-        needed = standoffs(context.case.needle, found.path.length[0], found.path.skin_angle[0])
+        needed = standoffs(context.case.needle, candidates.path.length[0], candidates.path.skin_angle[0])
         standoff, passed = max(standoff, float(needed)), row + 1
         progress(passed, len(angles))
     return _SweepPath(angles[:passed], standoff, stopped)

@@ -181,7 +181,7 @@ def refined_chances(
     return replace(first, touch=touch, margin=margin, touch_any=touching_any(touch), refined=whole)
 
 
-def keeps_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
+def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
     """Whether needles keep the case's limits, shape (n,), in any configurations that reach the target.
 
     Args:

@@ -260,7 +260,7 @@ def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Fl
     return np.asarray(chance_within(values, np.broadcast_to(radii, (len(cov), QUANTILES))).mean(axis=1))
 
 
-def radius_that_holds(cov: Floats, chance: float, freedom: int | None = None) -> float:
+def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) -> float:
     """Within which of the point that was meant the tip ends with a chance, mm: `hit_in_ball` the other way round.
 
     Args:

@@ -45,11 +45,11 @@ from puncture_twin.planning.geometry.rigid import frame_about, skew
 from puncture_twin.planning.uncertainty.hit import Proximity
 
 
-def line_chance(near: NearFaces, doubt: NeedleDoubt, length: float, threshold: float, gradient: Floats) -> float:
+def line_chance(near: NearFaces, doubt: NeedleUncertainty, length: float, threshold: float, gradient: Floats) -> float:
     """P that the needle comes nearer to a structure than a threshold; NaN where nothing displaces it.
 
     Args:
-        near: The structure's faces within `NeedleDoubt.reach` of the axis.
+        near: The structure's faces within `NeedleUncertainty.reach` of the axis.
         doubt: The needle and its doubt.
         length: Of the axis, mm.
         threshold: Needle radius, or that and a margin, mm.
@@ -79,7 +79,9 @@ SCRAMBLED_WITH = 20191104
 """Seed of the lines' spread."""
 
 
-def by_lines(problem: Problem, doubt: NeedleDoubt, basis: Floats, lines: Lines, first: float) -> tuple[float, float]:
+def by_lines(
+    problem: Problem, doubt: NeedleUncertainty, basis: Floats, lines: Lines, first: float
+) -> tuple[float, float]:
     """The mean chance of some lines, and their standard deviation; beyond first order's where sizes are uncertain."""
     chances = walked(problem, doubt.root, doubt.surface_mm, basis, lines.offsets, lines.sizes)
     whole = 0.0
@@ -149,7 +151,7 @@ DISAGREE = 0.1
 at most, and by .013 where it is .2 (three anatomies; beside a lung and between ribs)."""
 
 
-def chance_by_rules(problem: Problem, doubt: NeedleDoubt, basis: Floats, first: float, alone: bool) -> float:
+def chance_by_rules(problem: Problem, doubt: NeedleUncertainty, basis: Floats, first: float, alone: bool) -> float:
     """By the small rule; by many lines where its lines disagree, or several things are touched, or by most lines.
 
     Where the errors' size is uncertain every line has its own, and the lines say by how much first order, of quantile
@@ -232,7 +234,7 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
     rows = np.flatnonzero((wanted & np.isfinite(first)).any(axis=1))
     for row in rows:
         outward = needles.outward_ct[row]
-        pose = needle_doubt(around.target_ct, outward, needles.cov_ct[row], 0.0, needles.freedom)
+        pose = needle_uncertainty(around.target_ct, outward, needles.cov_ct[row], 0.0, needles.freedom)
         for column in np.flatnonzero(wanted[row] & np.isfinite(first[row])):
             surface_mm = float(needles.surface_mm[row, column])
             doubt = replace(pose, surface_mm=surface_mm) if surface_mm > 0 else pose
@@ -261,7 +263,7 @@ SIZES = 16
 
 
 @dataclass(frozen=True, eq=False)
-class NeedleDoubt:
+class NeedleUncertainty:
     """One needle, and how it may be displaced; CT frame, mm and rad.
 
     Attributes:
@@ -304,9 +306,9 @@ class NeedleDoubt:
         return of
 
 
-def needle_doubt(
+def needle_uncertainty(
     origin: Floats, outward: Floats, cov_ct: Floats, surface_mm: float, freedom: int | None = None
-) -> NeedleDoubt:
+) -> NeedleUncertainty:
     """From Sigma6.
 
     Args:
@@ -321,7 +323,7 @@ def needle_doubt(
     keep[:3, :3], keep[3:, 3:] = np.eye(3), across
     values, axes = np.linalg.eigh(_balanced(keep.T @ cov_ct @ keep))
     root = keep @ (_scales(keep.T @ cov_ct @ keep)[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
-    return NeedleDoubt(origin, outward, np.ascontiguousarray(root), surface_mm, freedom)
+    return NeedleUncertainty(origin, outward, np.ascontiguousarray(root), surface_mm, freedom)
 
 
 def _scales(cov: Floats) -> Floats:
@@ -542,7 +544,7 @@ PREFERRED, SOONER, NO_MATTER = 0.1, 0.8, 3.8
 something else is touched; and how far out it does not matter."""
 
 
-def likeliest_slope(problem: Problem, doubt: NeedleDoubt, slope: Floats, slack: float) -> tuple[Floats, bool]:
+def likeliest_slope(problem: Problem, doubt: NeedleUncertainty, slope: Floats, slack: float) -> tuple[Floats, bool]:
     """The slope (5,) along which the needle touches soonest, and whether nothing else touches about as soon.
 
     The nearest face need not be the likeliest, where a farther one lies in the direction of greater doubt: rays are

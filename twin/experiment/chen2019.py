@@ -211,7 +211,7 @@ JOINT = (2.5, 97.5)
 
 
 @dataclass(frozen=True)
-class Standing:
+class DrawnRank:
     """A number of the paper among as many draws of it.
 
     Attributes:
@@ -250,8 +250,8 @@ class Experiment:
 
     declaration: Declaration
     draws: int
-    printed: tuple[Standing, ...]
-    joint: tuple[Standing, ...]
+    printed: tuple[DrawnRank, ...]
+    joint: tuple[DrawnRank, ...]
     probability: float
     best_strain: float
 
@@ -275,8 +275,8 @@ def run_draws(declaration: Declaration, draws: int, rng: np.random.Generator) ->
     return Experiment(
         declaration,
         draws,
-        _standings(printed_errors(measured()), printed_errors(touched)),
-        _standings(_joint(paper, declaration), _joint(drawn, declaration)),
+        _ranks(printed_errors(measured()), printed_errors(touched)),
+        _ranks(_joint(paper, declaration), _joint(drawn, declaration)),
         float(chdtrc(FREEDOM, chi)),
         float(np.mean(_best(drawn) >= _best(paper)[0])),
     )
@@ -297,12 +297,12 @@ def _best(residuals: tuple[Floats, ...]) -> Floats:
     return np.asarray(np.max(list(strain_gains(residuals).values()), axis=0))
 
 
-def _standings(paper: Mapping[str, Floats], drawn: Mapping[str, Floats]) -> tuple[Standing, ...]:
+def _ranks(paper: Mapping[str, Floats], drawn: Mapping[str, Floats]) -> tuple[DrawnRank, ...]:
     rows = []
     for name, values in drawn.items():
         low, median, high = np.percentile(values, (5, 50, 95))
         at = float(paper[name][0])
-        rows.append(Standing(name, at, 100.0 * float(np.mean(values < at)), float(low), float(median), float(high)))
+        rows.append(DrawnRank(name, at, 100.0 * float(np.mean(values < at)), float(low), float(median), float(high)))
     return tuple(rows)
 
 

@@ -24,7 +24,7 @@ SHEATH_HU, WATER_HU, CORE_HU = 100.0, 0.0, 3000.0
 """Of plastic, of what flows in it, and of thin wires of copper with the plastic between; ours."""
 
 
-class Beside(NamedTuple):
+class OutsideObjects(NamedTuple):
     """What shall lie beside the patient.
 
     Attributes:
@@ -38,7 +38,9 @@ class Beside(NamedTuple):
     lines: int = 0
 
 
-def lay_beside(skin: TriangleMesh, at_mm: float, wanted: Beside, rng: np.random.Generator) -> tuple[Part, ...]:
+def place_outside_objects(
+    skin: TriangleMesh, at_mm: float, wanted: OutsideObjects, rng: np.random.Generator
+) -> tuple[Part, ...]:
     """Draw it about a skin: the bed first, then arms, then lines.
 
     Args:

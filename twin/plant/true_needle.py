@@ -67,7 +67,7 @@ def true_needle(model: UrModel, q_true: Floats, eta: Floats, tip_mm: float) -> T
     return TrueNeedle(T[..., :3, 3] + (R @ offset[..., None])[..., 0], R @ exp_rotation(lean))
 
 
-def driven_onto(model: UrModel, points_base: Floats, q_start: Floats, eta: Floats, tip_mm: float) -> Floats:
+def joints_at_points(model: UrModel, points_base: Floats, q_start: Floats, eta: Floats, tip_mm: float) -> Floats:
     """True joints that put each true tip on its point, shape (..., 6), rad, nearest to where they start.
 
     Args:
@@ -110,10 +110,10 @@ class TrueTissue:
     def __init__(self, insertion: Insertion, path: StraightPath, side: float, shaft_mm: float) -> None:
         self._force, self._bent = insertion.force, insertion.path
         self._path, self._side, self._shaft_mm = path, np.array([np.cos(side), np.sin(side), 0.0]), shaft_mm
-        self._deepest, self._held, self._felt = 0.0, 0.0, Felt(0.0, 0.0)
+        self._deepest, self._held, self._felt = 0.0, 0.0, TissueForce(0.0, 0.0)
 
     @property
-    def felt(self) -> Felt:
+    def felt(self) -> TissueForce:
         """The greatest so far."""
         return self._felt
 
@@ -123,7 +123,7 @@ class TrueTissue:
         depth = float((to_mm(at_m) - self._path.entry_base) @ self._path.into_base)
         along = self._along(depth)
         at_tip, at_holder = self._across(depth)
-        self._felt = Felt(max(self._felt.along_n, along), max(self._felt.across_n, abs(at_tip + at_holder)))
+        self._felt = TissueForce(max(self._felt.along_n, along), max(self._felt.across_n, abs(at_tip + at_holder)))
         holder_m = at_m - to_m(self._shaft_mm) * R[:, 2]
         side = R @ self._side
         return Push(at_tip * side - along * self._path.into_base, at_m), Push(at_holder * side, holder_m)
@@ -152,7 +152,7 @@ class TrueTissue:
         return at_tip, force - at_tip
 
 
-class Felt(NamedTuple):
+class TissueForce(NamedTuple):
     """The greatest forces of one insertion, N: along the needle, and across it as its holder bears them."""
 
     along_n: float
@@ -166,7 +166,7 @@ class Felt(NamedTuple):
         return f"the tissue pushed with up to {self.along_n:.2f} N along the needle, {self.across_n:.2f} N across it"
 
 
-NOT_FELT = "no force of tissue: the case declares none ([tissue])"
+NO_TISSUE_FORCE = "no force of tissue: the case declares none ([tissue])"
 """Of an insertion through tissue that nobody described."""
 
 
@@ -191,7 +191,7 @@ class TouchTruth:
     def q_contact(self, model: UrModel, tip_mm: float, touch: Touch) -> Floats:
         """What the encoders say, shape (6,), rad, when the true tip is on the marker, the needle as planned."""
         there = apply(self.T_base_ct, self.aim_ct[touch.name])
-        q_true = driven_onto(model, there[None], touch.q_touch[None], self.eta[None], tip_mm)[0]
+        q_true = joints_at_points(model, there[None], touch.q_touch[None], self.eta[None], tip_mm)[0]
         return np.asarray(q_true - self.arrival[touch.name])
 
 

@@ -26,16 +26,16 @@ from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled
-from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
+from puncture_twin.twin.rehearsal.trials import Puncture, Trials, draw_trials
 
-MET_MM = 1e-6
+CONTACT_MM = 1e-6
 """Of an axis from a surface that it meets."""
 
 ALLOWED = "a case with [errors] and markers, which say what a room may differ by"
 
 
 @dataclass(frozen=True, eq=False)
-class PhysicsRooms:
+class PhysicsTrials:
     """What the simulator said of some rooms.
 
     Attributes:
@@ -82,7 +82,7 @@ class Distribution:
     seed: int
     unreached: int
     puncture: Puncture
-    rooms: Rooms
+    rooms: Trials
     cov_ct: Floats
     in_region: Bools
     hit: Bools
@@ -94,7 +94,7 @@ class Distribution:
     budget: ErrorBudget
     guessed_touches: bool
     not_modelled: str
-    physics: PhysicsRooms | None = None
+    physics: PhysicsTrials | None = None
 
     def __len__(self) -> int:
         return len(self.rooms.tip_ct)
@@ -150,7 +150,7 @@ def _fraction(rooms: Bools) -> float | None:
     return float(rooms.mean()) if len(rooms) else None
 
 
-def rehearse_rooms(
+def rehearse_trials(
     context: CaseContext, outward_ct: Floats, q_insertion: Floats, count: int, seed: int
 ) -> Distribution:
     """Rehearse one direction in many rooms, each with a truth of its own.
@@ -167,7 +167,7 @@ def rehearse_rooms(
     """
     query = _query(context, outward_ct, q_insertion)
     rng = np.random.default_rng(seed)
-    rooms = draw_rooms(query.puncture, query.truth, count, rng)
+    rooms = draw_trials(query.puncture, query.truth, count, rng)
     off = rng.normal(size=(count, len(context.anatomy.checked)))[rooms.reached]
     return _measured(context, query, rooms, off, seed)
 
@@ -175,10 +175,10 @@ def rehearse_rooms(
 def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: int) -> Floats:
     """E with T_believed = T_true E, shape (4, 4), mm: one registration of a case that its declared errors allow.
 
-    Arguments and errors as of `rehearse_rooms`.
+    Arguments and errors as of `rehearse_trials`.
     """
     query = _query(context, outward_ct, q_insertion)
-    room = draw_rooms(query.puncture, query.truth, 1, np.random.default_rng(seed))
+    room = draw_trials(query.puncture, query.truth, 1, np.random.default_rng(seed))
     return np.asarray(np.linalg.inv(query.puncture.T_base_ct) @ room.T_base_ct[0])
 
 
@@ -228,7 +228,7 @@ def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
     return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
 
 
-def _measured(context: CaseContext, query: _Query, rooms: Rooms, off: Floats, seed: int) -> Distribution:
+def _measured(context: CaseContext, query: _Query, rooms: Trials, off: Floats, seed: int) -> Distribution:
     """What happened; ``off`` has a normal number for the surface of each structure in each room that is reached."""
     case, believed, puncture = context.case, query.believed, query.puncture
     q = puncture.q_insertion[None]
@@ -272,7 +272,7 @@ def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floa
     return np.asarray(passed)
 
 
-def _hits(context: CaseContext, rooms: Rooms, off_mm: Floats) -> Bools:
+def _hits(context: CaseContext, rooms: Trials, off_mm: Floats) -> Bools:
     """Within the radius of the true target, or in the mesh, which comes from the target's own scan and may lie off."""
     case = context.case
     if case.hit_radius_mm is not None:
@@ -290,7 +290,7 @@ def _target_column(anatomy: Anatomy, case: Case) -> int:
     return [one.name for one in anatomy.checked].index(case.target_structure)
 
 
-def _touches(context: CaseContext, puncture: Puncture, rooms: Rooms, off_mm: Floats) -> Bools:
+def _touches(context: CaseContext, puncture: Puncture, rooms: Trials, off_mm: Floats) -> Bools:
     """Which structures each room's needle touches, shape (n, k), by FCL's capsule where a bound does not exclude it.
 
     A surface that lies farther out is touched from farther; one that lies deeper than the needle is thick is touched
@@ -304,7 +304,7 @@ def _touches(context: CaseContext, puncture: Puncture, rooms: Rooms, off_mm: Flo
     turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1)
     touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):
-        length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], MET_MM)
+        length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], CONTACT_MM)
         for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):
             touched[row, place] = context.engine.collides(
                 int(column), rooms.tip_ct[row], rooms.outward_ct[row], length, float(radius[row])

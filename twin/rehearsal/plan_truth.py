@@ -30,16 +30,16 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 from puncture_twin.twin.plant.true_needle import AtTarget, TouchTruth, TrueNeedle, true_needle
 from puncture_twin.twin.plant.truth import Truth, draw_truth
-from puncture_twin.twin.rehearsal.distribution import Distribution, PhysicsRooms, bend_along, rehearse_rooms
+from puncture_twin.twin.rehearsal.distribution import Distribution, PhysicsTrials, bend_along, rehearse_trials
 from puncture_twin.twin.rehearsal.rehearsal import rehearse
-from puncture_twin.twin.rehearsal.result import PredictedScale, Rehearsal, RoomScale, Scale
-from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, bent
+from puncture_twin.twin.rehearsal.result import PredictedScale, Rehearsal, Scale, TrialScale
+from puncture_twin.twin.rehearsal.trials import Puncture, Trials, bent
 
 TRIED = 16
 """Rooms that are drawn for one: the arm may not reach the pose that a room's registration asks for."""
 
 
-def drawn_truth(puncture: Puncture, rooms: Rooms, row: int, seed: int, source: str) -> Truth:
+def drawn_truth(puncture: Puncture, rooms: Trials, row: int, seed: int, source: str) -> Truth:
     """The truth whose execution ends as one of the rooms did.
 
     Args:
@@ -74,7 +74,7 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
     if not drawn:
         return bent_truth(context, plan, draw_truth(case, plan.T_base_ct, seed=seed))
     seed = case.rehearsal.seed if seed is None else seed
-    found = rehearse_rooms(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
+    found = rehearse_trials(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
     return _of_drawn(found, 0, f"drawn with seed {seed} from {_declared(found)}")
 
 
@@ -128,10 +128,10 @@ def _declared(found: Distribution) -> str:
     return "[rehearsal.errors], not from what is believed" if found.wrong_belief else "[errors]"
 
 
-def standing_scale(context: CaseContext, q_insertion: Floats, found: Distribution | None) -> Scale | None:
+def error_scale(context: CaseContext, q_insertion: Floats, found: Distribution | None) -> Scale | None:
     """What a tip error is held against: the rooms, or without rooms the prediction; None without declared errors."""
     if found is not None:
-        return RoomScale(found.tip_error_mm, len(found) + found.unreached)
+        return TrialScale(found.tip_error_mm, len(found) + found.unreached)
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(context.case, registration)
     if error is None:
@@ -165,7 +165,7 @@ def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
     return Truth(T_base_ct, at_target.arrival, truth.seed, source, at_target.target_ct)
 
 
-def physics_rooms(context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count) -> PhysicsRooms:
+def physics_trials(context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count) -> PhysicsTrials:
     """Run some of the rooms, spread evenly over the order of their tip errors, in the simulator.
 
     Args:
@@ -183,4 +183,4 @@ def physics_rooms(context: CaseContext, plan: Plan, found: Distribution, count: 
         apart[number] = np.linalg.norm(done.tip_true_ct[-1] - found.rooms.tip_ct[row])
         contacts += bool(done.contacts)
         progress(number + 1, len(rows))
-    return PhysicsRooms(apart, contacts)
+    return PhysicsTrials(apart, contacts)

@@ -31,7 +31,7 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.bending import insertion_along
 from puncture_twin.planning.sweep.sweep_planner import SweepPlan
-from puncture_twin.twin.plant.true_needle import Felt, StraightPath, TrueTissue
+from puncture_twin.twin.plant.true_needle import StraightPath, TissueForce, TrueTissue
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.result import Rehearsal, RehearsalContact
 from puncture_twin.twin.world.client import TIME_STEP_S
@@ -196,7 +196,7 @@ class Executed:
     execution: Execution
     phase: NDArray[np.str_]
     off_path_mm: float
-    felt: Felt | None
+    felt: TissueForce | None
 
 
 def executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executed:
@@ -216,7 +216,7 @@ def executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executed
     ends = np.cumsum([len(approach), len(before) - len(approach), len(steps(plan.insertion))])
     row = np.floor(done.times_s / TIME_STEP_S + ROUNDING).astype(np.int64)
     phase = np.array(["approach", "settle", "insertion", "hold"])[np.searchsorted(ends, row, side="right")]
-    felt = None if case.bending is None else Felt(0.0, 0.0) if tissue is None else tissue.felt
+    felt = None if case.bending is None else TissueForce(0.0, 0.0) if tissue is None else tissue.felt
     return Executed(done, phase, inserted.off_path_mm, felt)
 
 

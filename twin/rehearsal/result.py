@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
-from puncture_twin.twin.plant.true_needle import NOT_FELT, Felt
+from puncture_twin.twin.plant.true_needle import NO_TISSUE_FORCE, TissueForce
 
 
 @dataclass(frozen=True)
-class Standing:
+class ErrorRank:
     """The place of a rehearsal's tip error among those of rooms, or in the predicted distribution.
 
     Attributes:
@@ -54,7 +54,7 @@ class Standing:
 
 
 @dataclass(frozen=True, eq=False)
-class RoomScale:
+class TrialScale:
     """The tip errors of rooms, of which one is rehearsed.
 
     Attributes:
@@ -65,10 +65,10 @@ class RoomScale:
     errors_mm: Floats
     rooms: int
 
-    def of(self, tip_error_mm: float) -> Standing:
+    def of(self, tip_error_mm: float) -> ErrorRank:
         """Where an error stands among them."""
         below = np.mean(self.errors_mm < tip_error_mm) + np.mean(self.errors_mm <= tip_error_mm)
-        return Standing(float(50 * below), self.rooms)
+        return ErrorRank(float(50 * below), self.rooms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +83,12 @@ class PredictedScale:
     cov: Floats
     freedom: int | None
 
-    def of(self, tip_error_mm: float) -> Standing:
+    def of(self, tip_error_mm: float) -> ErrorRank:
         """Where an error stands in it."""
-        return Standing(100 * float(hit_in_ball(self.cov, tip_error_mm, self.freedom)[0]))
+        return ErrorRank(100 * float(hit_in_ball(self.cov, tip_error_mm, self.freedom)[0]))
 
 
-Scale = RoomScale | PredictedScale
+Scale = TrialScale | PredictedScale
 """What a tip error is held against."""
 
 
@@ -178,8 +178,8 @@ class Rehearsal:
     truth_is_belief: bool
     control: str
     off_path_mm: float
-    felt: Felt | None
-    standing: Standing | None = None
+    felt: TissueForce | None
+    standing: ErrorRank | None = None
 
     @brief
     def __repr__(self) -> str:
@@ -194,7 +194,7 @@ class Rehearsal:
     @property
     def force_text(self) -> str:
         """What the tissue did, for a person."""
-        return NOT_FELT if self.felt is None else self.felt.text
+        return NO_TISSUE_FORCE if self.felt is None else self.felt.text
 
     def __post_init__(self) -> None:
         for value in (*vars(self).values(), *self.clearance_mm.values()):

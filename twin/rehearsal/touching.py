@@ -59,10 +59,10 @@ TOUCH_SPEED_MM_S = 2.0
 NEAR_SPEED_MM_S = 25.0
 """Of the straight line before them, and back."""
 
-FELT_N = 0.5
+CONTACT_N = 0.5
 """A force along the needle above which the marker is felt."""
 
-FELT_STEPS = 3
+CONTACT_STEPS = 3
 """In a row: a sensor's noise alone does not reach it so often."""
 
 FORCE_NOISE_N = 0.1
@@ -254,8 +254,8 @@ class _Contact:
 
     def __call__(self, measured: Measured) -> bool:
         pressed = -float(measured.force_n @ self._axis) + self._rng.normal(0.0, FORCE_NOISE_N)
-        self._in_a_row = self._in_a_row + 1 if pressed > FELT_N else 0
-        return self._in_a_row >= FELT_STEPS
+        self._in_a_row = self._in_a_row + 1 if pressed > CONTACT_N else 0
+        return self._in_a_row >= CONTACT_STEPS
 
 
 def _slow(cell: TouchingCell, q: Floats, speed_mm_s: float = NEAR_SPEED_MM_S) -> Trajectory:

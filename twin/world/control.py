@@ -60,7 +60,7 @@ from puncture_twin.twin.world.client import (
     to_m,
     to_mm,
 )
-from puncture_twin.twin.world.execution import RECORD_S, Execution, Recorder, felt_force
+from puncture_twin.twin.world.execution import RECORD_S, Execution, Recorder, contact_force
 from puncture_twin.twin.world.workcell import SimulatedWorkcell
 
 TipControl = Literal["impedance", "admittance", "position"]
@@ -523,7 +523,7 @@ def run(
     for row in range(len(reference)):
         state = arm.state()
         tip = tip_of(state.q)
-        force = felt_force(arm, TIP_LINK)
+        force = contact_force(arm, TIP_LINK)
         for push in () if around.resistance is None else around.resistance(tip):
             arm.push(TIP_LINK, push.force_n, push.point_m)
             force = force + push.force_n

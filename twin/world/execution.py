@@ -147,7 +147,7 @@ def touches(arm: Arm) -> tuple[Touch, ...]:
     return tuple(Touch(arm.link_name(link), other, depth) for (link, other), depth in sorted(deepest.items()))
 
 
-def felt_force(arm: Arm, link: str) -> Floats:
+def contact_force(arm: Arm, link: str) -> Floats:
     """The force of the workcell's bodies on one link, as of the last physics step: shape (3,), N, world frame."""
     force = np.zeros(3)
     for point in pybullet.getContactPoints(bodyA=arm.body, linkIndexA=arm.links[link], physicsClientId=arm.client):

@@ -138,7 +138,7 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
         fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.
         clear_mm: What the arm is to keep from skin and boxes where both ends do, see :func:`_keep`; 0 for none.
         order: Shape (k,): the checks in the order in which they are tested.
-        room: See :class:`Room`.
+        room: See :class:`SegmentScratch`.
         answer: See :class:`Answer`.
     """
     step, frames = end - start, np.empty((1, 7, 4, 4))
@@ -203,7 +203,7 @@ def left_of(scene, movers, segment, part, span, into, room, answered, answer):
         part: Its middle and half its width, fractions of the segment.
         span: Which list of ``room.lists``, and from where to where, holds the checks that are to be cleared.
         into: Where in the other list the rest goes.
-        room: See :class:`Room`.
+        room: See :class:`SegmentScratch`.
         answered: See :func:`check_segment`.
         answer: Likewise.
 
@@ -316,8 +316,8 @@ class Segment(NamedTuple):
     """Shape (1, 7, 4, 4), mm: filled by :func:`place_arm`."""
 
 
-class Room(NamedTuple):
-    """Where a segment is checked: see :func:`segment_room`. Nothing in it outlasts the segment."""
+class SegmentScratch(NamedTuple):
+    """Where a segment is checked: see :func:`segment_scratch`. Nothing in it outlasts the segment."""
 
     work: ProofScratch
     kept: Floats
@@ -334,12 +334,12 @@ class Room(NamedTuple):
     """Shape (``PARTS``, 2): parts of a segment that wait."""
 
 
-def segment_room(scene: ProofScene, movers: Movers) -> Room:
+def segment_scratch(scene: ProofScene, movers: Movers) -> SegmentScratch:
     """Room for the checks of a cell."""
     checks, count = len(scene.checks), len(movers.frames)
     lists, spans = np.empty((2, checks << HALVINGS), np.int64), np.empty((2, 2 << HALVINGS, 2), np.int64)
     work, paths = scratch(checks, len(scene.hulls.radii)), np.empty((count, 7))
-    return Room(work, np.zeros(checks), lists, spans, paths, np.zeros(count, np.bool_), np.empty((PARTS, 2)))
+    return SegmentScratch(work, np.zeros(checks), lists, spans, paths, np.zeros(count, np.bool_), np.empty((PARTS, 2)))
 
 
 @allocation_free()

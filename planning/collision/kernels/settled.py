@@ -51,7 +51,7 @@ class Triangle(NamedTuple):
     stack: Ints
 
 
-def beside_triangle(hulls: Hulls, stack: int) -> Triangle:
+def triangle_scratch(hulls: Hulls, stack: int) -> Triangle:
     """Room for a triangle beside the hulls, and for a descent as deep as ``stack``."""
     count, spare = len(hulls.corners), np.zeros((3, 3))
     starts = np.concatenate([hulls.neighbour_starts, hulls.neighbour_starts[-1] + np.array([2, 4, 6])])

@@ -199,7 +199,7 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def kept_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tuple[str, ...]:
+def cached_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tuple[str, ...]:
     """As `mesh_warnings` of each mesh, by name; what was found of the same meshes before is not found again.
 
     The meshes know then whether they are closed and wound alike, see `TriangleMesh.known`.

@@ -34,8 +34,8 @@ from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.distribution import bend_along
 from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, plan_truth, spread_rows
 from puncture_twin.twin.rehearsal.rehearsal import rehearse, split_error
-from puncture_twin.twin.rehearsal.result import Standing, ordinal
-from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
+from puncture_twin.twin.rehearsal.result import ErrorRank, ordinal
+from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
 UR3 = ur_model("ur3")
 APART_MM = 0.003
@@ -422,7 +422,7 @@ def rooms():
         plan.outward_ct,
         plan.insertion.q[-1],
     )
-    drawn = draw_rooms(puncture, errors, 1000, np.random.default_rng(3))
+    drawn = draw_trials(puncture, errors, 1000, np.random.default_rng(3))
     assert drawn.reached.all()
     return plan, puncture, drawn
 
@@ -457,8 +457,8 @@ def test_rows_are_spread_over_the_order_of_the_errors(count, wanted):
 
 def test_standing_in_words():
     """What headline and film say."""
-    assert Standing(50.05, 1000).text == "median of 1,000 rooms (50th percentile of their tip errors)"
-    assert Standing(2.6).text == "3rd percentile of the tip errors that are predicted"
+    assert ErrorRank(50.05, 1000).text == "median of 1,000 rooms (50th percentile of their tip errors)"
+    assert ErrorRank(2.6).text == "3rd percentile of the tip errors that are predicted"
     assert [ordinal(n) for n in (1, 2, 3, 4, 11, 12, 13, 21, 99)] == (
         ["1st", "2nd", "3rd", "4th", "11th", "12th", "13th", "21st", "99th"]
     )

@@ -19,7 +19,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.triangulation import Points, triangulate
 from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell
 
 DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
 """Fraction of the light that comes from everywhere; the rest is a lamp's."""
@@ -40,7 +40,7 @@ class LocatedPair(NamedTuple):
     """Whether the head stands in the workcell and may hide it; it does not during the calibration."""
 
 
-class Spot(NamedTuple):
+class Detection(NamedTuple):
     """A ball's centre in one picture."""
 
     pixel: Floats
@@ -59,7 +59,7 @@ class Search(NamedTuple):
     search_px: float
 
 
-Detector = Callable[[int, LocatedPair, Search], Spot | Lost]
+Detector = Callable[[int, LocatedPair, Search], Detection | Lost]
 """Takes the camera's number, the ball as it truly is, and where to look."""
 
 
@@ -76,7 +76,7 @@ def picture_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Dete
     """Pictures of the true workcell, each drawn anew with noise; what the head hides is hidden."""
     plan = workcell.case.file.cameras
 
-    def see(number: int, ball: LocatedPair, search: Search) -> Spot | Lost:
+    def see(number: int, ball: LocatedPair, search: Search) -> Detection | Lost:
         true = workcell.cameras[number]
         hidden = workcell.hidden_fraction(true, ball.center_c, ball.radius_mm) if ball.head_there else 0.0
         away = np.abs(true.project(ball.center_c) - search.camera.project(search.predicted_c)).max()
@@ -92,7 +92,7 @@ def picture_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Dete
             search_px=search.search_px,
             hough_only=plan.centre == "hough",
         )
-        return Lost(found.reason) if isinstance(found, LostBall) else Spot(found.pixel, found.covariance)
+        return Lost(found.reason) if isinstance(found, LostBall) else Detection(found.pixel, found.covariance)
 
     return see
 

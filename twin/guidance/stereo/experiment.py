@@ -17,7 +17,7 @@ from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleOutcome
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop
 from puncture_twin.twin.guidance.stereo.session import Session, run_session
-from puncture_twin.twin.guidance.stereo.stereo_room import workcell_checker
+from puncture_twin.twin.guidance.stereo.stereo_workcell import workcell_checker
 
 BATCH = 5
 """Seeds that a process takes at a time; they share the judge of the empty room."""

@@ -16,7 +16,7 @@ from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, o
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, carried_rod
 from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, planned_cameras
 
 
 class Known(NamedTuple):

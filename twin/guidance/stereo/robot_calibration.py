@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, 
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, path_contact
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, planned_cameras
 
 GRID = (3, 2, 2)
 """Points along the base's x, y and z."""

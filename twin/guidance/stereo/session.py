@@ -40,7 +40,7 @@ from puncture_twin.twin.guidance.stereo.servo_law import (
     path_upward,
 )
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, path_contact, servo
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, workcell_checker
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, draw_workcell, workcell_checker
 
 POINTED_MM = 3.0
 """How well an operator points at a marker in the pictures, per axis: where the search for it begins."""

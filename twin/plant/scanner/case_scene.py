@@ -25,7 +25,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.checks.skin_fit import skin_fit
-from puncture_twin.twin.plant.outside_objects import Beside, Part, lay_beside
+from puncture_twin.twin.plant.outside_objects import OutsideObjects, Part, place_outside_objects
 from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, box, check_closed, rod
 
 METAL_HU = 8000.0
@@ -113,7 +113,7 @@ class CaseScene:
         skin: The body's surface.
         cut: Shape (3, 2): at which ends the body goes on beyond its surface.
         tables: Shape (2, 3): the box about what the patient lies on; infinite without any.
-        beside: What was laid beside the patient.
+        outside_objects: What was laid beside the patient.
         markers: True positions, or None.
         listed: The case's own readings of them.
         target: Shape (3,).
@@ -124,7 +124,7 @@ class CaseScene:
     skin: TriangleMesh
     cut: Bools
     tables: Floats
-    beside: tuple[Part, ...]
+    outside_objects: tuple[Part, ...]
     markers: NamedPoints | None
     listed: NamedPoints | None
     target: Floats
@@ -138,7 +138,7 @@ def case_scene(
     *,
     marker: MarkerKind = "disc",
     needle: TrueRod | None = None,
-    beside: Beside | None = None,
+    outside_objects: OutsideObjects | None = None,
 ) -> CaseScene:
     """Lay a case into the scanner.
 
@@ -149,7 +149,7 @@ def case_scene(
         rng: Draws where in its cell each marker truly is.
         marker: What stands at each marker's place.
         needle: Drawn of metal, its usable length.
-        beside: Arms, bed and lines to lay beside the patient.
+        outside_objects: Arms, bed and lines to lay beside the patient.
 
     Raises:
         InputError: A structure's surface is open.
@@ -159,7 +159,7 @@ def case_scene(
     true = None if listed is None else _drawn_in_cells(case, listed, settings, rng)
     skin = anatomy.skin.mesh.transformed(T)
     target = apply(T, case.target_ct)
-    laid = () if beside is None else lay_beside(skin, float(target[2]), beside, rng)
+    laid = () if outside_objects is None else place_outside_objects(skin, float(target[2]), outside_objects, rng)
     solids = _body(case, anatomy)
     if true is not None:
         solids += _markers(true, skin_fit(true.points, anatomy.skin).normals_ct, marker)
@@ -175,7 +175,7 @@ def case_scene(
         skin=skin,
         cut=np.zeros((3, 2), np.bool_) if view is None else view.cut,
         tables=_bounds([one.mesh for one in (*tables, *beneath)]),
-        beside=laid,
+        outside_objects=laid,
         markers=_moved(true, T),
         listed=_moved(listed, T),
         target=target,
@@ -349,7 +349,7 @@ def _shown(scene: CaseScene, settings: ScanSettings) -> tuple[Floats, Floats]:
     low, high = scene.skin.bounds
     low = low - np.where(scene.cut[:, 0], 0.0, AIR_MM)
     high = high + np.where(scene.cut[:, 1], 0.0, AIR_MM)
-    for one in scene.beside:
+    for one in scene.outside_objects:
         if one.place == "upon":
             low[:2] = np.minimum(low[:2], one.mesh.bounds[0, :2] - AIR_MM)
             high[:2] = np.maximum(high[:2], one.mesh.bounds[1, :2] + AIR_MM)

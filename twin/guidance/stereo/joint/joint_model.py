@@ -212,10 +212,10 @@ class JointModel:
     def _commanded(self, x: Unknowns) -> tuple[Floats, Floats]:
         """Where the arm, with its errors, should have the ball; its play and repeatability let it stray."""
         q = self.observed.q_command
-        strays, J = self.strays(x, np.arange(len(q)))
-        return _whitened(strays, J, self._offset_roots)
+        missed, J = self.ball_deviations(x, np.arange(len(q)))
+        return _whitened(missed, J, self._offset_roots)
 
-    def strays(self, x: Unknowns, stays: Ints) -> tuple[Floats, Floats]:
+    def ball_deviations(self, x: Unknowns, stays: Ints) -> tuple[Floats, Floats]:
         """How far the ball is from where its arm should have it at k stays: (k, 3), mm, C, and slopes (k, 3, N)."""
         T, rod = self.pose_of_base(x), self.rod_at(x, self.observed.q_command[stays])
         measured = apply(T, rod.ball)

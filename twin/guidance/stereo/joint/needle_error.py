@@ -99,7 +99,7 @@ def servoed_error(found: Adjusted, stay: int, target_m: Floats) -> NeedleError:
     """
     model, x = found.model, found.unknowns
     stay = stay % len(x.balls_c)
-    miss, slopes = model.strays(x, np.array([stay]))
+    miss, slopes = model.ball_deviations(x, np.array([stay]))
     rod, frame = _Flange.of(found, model.observed.q_command[stay]), _Anatomy.of(found, target_m)
     variance, Jq = model.observed.errors.arrival**2, rod.arrival_slopes
     K = variance * Jq[:3].T @ np.linalg.inv(variance * Jq[:3] @ Jq[:3].T + FLOOR_MM**2 * np.eye(3))

@@ -278,13 +278,13 @@ def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
     """
     active = active[active < 17]
     reference = _central(recording)
-    cures = []
+    suggestions = []
     for moves in (_single_moves(), _all_moves()):
         changes = [_changed(estimate, recording, reference, move) for move in moves]
-        cures.append(_greedy(estimate, recording, active, changes))
-        if cures[-1].ratio_after >= SLACK * LEAST_RATIO:
+        suggestions.append(_greedy(estimate, recording, active, changes))
+        if suggestions[-1].ratio_after >= SLACK * LEAST_RATIO:
             break
-    return max(cures, key=lambda suggestion: suggestion.ratio_after)
+    return max(suggestions, key=lambda suggestion: suggestion.ratio_after)
 
 
 class _Move(NamedTuple):

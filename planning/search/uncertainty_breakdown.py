@@ -87,7 +87,7 @@ class Goal:
 
 
 @dataclass(frozen=True, eq=False)
-class Doubt:
+class UncertaintyBreakdown:
     """How sure one candidate is.
 
     Attributes:
@@ -177,7 +177,7 @@ def chance_text(chance: float) -> str:
     return f"{chance:.{digits}f}"
 
 
-def doubt_of(model: ChanceModel, outward_ct: Floats, q: Floats) -> Doubt:
+def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown:
     """The doubt of one candidate, its chances line-sampled as those of the table's best are.
 
     Args:
@@ -189,7 +189,7 @@ def doubt_of(model: ChanceModel, outward_ct: Floats, q: Floats) -> Doubt:
     chances = refined_chances(model, *needle, model.chances(*needle))
     touch = dict(zip(chances.structures, map(float, chances.touch[0]), strict=True))
     sources = shrinkable(model, model.needles(*needle), q)
-    return Doubt(
+    return UncertaintyBreakdown(
         float(chances.hit[0]),
         MappingProxyType(touch),
         float(chances.touch_any[0]),

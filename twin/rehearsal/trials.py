@@ -31,7 +31,7 @@ from puncture_twin.planning.registration.fits.least_squares import (
 from puncture_twin.planning.registration.marker_noise import parameter_variances
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.uncertainty.pose_error import Bend
-from puncture_twin.twin.plant.true_needle import TrueNeedle, driven_onto, true_needle
+from puncture_twin.twin.plant.true_needle import TrueNeedle, joints_at_points, true_needle
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Puncture:
     aim: Aim | None = None
 
 
-class Rooms(NamedTuple):
+class Trials(NamedTuple):
     """What happened in n rooms; CT frame, mm.
 
     Attributes:
@@ -90,16 +90,16 @@ class Rooms(NamedTuple):
     chi_squared: Floats
     bevel_side: Floats
 
-    def of(self, rows: Bools | Ints) -> Rooms:
+    def of(self, rows: Bools | Ints) -> Trials:
         """Some of the rooms."""
-        return Rooms._make(column[rows] for column in self)
+        return Trials._make(column[rows] for column in self)
 
-    def reached_alone(self) -> Rooms:
+    def reached_alone(self) -> Trials:
         """Without the rooms in which the arm did not reach the pose."""
         return self.of(self.reached)
 
 
-def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Rooms:
+def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Trials:
     """Draw rooms from declared errors and rehearse the puncture in each.
 
     Args:
@@ -122,7 +122,7 @@ def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rando
     outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T
     R_ct_needle = T_ct_base[:3, :3] @ needle.R_base_needle
     tip_ct, squares = apply(T_ct_base, needle.tip_base), _chi_squared(puncture, residuals)
-    return Rooms(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares, side)
+    return Trials(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares, side)
 
 
 def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
@@ -157,7 +157,7 @@ def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.ran
     eta_of = np.broadcast_to(eta[:, None], (count, markers, 28))
     read_ct = puncture.points_ct + _normal(rng, errors.marker_cov_ct, (count, markers))
     there = np.broadcast_to(apply(puncture.T_base_ct, puncture.points_ct), (count, markers, 3))
-    q_true = driven_onto(puncture.model, there, puncture.q_touch, eta_of, puncture.tip_mm)
+    q_true = joints_at_points(puncture.model, there, puncture.q_touch, eta_of, puncture.tip_mm)
     q_encoder = q_true - rng.normal(size=q_true.shape) * errors.arm.repeatability
     flange = flange_pose(puncture.model, q_encoder)
     touched = flange[..., :3, 3] + puncture.tip_mm * flange[..., :3, 2]
