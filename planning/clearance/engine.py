@@ -1,8 +1,7 @@
-"""What a clearance engine answers: the one interface between the search and whoever measures.
+"""The interface of clearance engines, and needle-to-organ clearance by whichever engine measures.
 
-Clearance of every candidate to every structure, and FCL's verdict on each.
-
-From where needle axes are nearest to surfaces: unit vectors, from the triangles that a search has found.
+An engine is prepared for surfaces once and measures from any target; `measure` adds the verdict at margins, where FCL
+decides ties, and `normals_of` the unit vectors from the nearest triangles.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """The fast engine: exact distances of all needle axes at once, from surfaces packed once and placed about a target.
 
-Directions in bundles: neighbours on the sphere share one walk through the tree.
-
-The order of each surface's triangles in its blocks, kept: to find it takes half of the time of packing.
-
-One surface as seen from one target.
-
-The faces of a structure near one needle axis: all that a small displacement of the needle can meet.
+Directions are measured in bundles: neighbours on the sphere go through the tree together. The order of a surface's
+triangles in its blocks is cached (it takes half of the packing's time). `near_faces` gives the faces that a slightly
+displaced needle can touch.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The reference engine: FCL, one query per direction and structure. Slow, plain, and right by definition.
+"""The reference engine, and the cross-check against it: FCL, one query per direction and structure.
 
-A second opinion: some directions measured again by plain FCL, and every difference named.
+It is slow, plain and right by definition. `cross_check` measures some directions again and names every difference.
 """
 
 from __future__ import annotations

@@ -1,20 +1,10 @@
-"""One body of an arm as FCL objects that move with the joints.
+"""Bodies of the arm for FCL and for bounds: links and tool as convex pieces, bare and padded, and spheres around them.
 
-The bodies of an arm with its tool: links and tool of convex pieces, bare and padded; holder and needle.
-
-A shape of a body that FCL builds when it is first asked about it.
-
-Meshes as FCL sees them: surfaces, solids, and whether two of them touch.
-
-Prisms about cylinders.
-
-Spheres in a tree that enclose a body: what is clear of them is clear of the body.
-
-A sphere is convex, so it contains the convex hull of any points in it. A convex piece is cut by planes into smaller
-ones; the corners of each part are the piece's corners on that side and the points where its edges cross the plane;
-a sphere about those corners contains the part, and the parts together are the piece (docs/concepts/arm-collisions.md).
-
-The connected parts of a surface, and whether one lies within a convex piece, where surfaces do not touch.
+`arm_bodies` makes all of them; a `Solid` is built by FCL when it is first queried. A `SphereTree` encloses a body: what
+is clear of its spheres is clear of the body. A sphere is convex, so it contains the convex hull of any points in it.
+A convex piece is cut by planes; the corners of a part are the piece's corners on that side and the points where its
+edges cross the plane; a sphere about those corners contains the part (docs/concepts/arm-collisions.md).
+Where surfaces do not touch, `LooseParts` tells whether a part of one lies within a convex piece.
 """
 
 from __future__ import annotations

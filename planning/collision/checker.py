@@ -1,9 +1,9 @@
-"""What the arm may touch: collision answers of FCL for an arm with its needle, the patient's skin and the room.
+"""The reference collision checker: FCL for an arm with its needle against the patient's skin and the workcell.
 
 FCL sees the surfaces of triangle meshes, not their insides. Links, holder, needle and boxes are therefore solid
 convex shapes here, and two of them never hide in one another. The skin is a triangle mesh, and the arm cannot hide in
 it either: neighbouring bodies of the chain overlap (a test holds this), the base stands outside (checked once), so if
-no body meets a closed skin every body is on the base's side of it. For an open skin there is no inside, and only its
+no body touches a closed skin every body is on the base's side of it. For an open skin there is no inside, and only its
 surface counts (``patient_closed``). What is loose (a block of the table) could hide in a link: see `FclSkin`.
 """
 

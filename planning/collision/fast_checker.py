@@ -1,6 +1,6 @@
-"""The verdicts of :class:`CellChecker`, sooner: FCL is queried only where spheres and planes prove nothing.
+"""The fast collision checker: the verdicts of :class:`CellChecker`, with FCL only where bounds prove nothing.
 
-Straight joint segments, checked by compiled proofs; FCL has the word where they say nothing.
+`FastChecker` checks states and paths, `SegmentChecker` straight joint segments; both by compiled proofs first.
 """
 
 from __future__ import annotations

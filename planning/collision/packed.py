@@ -1,10 +1,8 @@
-"""Boxes and bodies as compiled code takes them: convex hulls, each once, with their edges, and trees of spheres.
+"""Boxes, bodies and skin as compiled code takes them.
 
-Of a hull with many corners a coarse one of few takes its place, with how far the others stand out.
-
-What moves: how far a turn of each joint moves a body, and the sphere about it.
-
-The skin as compiled code takes it: its triangles in a balanced tree of boxes, and its field of distances.
+Convex hulls are packed once each, with their edges; many corners are replaced by a coarse hull of few, with how far the
+others stand out. Bodies have trees of bounding spheres; the skin is a balanced tree of boxes and a field of distances.
+`joint_levers` bounds how far a rotation of each joint moves a body.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
-"""The patient as FCL is asked about it: the skin and what else the CT shows, in parts that are made when needed.
+"""The patient and single checks as FCL sees them: the skin and what else the CT shows, in parts built on demand.
 
-One question to FCL, and its answer.
-
-The robot's base must not stand in the patient.
-
-Whether a tool of the user's own hangs on the arm: one that floats could lie wholly in the patient, unseen.
+A `Check` is one query to FCL. A base that stands in the patient is refused, and so is a tool of the user's own that
+hangs on nothing: one that floats could lie wholly in the patient, unseen.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""The checks of one cell as compiled code takes them: hulls, spheres and the skin's tree, packed once.
+"""The checks of one workcell, packed for compiled proofs.
 
-Pieces two joints apart that never touch, at no angle: proven once for an arm, and not tested again.
+`Proofs` proves checks clear at states, along paths and in boxes of joint angles. `never_touching` finds the pieces two
+joints apart that touch at no angle: proven once for an arm, and not tested again.
 """
 
 from __future__ import annotations

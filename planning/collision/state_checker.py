@@ -1,6 +1,7 @@
-"""What a check of configurations answers, and the names behind which one checker takes another's place.
+"""The interface of collision checkers, what they return, and bounds on how far an arm's bodies move.
 
-How far the bodies of an arm move between two configurations: the bound behind every sampled collision check.
+Any checker may take another's place behind `StateChecker`. `SweptBodies` bounds the motion between two configurations:
+every sampled collision check rests on it.
 """
 
 from __future__ import annotations

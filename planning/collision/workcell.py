@@ -1,8 +1,6 @@
-"""The workcell of a case for the arm: the needle on its flange, the patient, what stands around it, where it waits.
+"""The workcell of a case: the needle on its flange, the patient, obstacles and gantry, and where the arm waits.
 
-What a case file says stands about the patient: obstacles and gantry, as boxes for the arm and solids for the needle.
-
-They are solids for the needle too: it is checked against them with and without an arm.
+Obstacles and gantry are boxes for the arm and solids for the needle, which is checked against them also without an arm.
 """
 
 from __future__ import annotations

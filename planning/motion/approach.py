@@ -1,7 +1,7 @@
-"""From home to a standoff pose: RRT-Connect to several goals, shortened, corners rounded, timed, and checked by FCL.
+"""The approach from home to a standoff pose: RRT-Connect to several goals, shortened, rounded, timed, checked by FCL.
 
 A fast checker proves whole segments (:class:`SegmentChecker`). With FCL alone a segment is checked at
-samples, which can miss something thin; the check of the finished motion is closer, and plans anew what it refuses.
+samples, which can miss something thin; the check of the finished motion is closer, and what it refuses is planned anew.
 """
 
 from __future__ import annotations

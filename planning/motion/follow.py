@@ -1,15 +1,12 @@
 """Joint paths in time: past rounded corners without a stop, and straight insertions; from rest to rest, low in jerk.
 
-Corner. Between two straight segments with unit directions u and w the joints' velocity turns from v u to v w at one
+Corner. Between two straight segments with unit directions u and w the joints' velocity changes from v u to v w at one
 speed v of the path: dq/dt = v ((1 - f) u + f w) with f = 3 x^2 - 2 x^3, x = t / T. The curve leaves the one segment
 and joins the other at the distance d = v T / 2 from the corner, which fixes its shape whatever the speed. Each joint's
 speed stays between those of the two segments; its acceleration is at most 3/4 v^2 |w - u| / d and zero at both ends;
 its jerk is at most 3/2 v^3 |w - u| / d^2; the curve passes the corner at 3/16 d |w - u|, inside the triangle that it
-cuts off. On the segments between, ruckig changes the speed.
-
-How fast along a path: from one speed to another within speed, acceleration and jerk, by ruckig.
-
-Source: Berscheid and Kroeger 2021, "Jerk-limited real-time trajectory generation with arbitrary target states".
+cuts off. Between corners ruckig changes the speed (Berscheid and Kroeger 2021, "Jerk-limited real-time trajectory
+generation with arbitrary target states").
 """
 
 from __future__ import annotations

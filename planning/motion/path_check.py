@@ -1,4 +1,4 @@
-"""A joint path, looked at closely: states between which no body moves far, the first contact, the least clearance."""
+"""Checks of a finished joint path: dense states, the first contact, and the least clearance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RRT-Connect, by OMPL, over straight joint segments that somebody else checks.
+"""RRT-Connect, by OMPL, over straight joint segments that a given check decides; and OMPL's shortcuts of a path.
 
 Source: Kuffner and LaValle 2000, "RRT-Connect: an efficient approach to single-query path planning".
 
@@ -6,13 +6,9 @@ Nothing here depends on the clock: the planner stops after a number of samples, 
 for some of them in a row, so the same seed gives the same path.
 OMPL keeps one random generator for the whole process and reseeds it here; two plans must not run in two threads.
 
-OMPL's space of joint angles: its bounds, and its states as angles.
-
-OMPL measures distances in it with the wrist's joints counted for half: what a robot's arm touches is decided by the
-first three joints most of the time, and branches that reach farther in those find the way through a gap sooner
+OMPL measures distances with the wrist's joints counted for half: what an arm touches is decided by the first three
+joints most of the time, and branches that reach farther in those pass a gap sooner
 (``python -m benchmarks.approach_planners``).
-
-OMPL's shortcuts of a path, counted in steps, never in time.
 """
 
 from __future__ import annotations

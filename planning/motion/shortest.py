@@ -1,11 +1,11 @@
-"""The shortest path found to any of several goals: straight, or by runs of the planner that each seek a shorter one.
+"""The shortest path found to any of several goals, or the proof that the upper arm cannot pass.
 
-A proof that no path leads from home to a goal: whatever the other joints do, the upper arm cannot get by.
+`shortest_path` tries straight lines, then runs of the planner that each seek a shorter path.
 
-The upper arm's place depends on the first two joints alone. Their angles are divided into cells. In a blocked cell one
-point of the upper arm lies, at the middle, deeper in a box than it can move within the cell, so the upper arm is in
-that box all over the cell. A path's first two angles pass from cell to cell, so one that is free stays among the cells
-that are not blocked and hang together. Where home and a goal are not among the same of them there is no path.
+Proof (`Cut`). The upper arm's place depends on the first two joints alone, whose angles are divided into cells. In a
+blocked cell one point of the upper arm lies, at the middle, deeper in a box than it can move within the cell, so the
+upper arm is in that box all over the cell. A path's first two angles pass from cell to cell, so a free one stays in one
+connected part of the cells that are not blocked. Where home and a goal lie in different parts there is no path.
 """
 
 from __future__ import annotations

@@ -1,16 +1,8 @@
-"""Which directions the arm can reach and insert along: standoff pose, straight insertion, nothing touched on the path.
+"""Reach: which directions the arm can insert along, from a standoff pose straight to the target, without contact.
 
-Retraction is the same motion backwards, so what may be inserted may be withdrawn.
-
-The search for the first clear motion of each of many requests.
-
-Motions checked for contacts, of many directions at once.
-
-What keeps every branch of the arm from a flange pose.
-
-Where the approach may end: every roll, branch and whole turn on which the arm holds one direction.
-
-A small workcell, asked once: on a new machine it has every kernel of the arm compiled before a case needs it.
+`assess_reach_all` checks many directions: kinematics of all first (`survey`), then for each the motions that it
+allows, the best margin first, until one is clear. `approach_goals` lists where an approach to one direction may end.
+Retraction is the insertion backwards, so what may be inserted may be withdrawn.
 """
 
 from __future__ import annotations
@@ -90,24 +82,6 @@ CHUNK = 256
 """Requests between two reports of progress."""
 
 
-def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswer]:
-    """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first.
-
-    Args:
-        checker: Checks contacts, in the base frame.
-        request: The direction.
-
-    Returns:
-        Empty where there is none.
-
-    Raises:
-        InputError: See :func:`assess_reach_all`.
-    """
-    found = _surveyed(checker, [request], ROLLS)[0]
-    tried = tried_all(checker, [(found, insertion) for insertion in found.insertions()])
-    return [answer for answer in tried if isinstance(answer, ReachAnswer)]
-
-
 def assess_reach_all(
     checker: StateChecker,
     requests: Sequence[ReachRequest],
@@ -135,6 +109,24 @@ def assess_reach_all(
         if progress is not None:
             progress(len(answers), len(requests))
     return answers
+
+
+def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswer]:
+    """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first.
+
+    Args:
+        checker: Checks contacts, in the base frame.
+        request: The direction.
+
+    Returns:
+        Empty where there is none.
+
+    Raises:
+        InputError: See :func:`assess_reach_all`.
+    """
+    found = _surveyed(checker, [request], ROLLS)[0]
+    tried = tried_all(checker, [(found, insertion) for insertion in found.insertions()])
+    return [answer for answer in tried if isinstance(answer, ReachAnswer)]
 
 
 def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[ReachAnswer]:
@@ -413,7 +405,9 @@ def _rotated(checker: StateChecker, answer: ReachAnswer) -> list[ReachAnswer]:
 
 
 NEEDLE = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
+
 STANDOFF_MM = 120.0
+
 TARGET = np.array([360.0, 20.0, 100.0])
 """In the middle of the body, mm, base frame."""
 
@@ -421,6 +415,7 @@ OUTWARD = np.array([[0.0, 0.0, 1.0], [-0.3, 0.2, 0.93], [0.9, 0.1, 0.3], [0.3, 0
 """Two directions that the arm reaches, and two that it does not."""
 
 CORNERS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+
 FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
 """Of an octahedron, seen from outside counterclockwise."""
 

@@ -1,6 +1,6 @@
-"""Where tip and flange wait before the insertion, and how far from the target the needle's axis is checked.
+"""Standoff: where tip and flange wait before the insertion, and how far out the needle's axis is checked.
 
-How far from the skin the tip waits before the insertion, for a case that does not say.
+A case may state it; else the tip waits so far from the skin that the needle clears it (`skin_gaps`).
 """
 
 from __future__ import annotations

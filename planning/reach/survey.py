@@ -1,10 +1,6 @@
-"""What kinematics alone says of many directions: every branch and roll.
+"""Kinematics of straight insertions: every branch and roll of many directions, without any collision check.
 
-What the arm has to reach for one direction, and whether it does.
-
-The path of each branch along the needle, by inverse kinematics.
-
-A straight insertion as states so close to one another that what holds at them holds between them.
+A path along the needle is sampled so closely that what is true of its states is true between them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""All that a person needs to find a path again at the patient: the one table that terminal, JSON and page show.
+"""One path as a person finds it again at the patient: skin entry, nearest marker, and angles in the scanner.
 
-How far the skin entry lies from a marker, along the patient's own axes.
+`entry_facts` makes the one table that terminal, JSON and page show; the entry lies so far from a marker along the
+patient's own axes.
 """
 
 from __future__ import annotations
@@ -14,12 +15,6 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-
-LEAST_IN_PLANE = 1e-6
-"""Of a unit vector: a needle that runs along the patient has no angle within the slice."""
-
-MOST_TILT = np.radians(30.0)
-"""To which gantries of CT scanners tilt at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +106,13 @@ class NeedlePlanes(NamedTuple):
         """Plain values: degrees; null where there is no angle."""
         angles = {f"{name}_deg": float(np.degrees(angle)) for name, angle in self._asdict().items()}
         return {name: angle if np.isfinite(angle) else None for name, angle in angles.items()}
+
+
+LEAST_IN_PLANE = 1e-6
+"""Of a unit vector: a needle that runs along the patient has no angle within the slice."""
+
+MOST_TILT = np.radians(30.0)
+"""To which gantries of CT scanners tilt at most."""
 
 
 def _angle(angle: float, of: str, positive: str, negative: str) -> str:

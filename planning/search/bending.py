@@ -1,13 +1,8 @@
-"""Directions on which a needle that bends, to any side, may come into a margin.
+"""The needle that bends: which directions it makes unsafe, and what one insertion does to needle and arm.
 
-The shaft is nowhere further from its straight axis than the bound of its path's length, so a clearance of margin and
-bound is enough whatever side the bevel points to.
-
-One insertion of a needle that bends: where its bevel takes it, and what the arm feels.
-
-The tissues along one path, from the skin to the target.
-
-What lies along one path: the CT's Hounsfield units beside the structures that the case names there.
+The shaft is nowhere farther from its straight axis than the bound of its path's length (`DeflectionBound`), so a
+clearance of margin and bound is enough whatever side the bevel points to: `with_bending` rejects what has less.
+`insertion_along` follows one path through its tissues (`path_layers`), `stretches` through the CT.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Chances of a search's candidates, and their refusal where a chance breaks the case's limit.
+"""Chances to hit and to touch of a search's candidates, and their rejection where a chance breaks the case's limit.
 
-To first order for all; by line sampling where a limit may decide, and where people are shown them, as `check` has them.
+To first order for all; by line sampling where a limit may decide, and where people are shown them, as in `check`.
 For the best of them the chance to touch anything too, all structures linearised together.
 """
 

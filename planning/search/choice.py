@@ -1,6 +1,6 @@
 """Which candidate a person wants: the best, one of a rank or window, of two angles, or of an entry into the skin.
 
-A list of directions in a file: points of entry, or angles; each row one direction.
+`choose` returns the rows of one choice; `read_entries` and `read_targets` read many choices from a file, one a row.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What makes a candidate safe for the organs or not: the constraints, in the order in which a reason is given.
+"""The constraints that reject a candidate, in the order in which its reason is given: organs and skin, then the arm.
 
-Which of the candidates that the organs allow the arm can reach and insert along.
+`first_broken` checks skin and organs of all candidates at once, `with_reach` the arm for those that they leave.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""A case, read and ready to be asked: its structures, its engine, and the arm in its workcell.
+"""One case, prepared: structures, clearance engine, the arm in its workcell, and every question about them.
 
-What else would be safe: with less assumed beyond the image, and with a shorter needle of the catalogue.
+`prepare` reads a case once; `CaseContext` then searches its grid, checks and explains single directions, and gives
+errors and provenance. A search also reports what else would be safe (`alternatives`).
 """
 
 from __future__ import annotations

@@ -1,14 +1,9 @@
-"""Skin and organs at all positions of the breath, and between them; what the gate lets through decides the verdict.
+"""The breath in the search: skin, organs and arm at every position of it, and between positions.
 
-The arm at every phase that the gate lets through: the target, the skin and what lies on it are elsewhere there.
-
-Skin and organs at every phase of the breath, if the needle is inserted at that phase.
-
-At the position s the target is at t + s b d, and a structure of weight w is displaced by s w b d. Seen from the
-structure, the needle starts at t + s b (1 - w) d: the surfaces stay where they are, and the engine prepared for them is
-asked for another target. What moves with the target (w = 1) is not measured again.
-
-The weight of every structure of a case that breathes: how much of the target's motion it follows; what to warn.
+At the position s the target is at t + s b d, and a structure of weight w is displaced by s w b d (amplitude b, unit
+direction d). Seen from the structure, the needle starts at t + s b (1 - w) d: the surfaces stay where they are, and
+their engine measures from another target. What moves with the target (w = 1) is not measured again.
+What the gate lets through decides the verdict.
 """
 
 from __future__ import annotations
@@ -38,76 +33,6 @@ from puncture_twin.planning.reach.standoff import axis_lengths, own_paths
 from puncture_twin.planning.search.bending import bent_verdict
 from puncture_twin.planning.search.candidates import ArmColumns, BreathingColumns, Candidates, Verdict
 from puncture_twin.planning.search.constraints import ArmReach, first_broken, with_reach
-
-LEAST_MM = 0.1
-"""Positions this near to each other are not parted: what is not shown to be clear there counts as too close."""
-
-
-class _Gap(NamedTuple):
-    """Between the positions low and high: m candidates, k structures, what both leave over the margins, (m, k), mm."""
-
-    rows: Ints
-    columns: Ints
-    low: float
-    high: float
-    at_low: Floats
-    at_high: Floats
-    deflection: Floats
-
-    def of(self, rows: Bools, columns: Bools) -> _Gap:
-        """Of some candidates and structures."""
-        part = np.ix_(rows, columns)
-        ends = self.at_low[part], self.at_high[part]
-        return _Gap(self.rows[rows], self.columns[columns], self.low, self.high, *ends, self.deflection[rows])
-
-
-def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
-    """The verdict with those rejected that no measurement shows to be clear between two positions.
-
-    Args:
-        body: The case.
-        verdict: Of the candidates, with what is rejected at the two positions.
-        low: The one position.
-        high: The other, of the same candidates.
-    """
-    deflection = np.fmax(low.deflection, high.deflection)
-    columns = np.arange(len(body.demanding))
-    return _checked(body, verdict, _Gap(low.rows, columns, low.s, high.s, low.excess, high.excess, deflection))
-
-
-def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
-    moves = body.moves_mm(gap.low, gap.high)[gap.columns]
-    least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]
-    short = (least < 0) & (moves > 0) & (verdict.reason[gap.rows] == Reason.NONE.value)[:, None]
-    rows, columns = short.any(axis=1), short.any(axis=0)
-    if not rows.any():
-        return verdict
-    gap, least, middle = gap.of(rows, columns), least[np.ix_(rows, columns)], (gap.low + gap.high) / 2
-    if moves[columns].max() <= LEAST_MM:
-        nearest = _names(body, gap, least)
-        return rejected_at(
-            verdict, gap.rows, _too_close(nearest, np.full(len(nearest), np.nan)), body.breathing, middle
-        )
-    excess = body.excess_at(gap.rows, middle, gap.columns)
-    left = excess - gap.deflection[:, None]
-    bad = left.min(axis=1) < 0
-    column = left[bad].argmin(axis=1)
-    amount = excess[bad][np.arange(len(column)), column] + body.margins[gap.columns[column]]
-    close = _too_close(_names(body, gap, left)[bad], amount)
-    verdict = rejected_at(verdict, gap.rows[bad], close, body.breathing, middle)
-    verdict = _checked(body, verdict, gap._replace(high=middle, at_high=excess))
-    return _checked(body, verdict, gap._replace(low=middle, at_low=excess))
-
-
-def _names(body: BreathingBody, gap: _Gap, left: Floats) -> Texts:
-    """The structure that leaves each candidate least."""
-    names = np.array([body.anatomy.checked[column].name for column in body.demanding], dtype=object)
-    return np.asarray(names[gap.columns[left.argmin(axis=1)]])
-
-
-def _too_close(names: Texts, amount: Floats) -> Verdict:
-    blank, reason = np.full(len(names), "", dtype=object), np.full(len(names), Reason.TOO_CLOSE.value, dtype=object)
-    return Verdict(reason, names, np.full(len(names), np.nan), amount, blank)
 
 
 def with_breathing(
@@ -228,48 +153,6 @@ def _moved(mesh: TriangleMesh, by_ct: Floats) -> TriangleMesh:
 
 
 @dataclass(frozen=True, eq=False)
-class Phase:
-    """What some candidates are at one position of the breath.
-
-    Attributes:
-        s: The position.
-        rows: Shape (m,), which candidates.
-        verdict: Of these m.
-        clearance: Shape (m, k), to the k structures with a margin, mm.
-        excess: Shape (m, k), the same less the margins.
-        deflection: Shape (m,), how far the needle may bend, mm; 0 where it does not.
-    """
-
-    s: float
-    rows: Ints
-    verdict: Verdict
-    clearance: Floats
-    excess: Floats
-    deflection: Floats
-
-    @property
-    def safe(self) -> Bools:
-        """Shape (m,)."""
-        return np.asarray(self.verdict.reason == Reason.NONE.value)
-
-    @property
-    def least_excess(self) -> Floats:
-        """Shape (m,), mm; minus infinity where something else than a clearance rejects."""
-        near = np.isin(self.verdict.reason, CLEARANCES) | self.safe
-        return np.asarray(np.where(near, self.excess.min(axis=1, initial=np.inf), -np.inf))
-
-    def of(self, which: Bools) -> Phase:
-        """Of some of the candidates; ``which`` of shape (m,)."""
-        rows = np.flatnonzero(which)
-        arrays = (self.clearance[rows], self.excess[rows], self.deflection[rows])
-        return Phase(self.s, self.rows[rows], self.verdict.of(rows), *arrays)
-
-
-CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE_BENDS.value)
-"""Reasons whose number is a clearance, the only one that is told of a phase."""
-
-
-@dataclass(frozen=True, eq=False)
 class BreathingBody:
     """A case that breathes, ready to be asked for any position.
 
@@ -368,6 +251,48 @@ class BreathingBody:
         return Clearances(clearance, depth, violated)
 
 
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """What some candidates are at one position of the breath.
+
+    Attributes:
+        s: The position.
+        rows: Shape (m,), which candidates.
+        verdict: Of these m.
+        clearance: Shape (m, k), to the k structures with a margin, mm.
+        excess: Shape (m, k), the same less the margins.
+        deflection: Shape (m,), how far the needle may bend, mm; 0 where it does not.
+    """
+
+    s: float
+    rows: Ints
+    verdict: Verdict
+    clearance: Floats
+    excess: Floats
+    deflection: Floats
+
+    @property
+    def safe(self) -> Bools:
+        """Shape (m,)."""
+        return np.asarray(self.verdict.reason == Reason.NONE.value)
+
+    @property
+    def least_excess(self) -> Floats:
+        """Shape (m,), mm; minus infinity where something else than a clearance rejects."""
+        near = np.isin(self.verdict.reason, CLEARANCES) | self.safe
+        return np.asarray(np.where(near, self.excess.min(axis=1, initial=np.inf), -np.inf))
+
+    def of(self, which: Bools) -> Phase:
+        """Of some of the candidates; ``which`` of shape (m,)."""
+        rows = np.flatnonzero(which)
+        arrays = (self.clearance[rows], self.excess[rows], self.deflection[rows])
+        return Phase(self.s, self.rows[rows], self.verdict.of(rows), *arrays)
+
+
+CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE_BENDS.value)
+"""Reasons whose number is a clearance, the only one that is told of a phase."""
+
+
 def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:
     """A verdict with what is rejected at one phase; what is rejected already keeps its reason.
 
@@ -389,13 +314,75 @@ def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Brea
     return Verdict(**arrays)
 
 
-SAFE_WHEN = (
-    "breathing: a safe direction is safe {when}: checked at {count} positions, and clearances between them; a needle "
-    "in place moves with the organ and bends"
-)
-PLANS = "breathing: plans and rehearsals go to the target where the CT shows it (s = {s:g}), the patient at rest there"
-OPEN = "breathing: the gate is open {part:.0%} of the time, if the breath follows the curve"
-OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside of the gate (s <= {gate:g})"
+def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
+    """The verdict with those rejected that no measurement shows to be clear between two positions.
+
+    Args:
+        body: The case.
+        verdict: Of the candidates, with what is rejected at the two positions.
+        low: The one position.
+        high: The other, of the same candidates.
+    """
+    deflection = np.fmax(low.deflection, high.deflection)
+    columns = np.arange(len(body.demanding))
+    return _checked(body, verdict, _Gap(low.rows, columns, low.s, high.s, low.excess, high.excess, deflection))
+
+
+class _Gap(NamedTuple):
+    """Between the positions low and high: m candidates, k structures, what both leave over the margins, (m, k), mm."""
+
+    rows: Ints
+    columns: Ints
+    low: float
+    high: float
+    at_low: Floats
+    at_high: Floats
+    deflection: Floats
+
+    def of(self, rows: Bools, columns: Bools) -> _Gap:
+        """Of some candidates and structures."""
+        part = np.ix_(rows, columns)
+        ends = self.at_low[part], self.at_high[part]
+        return _Gap(self.rows[rows], self.columns[columns], self.low, self.high, *ends, self.deflection[rows])
+
+
+LEAST_MM = 0.1
+"""Positions this near to each other are not parted: what is not shown to be clear there counts as too close."""
+
+
+def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
+    moves = body.moves_mm(gap.low, gap.high)[gap.columns]
+    least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]
+    short = (least < 0) & (moves > 0) & (verdict.reason[gap.rows] == Reason.NONE.value)[:, None]
+    rows, columns = short.any(axis=1), short.any(axis=0)
+    if not rows.any():
+        return verdict
+    gap, least, middle = gap.of(rows, columns), least[np.ix_(rows, columns)], (gap.low + gap.high) / 2
+    if moves[columns].max() <= LEAST_MM:
+        nearest = _names(body, gap, least)
+        return rejected_at(
+            verdict, gap.rows, _too_close(nearest, np.full(len(nearest), np.nan)), body.breathing, middle
+        )
+    excess = body.excess_at(gap.rows, middle, gap.columns)
+    left = excess - gap.deflection[:, None]
+    bad = left.min(axis=1) < 0
+    column = left[bad].argmin(axis=1)
+    amount = excess[bad][np.arange(len(column)), column] + body.margins[gap.columns[column]]
+    close = _too_close(_names(body, gap, left)[bad], amount)
+    verdict = rejected_at(verdict, gap.rows[bad], close, body.breathing, middle)
+    verdict = _checked(body, verdict, gap._replace(high=middle, at_high=excess))
+    return _checked(body, verdict, gap._replace(low=middle, at_low=excess))
+
+
+def _names(body: BreathingBody, gap: _Gap, left: Floats) -> Texts:
+    """The structure that leaves each candidate least."""
+    names = np.array([body.anatomy.checked[column].name for column in body.demanding], dtype=object)
+    return np.asarray(names[gap.columns[left.argmin(axis=1)]])
+
+
+def _too_close(names: Texts, amount: Floats) -> Verdict:
+    blank, reason = np.full(len(names), "", dtype=object), np.full(len(names), Reason.TOO_CLOSE.value, dtype=object)
+    return Verdict(reason, names, np.full(len(names), np.nan), amount, blank)
 
 
 class MovingWeights(NamedTuple):
@@ -434,6 +421,18 @@ def _by_itself(case: Case, structure: Structure) -> float | None:
     if structure.name in {case.target_structure, BEYOND_IMAGE}:  # which the breath has widened already
         return 1.0
     return 0.0 if structure.source == OF_CASE_FILE else None
+
+
+SAFE_WHEN = (
+    "breathing: a safe direction is safe {when}: checked at {count} positions, and clearances between them; a needle "
+    "in place moves with the organ and bends"
+)
+
+PLANS = "breathing: plans and rehearsals go to the target where the CT shows it (s = {s:g}), the patient at rest there"
+
+OPEN = "breathing: the gate is open {part:.0%} of the time, if the breath follows the curve"
+
+OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside of the gate (s <= {gate:g})"
 
 
 def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
-"""Which of the safe candidates to prefer: a weighted cost of six terms, and the Pareto front of the same terms.
+"""The order of the safe candidates: a weighted cost of six terms, and the Pareto front of the same terms.
 
-How far a needle may be off and still be safe for the organs, as far as the grid tells.
+One of the terms is the safe cone: by how much a needle may be off and still be safe, as far as the grid tells.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The batch search: a case in, one checked row per direction out.
 
-`search` is the list of its stages; `organ_candidates` the first of them: path, clearance and verdict of every
+`search` is the list of its stages; `organ_candidates` is the first of them: path, clearance and verdict of every
 direction for skin and organs, without the arm.
 """
 

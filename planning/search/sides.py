@@ -1,4 +1,4 @@
-"""The sides of a body, each as far as a needle can come from there: where a grid should look, and where one looked."""
+"""Open sides of the body around a target: from where a needle can come, and which of them the case's grid covers."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How sure one candidate is, why not surer, and which single error would have to shrink, and to what.
+"""Uncertainty breakdown of one candidate: its chances, the sources of its error, and which one would have to shrink.
 
-An error's variance enters every covariance linearly, so that a source of f times its deviation leaves Sigma - (1 - f^2)
-part. The registration's weights are left as they are: with better ones the errors could be a little larger.
+An error's variance enters every covariance linearly: a source of f times its deviation leaves Sigma - (1 - f^2) part.
+The registration's weights stay as they are: with better ones the errors could be a little larger.
 """
 
 from __future__ import annotations

@@ -48,6 +48,40 @@ MOST_MARKERS = 12
 """The order of more takes too long to be the best one."""
 
 
+def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progress: Count) -> TouchPlan:
+    """Plan to touch every marker that can be touched.
+
+    Args:
+        context: Of a case with declared errors, markers and an arm.
+        q_insertion: Shape (6,), rad, the tip on the target: what the touches shall be good for.
+        seed: Of the motions' planner.
+        progress: Called with motions done and all of them.
+
+    Raises:
+        InputError: The case declares no errors, or has no markers, or too many.
+        NoAnswerError: The markers that can be touched are fewer than three or lie on a line, or no motion home was
+            found.
+    """
+    every = _task(context, q_insertion)
+    found = _open(every)
+    while True:
+        task = every.of(found.rows)
+        error = _error(task, every, found.left_out)
+        chosen, worst = (least_error(error, found.candidates, q_insertion, worst=worst) for worst in (False, True))
+        stops = Stops(task.markers.names, task.markers.points_base, chosen)
+        try:
+            tour = tour_through(context, stops, seed=seed, progress=progress)
+        except NoMotionError as none:
+            found = found.without(none.place, task.markers.names[none.place], str(none))
+            continue
+        return TouchPlan(
+            **vars(tour),
+            left_out=found.left_out,
+            expected_mm=task.expected_mm(chosen),
+            worst_mm=task.expected_mm(worst),
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class _Task:
     """Some markers of a case, and what they are touched for.
@@ -116,40 +150,6 @@ class _Open(NamedTuple):
         rows, kept = list(self.rows), list(self.candidates)
         del rows[place], kept[place]
         return _Open(tuple(rows), tuple(kept), {**self.left_out, name: why})
-
-
-def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progress: Count) -> TouchPlan:
-    """Plan to touch every marker that can be touched.
-
-    Args:
-        context: Of a case with declared errors, markers and an arm.
-        q_insertion: Shape (6,), rad, the tip on the target: what the touches shall be good for.
-        seed: Of the motions' planner.
-        progress: Called with motions done and all of them.
-
-    Raises:
-        InputError: The case declares no errors, or has no markers, or too many.
-        NoAnswerError: The markers that can be touched are fewer than three or lie on a line, or no motion home was
-            found.
-    """
-    every = _task(context, q_insertion)
-    found = _open(every)
-    while True:
-        task = every.of(found.rows)
-        error = _error(task, every, found.left_out)
-        chosen, worst = (least_error(error, found.candidates, q_insertion, worst=worst) for worst in (False, True))
-        stops = Stops(task.markers.names, task.markers.points_base, chosen)
-        try:
-            tour = tour_through(context, stops, seed=seed, progress=progress)
-        except NoMotionError as none:
-            found = found.without(none.place, task.markers.names[none.place], str(none))
-            continue
-        return TouchPlan(
-            **vars(tour),
-            left_out=found.left_out,
-            expected_mm=task.expected_mm(chosen),
-            worst_mm=task.expected_mm(worst),
-        )
 
 
 def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:

@@ -1,9 +1,7 @@
-"""The chances of any needles that reach a case's target, to hit, to touch and to break margins, to first order.
+"""Chances of any needles that reach a case's target: to hit, to touch and to break margins, and the case's limits.
 
-The model is made once for a case; whoever asks has needles alone: directions, and how the arm stands with the tip on
-the target. Line sampling refines them where it is wanted (`refined_chances`).
-
-The chances of a search's candidates to hit the target, and to touch each structure or its margin; their limits.
+The model is made once for a case; a query is needles alone: directions, and the arm's joints with the tip on the
+target. Chances are of first order; line sampling refines them on request (`refined_chances`).
 """
 
 from __future__ import annotations

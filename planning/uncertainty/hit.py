@@ -1,6 +1,7 @@
-"""The chance to hit: that a normal error of known covariance leaves the tip within a radius, or within a mesh.
+"""Chance to hit, and chance to touch to first order, from the covariance of the needle's pose.
 
-In a mesh by directional simulation (Bjerager, J. Eng. Mech. 114, 1988): along each of many fixed directions u_i the
+**To hit**: a normal error of known covariance leaves the tip within a radius, or within a mesh. In a mesh by
+directional simulation (Bjerager, J. Eng. Mech. 114, 1988): along each of many fixed directions u_i the
 surface is crossed at distances rho_ij, and with m_i^2 = u_i' Sigma^-1 u_i
 
     P = sum_i m_i^-3 sum_j s_ij F3(rho_ij m_i) / sum_i m_i^-3,   F3 the distribution of the length of three normals
@@ -11,14 +12,12 @@ normal; F3 is odd, so that this is right where it moves past the target, and P i
 gave the errors' size, that size is uncertain too: F3 becomes Fisher's F(3, nu), and within a radius the chance is
 averaged over chi-squared.
 
-The chance to touch, to first order: how an error of the needle's pose changes its distance from each structure.
-
-The axis point f + s u is nearest to structure j at distance D; n is the unit vector from the structure to it. Then
+**To touch** (`proximity`): the axis point f + s u is nearest to structure j at distance D, n the unit vector from it.
 
     dD = n . (d + s phi x u),   g = (n; s u x n),   sigma^2 = g' Sigma6 g,   P = Phi(-(D - t) / sigma)
 
 (Hasofer, Lind, J. Eng. Mech. Div. 100, 1974). Exact for a flat surface; low between two ribs or over a concave lung,
-high at convex ends: where it may decide, `line_sampling` answers (docs/concepts/uncertainty.md).
+high at convex ends: where it may decide, line sampling is used (docs/concepts/uncertainty.md).
 """
 
 from __future__ import annotations

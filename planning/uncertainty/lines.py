@@ -1,6 +1,6 @@
-"""The chance to touch, beyond first order: the needle is moved along lines, and where it touches is found.
+"""Chance to touch beyond first order, by line sampling: a needle is displaced along lines to where it touches.
 
-With Sigma5 the covariance of the tip's shift and of the lean across the needle (turning about its own axis moves it
+With Sigma5 the covariance of the tip's shift and of the lean across the needle (a rotation about its own axis moves it
 nowhere), xi = B z, B B' = Sigma5, and z standard normal, every line is
 
     z = y + beta a,   a = -B'g / sigma,   y across a,      P = E_y[sum Phi(beta_out) - Phi(beta_in)]
@@ -9,16 +9,12 @@ over the stretches of the line on which the needle is nearer than the threshold 
 Pradlwarter, Schueller, Prob. Eng. Mech. 19, 2004). The mean over y is a rule of 25 lines, exact to the fifth degree
 (Stroud, Approximate Calculation of Multiple Integrals, 1971, E_n^r2 5-2 with n = 4). Where its lines disagree, or
 several things are about as likely, 128 lines spread by Sobol; where these disagree, 512. Where another direction
-touches sooner than first order's, which 51 rays tell, a is that one. A line is walked in steps that no approach can
-outrun, so that entry *and* exit of every stretch are found. A surface that may lie off as a whole is one more normal;
-errors whose size is uncertain give every line a size of its own.
+touches sooner than first order's (found by 51 rays), a is that one. A surface that may lie off as a whole is one more
+normal; errors whose size is uncertain give every line a size of its own.
 
-One needle, and how it may be displaced.
-
-Lines of displaced needles, walked to where they touch: the compiled inside of `line_sampling`.
-
-A step is never longer than the needle's distance over the fastest that any of its points moves, so that no approach
-is outrun; through what it touches it goes in small steps, and at every exit it is tested whether the needle is inside.
+A step along a line is never longer than the needle's distance over the fastest that any of its points moves, so that
+entry *and* exit of every stretch are found. Through what it touches the walk goes in small steps, and at every exit it
+is tested whether the needle is inside.
 """
 
 from __future__ import annotations

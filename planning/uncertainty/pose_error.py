@@ -1,4 +1,4 @@
-"""The covariance of the needle's pose against the anatomy at the end of an insertion, and where it comes from.
+"""Covariance of the needle's pose against the anatomy at the end of an insertion, its sources, and its bound.
 
 With J_i the arm's error Jacobian at marker i's touch and J_f at the insertion, L the registration's map, X its
 transport to the target, Omega what errs anew at each marker:
@@ -6,25 +6,7 @@ transport to the target, Omega what errs anew at each marker:
     Sigma6 = G Sigma_eta G' + X L Omega L' X' + (rep^2 + drift^2) Jq_f Jq_f',   G = J_f - X L J
 
 The minus sign is the cancellation: what the arm does wrong at the markers it does again at the target.
-
-The most that a needle's pose may err in any configuration that puts its tip on the target.
-
-No configuration is asked: every column of the arm's error Jacobian is bounded by its lever, and a lever's length by the
-chain between the tip and the joint. For matrices |A + B| <= |A| + |B| and |[A B]|^2 <= |A|^2 + |B|^2 (largest singular
-values), so that for every q
-
-    sqrt(lmax Sigma_dd) <= deviation_mm,   sqrt(lmax Sigma_phiphi) <= deviation_rad.
-
-A distance whose gradient is g = (n; s u x n), |n| = |u| = 1, then deviates by deviation_mm + s deviation_rad at most.
-
-A point of the axis at depth s is displaced by no more than |d| + s |phi|, phi across the axis, and a surface by e. With
-(d, phi, e) whitened to w of 6 dimensions, Cauchy and Schwarz give for all s at once
-
-    |d| + s |phi| + |e| <= |w| hypot(deviation_mm + s deviation_rad, surface_mm),
-
-and |w|^2 is chi-squared (6 times Fisher's F where the residuals gave the noise's size). So a distance that is larger
-than the needle's radius by z times this, z^2 the quantile of 1 - P, is used up with a chance of P at most, whatever the
-surface's shape.
+`AnyPose` bounds the error in all configurations that put the tip on the target.
 """
 
 from __future__ import annotations
@@ -247,7 +229,23 @@ def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudg
 
 
 class AnyPose(NamedTuple):
-    """Bounds of a pose's error, whatever the configuration; see above."""
+    """Bounds of a pose's error, whatever the configuration; see above.
+
+    Every column of the arm's error Jacobian is bounded by its lever, and a lever's length by the chain between tip and
+    joint. For matrices |A + B| <= |A| + |B| and |[A B]|^2 <= |A|^2 + |B|^2 (largest singular values), so that for all q
+
+        sqrt(lmax Sigma_dd) <= deviation_mm,   sqrt(lmax Sigma_phiphi) <= deviation_rad.
+
+    A distance whose gradient is g = (n; s u x n), |n| = |u| = 1, deviates by deviation_mm + s deviation_rad at most.
+    A point of the axis at depth s is displaced by no more than |d| + s |phi|, phi across the axis, a surface by e. With
+    (d, phi, e) whitened to w of 6 dimensions, Cauchy and Schwarz give for all s at once
+
+        |d| + s |phi| + |e| <= |w| hypot(deviation_mm + s deviation_rad, surface_mm),
+
+    and |w|^2 is chi-squared (6 times Fisher's F where the residuals gave the noise's size). So a distance larger than
+    the needle's radius by z times this, z^2 the quantile of 1 - P, is used up with a chance of P at most, whatever the
+    surface's shape.
+    """
 
     deviation_mm: float
     deviation_rad: float

@@ -1,6 +1,6 @@
 """A surface packed for the fast search: blocks of 16 triangles under an implicit 16-ary tree of discs.
 
-The discs about blocks of triangles, and about 16 discs of the level below.
+Each disc bounds a block's triangles, or 16 discs of the level below.
 """
 
 from __future__ import annotations

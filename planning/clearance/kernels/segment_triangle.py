@@ -1,17 +1,12 @@
-"""Exact distance of a needle axis from one triangle, in float64, degenerate triangles included.
+"""Exact distance of a needle axis from triangles, in float64, degenerate triangles included.
 
 The axis starts at the origin and ends at ``length * u``. Every candidate below is a point *of the triangle*, given by
-non-negative weights of its corners, and its distance from the axis is evaluated honestly; so no candidate, however
-badly conditioned the arithmetic that proposed it, can make the answer too small. One of them is the nearest point.
+non-negative weights of its corners, and its distance from the axis is computed from that point. So no candidate,
+however badly conditioned, can make the distance too small; and one of them is the nearest point (`axis_triangle`).
 
-The target's own distance from a packed surface: the upper bound of every needle axis that starts there.
-
-Distances of one needle axis from the few faces near it, for axes that are displaced again and again, in float64.
-
-The arithmetic of a face is the engine's own (`axis_triangle`). Spheres around faces, and around blocks of 16 of them,
-only say which faces need not be asked.
-
-Which blocks of faces lie near a needle axis, and spheres around what they hold.
+`nearest_triangle` gives the target's own distance from a packed surface, an upper bound for every axis from there.
+`displaced_distance` measures an axis that is displaced again and again from the few faces near it: spheres around
+faces, and around blocks of 16, tell which faces may be skipped.
 """
 
 from __future__ import annotations

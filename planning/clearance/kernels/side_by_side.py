@@ -1,10 +1,9 @@
-"""Exact distances of many axes from many triangles, in float64, pair by pair and side by side.
+"""Exact distances of many axes from many triangles, in float64, pair by pair.
 
-Each pair is brought into the axis' own frame. Most triangles lie beside their axis, where the distance is that of their
-shadows in the plane across it; those are all done in one loop without a branch. The few others are told apart there.
-As in `segment_triangle.py` every answer is the distance of a point *of the triangle*.
-
-The room in which one structure is searched: arrays made once, passed down as one.
+Each pair is brought into the frame of its axis. Most triangles lie beside their axis, where the distance is that of
+their projection on the plane across it; those are all measured in one loop without a branch, the few others singly.
+As in `segment_triangle.py`, every distance is that of a point *of the triangle*.
+`Scratch` holds the arrays in which one structure is searched: made once, passed down as one.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Compiled distance of two convex hulls, between two bounds that are each a proof: a plane, and two points.
 
-A direction is searched by climbing from corner to corner; what it proves is then told by all corners.
+A direction is searched by climbing from corner to corner; what it proves is then evaluated over all corners.
 
 Source: Gilbert, Johnson and Keerthi 1988, "A fast procedure for computing the distance between complex objects in
 three-dimensional space". The nearest point of a triangle: Ericson 2005, "Real-time collision detection", 5.1.5.

@@ -1,7 +1,7 @@
-"""Compiled proofs that parts of an arm are clear, check by check, at states and all about them.
+"""Compiled proofs that parts of an arm are clear, check by check, at states and in boxes of joint angles about them.
 
-Each answer is a lower bound on a distance, in mm: above 0 it proves that nothing touches; at or below, nothing is said.
-The bounds themselves are those of `surfaces` and `hulls` beside this file.
+Each bound is a lower one on a distance, in mm: above 0 it proves that nothing touches; at or below, it proves nothing.
+The bounds themselves are those of `surfaces` and `hulls`.
 """
 
 # mypy: disable-error-code="no-untyped-def"

@@ -1,14 +1,8 @@
 # mypy: disable-error-code="no-untyped-def"
-"""Compiled check of one straight joint segment: what surely touches, what is surely clear, and what is left to ask.
+"""Compiled check of one straight joint segment: certain contacts, what is certainly clear, and what FCL has to decide.
 
-It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.segments`, of those that it calls and of
-:mod:`puncture_twin.planning.arm.kinematics`.
-
-Compiled halving of a segment for all checks together: each part keeps those that no middle of a part has cleared.
-
-It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.proofs` and of those that they call.
-
-What compiled checks of a segment share: the segment, its answer, and the room to work in.
+`divide` halves the segment for all checks together: each part keeps the checks that the middle of no larger part has
+cleared. `check_segment` goes on with each check alone. It calls the kernels of `proofs` and of the arm's kinematics.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Compiled answers to single checks: clear, or surely a contact; the reference is queried where neither is proven.
+"""Compiled decisions of single checks: clear, or certainly a contact; FCL is queried where neither is proven.
 
-What of the bounds of :mod:`puncture_twin.planning.collision.kernels.proofs` proves nothing is looked at once more: two
-hulls overlap surely where some of their corners' differences enclose the origin, and holder and needle are held
-against each triangle of the skin that is near them.
+Where the bounds of :mod:`puncture_twin.planning.collision.kernels.proofs` prove nothing, two more tests follow. Two
+hulls certainly overlap where some differences of their corners enclose the origin; holder and needle are tested against
+each triangle of the skin near them.
 """
 
 # mypy: disable-error-code="no-untyped-def"

@@ -1,6 +1,6 @@
 """Compiled distances to a surface of triangles: of points, and of a tree of bounding spheres that encloses a body.
 
-Each answer for a body is a lower bound, in mm: above 0 it proves that nothing touches; at or below, nothing is said.
+Each bound for a body is a lower one, in mm: above 0 it proves that nothing touches; at or below, it proves nothing.
 """
 
 # mypy: disable-error-code="no-untyped-def"
