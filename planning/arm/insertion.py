@@ -1,4 +1,4 @@
-"""The straight insertion: its line, and as joint motion, where a branch's path along the needle ends, how good it is.
+"""The straight insertion: its line, its joint motion, where a branch's path along the needle ends, and its margin.
 
 Each function is followed by the compiled loop behind it: a plain one over plain arrays, for which an arm is its lengths
 (d1, a2, a3, d4, d5, d6) in mm.

@@ -1,33 +1,8 @@
-"""Forward kinematics of the UR arms: frames of the links, and the Jacobian.
+"""Kinematics of UR arms: frames of the links, Jacobians, parameter errors, singularities, and tip speeds.
 
 The base frame is the controller's (a URDF's ``base_link`` is rotated by 180 deg about z against it). Frames follow
 Denavit and Hartenberg: T_{i-1}_{i} = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Compiled loops take an arm as its lengths
 (d1, a2, a3, d4, d5, d6) in mm.
-
-How the errors of an arm and of the needle on it move the needle: 28 parameters, by Denavit and Hartenberg.
-
-Source: Mooring, Roth, Driels, "Fundamentals of Manipulator Calibration", 1991: one column a parameter, its axis times
-its lever. With z_{i-1}, o_{i-1} axis and origin of joint i, and x_i, o_i of the frame behind it, at the tip p:
-
-    a_i: (x_i; 0)   d_i: (z_{i-1}; 0)   alpha_i: (x_i x (p - o_i); x_i)   q_i: (z_{i-1} x (p - o_{i-1}); z_{i-1})
-    tip offset: (R_flange; 0)   needle direction: (0; first two columns of R_flange)
-
-d2 is left out: axes 2 and 3 are parallel, and d3 moves the arm alike.
-
-Kinematics of an arm whose Denavit-Hartenberg numbers are not the nominal ones.
-
-T_{i-1}_{i} = Rz(q_i + zero_i) Tz(d_i) Tx(a_i) Rx(alpha_i). The parameters that err, and their order, are the first 23
-of `error_jacobian`. A calibration estimates such an arm, a twin draws one.
-
-How far a configuration of a UR arm is from its three singularities: of shoulder, elbow and wrist.
-
-How fast a plan may move: the needle's tip, and the joints as a fraction of what the arm can.
-
-Are the joints of this arm? Held against what the same file says of where flange, tool or tip was.
-
-A UR3e's joints read as a UR3's are 18 mm off, and nothing in six angles says so. But a recording often states the same
-thing twice: a controller's own pose beside its joints, a touched point, a flange. With the arm's nominal lengths both
-must agree, up to what a controller's own calibration moves.
 """
 
 from __future__ import annotations
@@ -158,6 +133,15 @@ FREE_D = (0, 2, 3, 4, 5)
 def error_jacobian(model: UrModel, q: Floats, tip_mm: float) -> Floats:
     """The needle's motion per unit of each parameter's error.
 
+    28 parameters of arm and needle: one column a parameter, its axis times its lever (Mooring, Roth, Driels,
+    "Fundamentals of Manipulator Calibration", 1991). With z_{i-1}, o_{i-1} axis and origin of joint i, and x_i, o_i of
+    the frame behind it, at the tip p:
+
+        a_i: (x_i; 0)   d_i: (z_{i-1}; 0)   alpha_i: (x_i x (p - o_i); x_i)   q_i: (z_{i-1} x (p - o_{i-1}); z_{i-1})
+        tip offset: (R_flange; 0)   needle direction: (0; first two columns of R_flange)
+
+    d2 is left out: axes 2 and 3 are parallel, and d3 moves the arm alike.
+
     Args:
         model: The nominal arm.
         q: Shape (..., 6), rad.
@@ -191,7 +175,11 @@ def _levers(axes: Floats, tip: Floats, origins: Floats) -> Floats:
 
 
 class ErringArm(NamedTuple):
-    """Denavit-Hartenberg numbers of one arm, each of shape (6,), mm and rad."""
+    """Denavit-Hartenberg numbers of one arm, each of shape (6,), mm and rad.
+
+    T_{i-1}_{i} = Rz(q_i + zero_i) Tz(d_i) Tx(a_i) Rx(alpha_i). The parameters that err, and their order, are the first
+    23 of `error_jacobian`. A calibration estimates such an arm, a twin draws one.
+    """
 
     a: Floats
     d: Floats
@@ -423,6 +411,10 @@ def check_arm(
     any_tool: bool = False,
 ) -> None:
     """Refuse joints that do not put the tool where the same file says that it was.
+
+    A UR3e's joints read as a UR3's are 18 mm off, and six angles alone do not show it. But a recording often states the
+    same thing twice: a controller's own pose with its joints, a touched point, a flange. With the arm's nominal lengths
+    both must agree, up to what a controller's own calibration moves.
 
     Args:
         model: The case's arm.

@@ -1,8 +1,7 @@
 """The bodies of the arm's links, in the link frames of :mod:`puncture_twin.planning.arm.kinematics`, in mm.
 
-Source: the collision shapes of its URDF; ``meshes/ur/LICENSE`` says whence those are that ship.
-
-The URDF behind an arm's model: the user's own, if it is built as a UR, or the one that ships under its name.
+Source: the collision shapes of the URDF behind an arm's model: the user's own, if it is built as a UR, or the one that
+ships under its name (``meshes/ur/LICENSE`` says whence).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the arm carries and what stands about it: needle holder and needle, and the workcell's boxes."""
+"""What the arm carries and what surrounds it: needle holder and needle, and the workcell's boxes."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""What a cohort is made of: a folder, a CSV, or a TOML file with patterns and grids of options.
-
-A cohort as ``cohort.toml``: patterns of cases, and a grid of options that each of them is run with.
-
-One case of a cohort, before anything of it has been read.
-"""
+"""The cases of a cohort: a folder, a CSV, or a TOML file with patterns of cases and a grid of options for each."""
 
 from __future__ import annotations
 

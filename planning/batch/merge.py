@@ -1,8 +1,7 @@
-"""One table for a cohort, a row a case, and one dataset of candidates with the same columns for all.
+"""The merged tables of a cohort, and two merged cohorts compared.
 
-One row a case: its verdict in numbers, or its reason. mm and degrees.
-
-Two merged cohorts against each other: what became safe, what was lost, how far the best entries moved.
+``cases.parquet`` has a row a case: its verdict in numbers (mm and degrees), or its reason; the dataset has the
+candidates of all cases with the same columns. `compare` says what became safe and what was lost.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""``plan.parquet``: every case of a cohort, with an id that is the hash of its inputs, its options and the version.
+"""The plan of a cohort (``plan.parquet``) and the results of its cases on disk.
 
-The result of one case: a folder ``DIR/ID`` that appears by one rename, with everything in it or not at all.
+A case's id is the hash of its inputs, its options and the version. Its result is a folder ``DIR/ID`` that appears by
+one rename, with everything in it or not at all.
 """
 
 from __future__ import annotations

@@ -1,12 +1,6 @@
-"""A cohort's cases, or a part, run by one at a time until each has a row; what has one is left as it is.
+"""Runs of a cohort: all of it or a part ``i/n``, on this machine or a scheduler's; its state, and an estimate.
 
-A part of a cohort: ``i/n``, as stated or as SLURM's array says it.
-
-How long a cohort will take, and how much memory and disk: measured at its first case that can be read.
-
-What has become of a cohort: done, failed with reasons, missing, stale.
-
-The same cases on the workers of a ``dask.distributed`` scheduler, on as many machines as it has.
+Cases are run by one process at a time until each has a row; what has one is left as it is.
 
 Dask runs a task again whose worker died, finished or not: every case is run at least once, and committed exactly once,
 because its result appears by a rename that only the first can make. The cohort, its output folder and this package are

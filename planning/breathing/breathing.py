@@ -1,14 +1,12 @@
-"""The breathing that a case declares: how far, whereto, and how much of it each structure follows.
+"""The breathing that a case declares: amplitude, direction, gate, and the weight by which each structure follows.
 
-The model is the plainest that there is: everything moves along one line, structure i by s w_i b, with s the position in
-the breath, b the amplitude and w_i its weight. The target's weight is 1. Nothing deforms, and in and out pass the same
-places.
-
-The breath as a curve: Lujan, Larsen, Balter and Ten Haken, Med. Phys. 26 (1999), 715-720.
+Everything moves along one line, structure i by s w_i b, with s the position in the breath, b the amplitude and w_i its
+weight; the target's is 1. Nothing deforms, and in and out pass the same places. The position over time follows Lujan,
+Larsen, Balter and Ten Haken, Med. Phys. 26 (1999), 715-720:
 
     z(t) = z0 - b cos^2n(pi t / T - phi)
 
-z0 is the place at full exhale, b the amplitude, T the period. With phi = pi/2 the period begins at exhale, and the
+z0 is the place at full exhale, T the period. With phi = pi/2 the period begins at exhale, and the
 position s = (z0 - z) / b runs from 0 (exhale) to 1 (full inhale): s(t) = sin^2n(pi t / T).
 """
 

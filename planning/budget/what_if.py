@@ -1,4 +1,4 @@
-"""What each source costs alone, and what other slices, markers, touches or another arm would leave of the error."""
+"""Cost of each error source alone, and what other slices, markers, touches or another arm would leave of the error."""
 
 from __future__ import annotations
 

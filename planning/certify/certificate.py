@@ -1,9 +1,4 @@
-"""A certified map of a cap of directions, as a value and as a versioned file.
-
-How a certificate shows itself in a notebook.
-
-The safe cone of every safe candidate, as a column and a term of the ranking.
-"""
+"""A certified map of a cap of directions: the value, its versioned file, and the safe cone that it gives candidates."""
 
 from __future__ import annotations
 

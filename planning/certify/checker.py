@@ -1,4 +1,4 @@
-"""Does a certificate hold? Plain numpy and FCL, cell by cell; nothing of what made the certificate is used.
+"""Independent check of a certificate: plain numpy and FCL, cell by cell, without any code that made the certificate.
 
 What a cell claims is proven from the surfaces by the lemmas of docs/concepts/certificate.md. A triangle that is proven
 clear of a cell is clear of its parts too, and what is true of the skin all over a cell is true all over its parts.

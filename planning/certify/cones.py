@@ -1,4 +1,4 @@
-"""Which triangles matter to which cone of directions: bounding cones, and lists that shrink from cell to part."""
+"""Bounding cones of triangles, and for every cell the list of triangles that may matter to it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a certificate answers: everything but the surfaces that a verdict depends on."""
+"""The question that a certificate answers: everything but the surfaces that a verdict depends on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every ray of a cone meets of the skin: bounds over all crossings, and their number where it is the same for all.
+"""Skin crossings of all rays of a cone: bounds on depth and angle, and their number where it is the same for all.
 
 docs/concepts/certificate.md derives each bound; `puncture_twin.planning.certify.checker` has the lemmas in plain form.
 """

@@ -1,4 +1,4 @@
-"""The skin as seen from one target: what a cone of directions needs to know of each of its triangles."""
+"""The skin as seen from one target: the data of each triangle that bounds over cones of directions need."""
 
 from __future__ import annotations
 

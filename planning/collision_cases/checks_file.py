@@ -1,6 +1,6 @@
-"""The schema of a ``*.collision.toml`` file: what people expect of directions, windows and plans.
+"""The schema of a ``*.collision.toml`` file, which states what is expected of directions, windows and plans.
 
-On which line of a TOML file a table or a key of it stands: its reader does not say.
+`line_of` finds the line of a table or key in the text, which the TOML reader does not report.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files of expectations as tests of pytest: one a table."""
+"""Tables of a ``*.collision.toml`` file as tests of pytest, one a table, and how each is checked."""
 
 from __future__ import annotations
 

@@ -1,12 +1,8 @@
-"""What one run of pytest keeps: cases that were read, their searches, and numbers that are to be rewritten.
+"""One run of pytest: cases that were read, their searches, differences found, and numbers to be rewritten.
 
-What the plugin asks of a run of pytest, and what it says at its end: light, since every run wants it.
-
-A green run must not be read as if arms had been checked, where they were not.
-
-New numbers in a file that people wrote: its comments, order and spaces stay.
-
-What a case was found to be, against what a file expects, and the number that a file would have to expect.
+A green run must not be read as if arms had been checked where they were not: `arm_notes` says so at its end.
+`rewrite` puts new numbers into a file that people wrote; its comments, order and spaces stay.
+Nothing heavy is imported here, since every run of pytest loads it.
 """
 
 from __future__ import annotations

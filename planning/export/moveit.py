@@ -1,9 +1,4 @@
-"""The files of a plan for MoveIt: each read back before any is published.
-
-Messages of ROS 2 as plain values, in metres: what both the scene and the goals are made of.
-
-The arm's URDF with holder and needle on its flange, as ROS reads it: metres, z along the needle.
-"""
+"""A plan for MoveIt: scene, goals and a URDF with the needle, in metres; each read back before any is published."""
 
 from __future__ import annotations
 

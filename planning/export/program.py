@@ -1,17 +1,11 @@
-"""What a URScript program does, as numbers: the approach, the standoff, the insertion.
+"""The URScript program of a plan as numbers: approach, standoff and insertion; and the checks before it is written.
 
-The approach is the plan's own way: its straight joint segments from rest to rest are what ``movej`` runs between two
-waypoints, so the waypoints are found again in the samples. A smooth approach has no rests, and is streamed instead.
-The insertion is one ``movel``: the plan's tip runs straight at one orientation, and so does this move, on the one
-branch that leads on from the standoff without a jump.
-
-What a file of samples says: both phases over time. And whether that is what the plan says.
-
-The exported numbers against the arm's limits: positions, speeds and accelerations.
-
-The waypoints of a joint path, found again in its samples.
-
-Words and numbers in exported files: nothing that a plan names can leave its comment or its string.
+The approach runs along the plan's own path: its straight joint segments from rest to rest are what ``movej`` runs
+between two waypoints, so `corner_rows` finds the waypoints again in the samples. A smooth approach has no rests, and is
+streamed instead. The insertion is one ``movel``: the plan's tip runs straight at one orientation, and so does this
+move, on the one branch that leads on from the standoff without a jump.
+`check_trajectory` compares positions, speeds and accelerations with the arm's limits; `plain_text` keeps what a plan
+names inside its comment or string.
 """
 
 from __future__ import annotations

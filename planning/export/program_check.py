@@ -1,4 +1,4 @@
-"""Whether a program that was read back is the plan's motion, and within the arm's limits."""
+"""Check of a program that was read back: it is the plan's motion, and within the arm's limits."""
 
 from __future__ import annotations
 

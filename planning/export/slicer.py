@@ -1,6 +1,6 @@
-"""Everything of a case and a chosen path that Slicer can show, as texts that were read back and found equal.
+"""A case and a chosen path as files for 3D Slicer, read back and found equal: scene, path, markers, entry area.
 
-The skin through which safe paths enter, as a surface between the entries of neighbouring directions.
+The entry area is the skin through which safe paths enter, as a surface between entries of neighbouring directions.
 """
 
 from __future__ import annotations

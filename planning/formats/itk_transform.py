@@ -1,22 +1,11 @@
 """Linear transforms of ITK, as text (.tfm, .txt) or HDF5 (.h5): what 3D Slicer, SimpleITK and ANTs write.
 
-Which frame a transform's points are in, no file says.
-Source: ITK, TxtTransformIO; Slicer's developer guide, "Transforms": a node's file goes from its parent.
-
-Linear transforms as ITK parametrises them, and the one matrix that they are together.
-
-Each states what ``TransformPoint`` does: y = M (x - c) + c + t, with x and y in LPS mm, M from the parameters and the
-centre of rotation c from the fixed ones. A composite applies its last part first.
-Source: ITK, MatrixOffsetTransformBase, Euler3DTransform (M = Rz Rx Ry, or Rz Ry Rx where its flag says ZYX),
-VersorRigid3DTransform, CompositeTransform.
-
-Transforms of ITK in HDF5 (.h5): the default of 3D Slicer for all transforms, and of ANTs for composites.
-
-A file has a group ``TransformGroup`` with groups ``0``, ``1``, ... of ``TransformType`` (one text),
-``TransformParameters`` and ``TransformFixedParameters``; files of ITK 4 spell both ``Tranform``. A composite is group 0
-without parameters, its parts the groups after it. What is read are the bytes that were hashed: nothing that points
-elsewhere is followed. The texts are found by `heap_text`: HDF5's own library never ends on some damaged heaps.
-Source: ITK, HDF5TransformIO. Needs the extra ``hdf5`` (h5py), which is imported only here.
+Each transform states what ``TransformPoint`` does: y = M (x - c) + c + t, with x and y in LPS mm, M from the parameters
+and the centre of rotation c from the fixed ones. A composite applies its last part first. In which frame a transform's
+points are, no file says.
+Source: ITK, TxtTransformIO, HDF5TransformIO, MatrixOffsetTransformBase, Euler3DTransform (M = Rz Rx Ry, or Rz Ry Rx
+where its flag says ZYX), VersorRigid3DTransform, CompositeTransform; Slicer's developer guide, "Transforms": a node's
+file goes from its parent.
 """
 
 from __future__ import annotations
@@ -248,6 +237,12 @@ _AS_TEXT = (
 
 def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
     """The transforms of a file in its order, linear or not; lists too long for a linear one come empty.
+
+    A file has a group ``TransformGroup`` with groups ``0``, ``1``, ... of ``TransformType`` (one text),
+    ``TransformParameters`` and ``TransformFixedParameters``; files of ITK 4 spell both ``Tranform``. A composite is
+    group 0 without parameters, its parts the groups after it. What is read are the bytes that were hashed: nothing that points
+    elsewhere is followed. The texts are found by `heap_text`: HDF5's own library never ends on some damaged heaps.
+    Needs the extra ``hdf5`` (h5py), which is imported only here.
 
     Args:
         data: The whole file.

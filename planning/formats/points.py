@@ -1,21 +1,13 @@
-"""Named points of other programs: CSV, Slicer markups (.mrk.json) and the older Slicer lists (.fcsv), in mm.
+"""Named points and joint recordings of other programs: CSV, Slicer markups (.mrk.json) and older Slicer lists (.fcsv).
 
 A CSV states its unit in the header (``name,x_mm,y_mm,z_mm``) and leaves the space to the case; Slicer's files state
-both. Whatever states a patient space arrives in LPS.
+both. Whatever states a patient space arrives in LPS, in mm. Source: Slicer documentation, "Markups" module, file
+formats, and its published schema of versions 1.0.0 to 1.0.3; in older files the coordinate system is a number. Version
+1.0.0 knows no ``coordinateUnits``: Slicer works in mm.
 
-Points as CSV: a header with the unit in it, then one point per line.
-
-Points of 3D Slicer: markups as JSON (.mrk.json), and the older fiducial lists (.fcsv).
-
-Source: Slicer documentation, "Markups" module, file formats, and its published schema of versions 1.0.0 to 1.0.3;
-in older files the coordinate system is a number. Version 1.0.0 knows no ``coordinateUnits``: Slicer works in mm.
-
-What a point file holds, before unit, space and the guard: the common result of its readers.
-
-The one gate for how an arm stood: joint angles and times that a file, a case or a controller states.
-
-A recording, a list of touches, a case's home and a live controller's word come through here: angles that a joint can
-have, in the unit that is stated, at times that do not run backwards. Whose arm: `planning/arm/kinematics.py`.
+`joint_readings` is the one gate for joint angles and times, of a recording, a list of touches, a case's home or a live
+controller: angles that a joint can have, in the stated unit, at times that do not run backwards. Whose arm they are of
+is checked in `planning/arm/kinematics.py`.
 """
 
 from __future__ import annotations

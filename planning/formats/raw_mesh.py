@@ -1,4 +1,4 @@
-"""What a mesh file holds, before unit, space and the guard: the common result of the readers beside this file."""
+"""A mesh file's contents before unit, space and the guard: the common result of the readers of mesh files."""
 
 from __future__ import annotations
 

@@ -1,16 +1,13 @@
-"""Is a point inside a surface? By the winding number, or by rays; and it is said when the question has no answer.
+"""Whether a point lies inside a surface, by winding number or by rays, and where rays from a point cross it.
 
-How far a surface goes around a point: the winding number, and by rays, which do not ask how triangles are wound.
+Both answers are compared, and a point for which they differ is reported as undecidable.
 
-Where rays from one point cross a surface: every crossing, in float64, without a missed edge.
-
-All rays start at the target, so a triangle is met exactly by the rays inside the solid angle that it subtends. Rays are
-binned by direction; each triangle visits the bins that its bounding cone touches, and of their rays those inside of the
-cone: where a ray lies in the plane of a triangle far beside it, the edge functions are rounding alone.
-
-Corners are moved along the ray into a plane, each by its own numbers alone, so triangles that share corners share them
-there. On which side of an edge the ray passes is then told rightly or as both: a ray through an edge or a corner hits
-at least one of the triangles about it (Woop, Benthin and Wald, JCGT 2(1), 2013).
+All rays of `crossings` start at one point, so a triangle is hit exactly by the rays inside the solid angle that it
+subtends. Rays are binned by direction; each triangle visits the bins that its bounding cone touches, and of their rays
+those inside of the cone: where a ray lies in the plane of a triangle far from it, the edge functions are rounding
+alone. Corners are moved along the ray into a plane, each by its own numbers alone, so that triangles that share corners
+share them there. On which side of an edge the ray passes is then decided rightly or as both: a ray through an edge or a
+corner hits at least one of the triangles about it (Woop, Benthin and Wald, JCGT 2(1), 2013).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Smooth where a surface is smooth, sharp where it is sharp: which corners of triangles share a normal, and which."""
+"""Vertex normals that are smooth where a surface is smooth and separate where it has a crease."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A triangle mesh as the planner holds it: checked, read-only, in mm.
-
-Several meshes as the arrays of one cache entry, and back.
-"""
+"""Triangle meshes of the planner: checked, read-only, in mm; and several of them as the arrays of one cache entry."""
 
 from __future__ import annotations
 

@@ -1,19 +1,12 @@
-"""Rigid motions as poses and as twists.
+"""Rigid motions and rotations: poses, twists, rotation vectors, and frames from axes or points.
 
-Notation of Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018), and of `rotations`. A
-twist is τ = (ρ, ω): the translation (mm) first, then the rotation (rad). A pose T_b_a = [R, t; 0, 1] maps coordinates
-in frame a to frame b. Every function that takes poses (..., 4, 4) takes many at once, unless its shape says otherwise.
+Notation of Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018). A twist is τ = (ρ, ω):
+the translation (mm) first, then the rotation vector (rad); Ω = [ω]× is its cross-product matrix, φ = |ω|. A pose
+T_b_a = [R, t; 0, 1] maps coordinates in frame a to frame b. Every function that takes poses (..., 4, 4), vectors
+(..., 3) or rotations (..., 3, 3) takes many at once, unless its shape says otherwise.
 
-Rotations as rotation vectors: the exponential, the logarithm, and the cross product's matrix.
-
-What every command needs is computed here, to the last bit as scipy does it, whose import takes 0.04 s. Sines and
-cosines are therefore the C library's: numpy's own differ in the last bit.
-
-Notation of Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018). A rotation vector is
-ω (rad), Ω = [ω]× its cross-product matrix, φ = |ω|. Every function that takes vectors (..., 3) or rotations (..., 3, 3)
-takes many at once, unless its shape says otherwise.
-
-Frames from axes or points: rotations whose columns are the axes.
+Rotations are computed to the last bit as scipy does it, whose import takes 0.04 s in every command. Sines and cosines
+are therefore the C library's: numpy's own differ in the last bit.
 """
 
 from __future__ import annotations

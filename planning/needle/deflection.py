@@ -1,26 +1,21 @@
-"""How far a bevel can take a needle off its straight line, whatever side it points to and whatever it passes.
+"""Deflection of a needle with a bevel: its bound in any direction, its path through given tissues, and its shaft.
 
-The bound is the path of a bevel that never turns, all the way in the stiffest tissue of the case: the stiffer the
-tissue, the more a bevel steers. A stiff layer before soft ones can take it further: the allowance for that was found by
-search, not proven (what is proven of every order is several times as wide: docs/concepts/needle-and-tissue.md). Which
-needle it is does not matter for that search: with lengths over 1/lambda, only the shaft's own and the layers' are left.
-In given layers the path is linear in alpha, and a bevel that never turns goes furthest.
+**Bound** (`DeflectionBound`): the path of a bevel that never rotates, all the way in the stiffest tissue of the case:
+the stiffer the tissue, the more a bevel steers. A stiff layer before soft ones can take it further: the allowance for
+that was found by search, not proven (what is proven of every order is several times as wide:
+docs/concepts/needle-and-tissue.md). With lengths over 1/lambda, only the shaft's own and the layers' are left, so that
+search holds for any needle. In given layers the path is linear in alpha, and a bevel that never rotates goes furthest.
 
-The path that a bevel cuts, and the needle in it.
-
-A bevel cuts at an angle alpha to the shaft behind it. A lateral force at the tip of a bent beam alone gives a path that
-depends on the step; the path is kinematic (Webster et al., Int. J. Robotics Research 25, 2006):
+**Path**: a bevel cuts at an angle alpha to the shaft behind it. A lateral force at the tip of a bent beam alone gives a
+path that depends on the step; the path is kinematic (Webster et al., Int. J. Robotics Research 25, 2006):
 
     dy/ds = w'(tip) + alpha,   w(tip) = y(s)
 
 with w the shaft in the foundation of the path that was cut (mechanics: Misra et al., Int. J. Robotics Research 29,
 2010). Explicit in s, by the two-step formula of Adams and Bashforth.
 
-The shaft of a needle: gauges, stiffness, sag and the load at which it buckles. N and mm.
-
-Closed forms of Euler and Bernoulli, as in any handbook (Young and Budynas, Roark's Formulas for Stress and Strain).
-
-What a needle passes on its way: tissues, layer by layer.
+**Shaft**: gauges, stiffness, sag and the load at which it buckles, N and mm, by the closed forms of Euler and
+Bernoulli (Young and Budynas, Roark's Formulas for Stress and Strain).
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 # mypy: disable-error-code="no-untyped-def"
-"""The arm as spheres, and whether they keep clear of the patient and the workcell: quick, and about right.
+"""The arm as bounding spheres, against the patient's distance field and the workcell's boxes: quick, and approximate.
 
-Only for choosing where to look: what a placement is worth says :func:`planning.reach.reach.assess_reach_all`.
-
-The patient as a field of signed distances, and the workcell's boxes: for quick tests of many arm poses.
+Only to choose where to look: what a placement is worth is decided by :func:`planning.reach.reach.assess_reach_all`.
 """
 
 from __future__ import annotations

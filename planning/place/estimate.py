@@ -1,4 +1,4 @@
-"""Which fraction of directions an arm may reach from a placement: kinematics of all, bounding spheres, then itself."""
+"""Estimated fraction of directions an arm reaches from a placement: kinematics, bounding spheres, self-contacts."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The ways to mount an arm, where each may stand about the target, and the base's pose there as ``[robot.mount]``.
+"""Mounts of an arm: where each may be placed about the target, the base's pose there, and the directions to be reached.
 
-The organ-safe directions that an arm should hold: each with the solid angle that it stands for.
+A pose is written as ``[robot.mount]``; each organ-safe direction counts by the solid angle that it represents.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
-"""The search for a place to stand the arm: all regions coarsely, the best of each finely, the finalists exactly.
+"""The search for a placement of the arm: all regions coarsely, the best of each finely, the finalists exactly.
 
-What a placement is worth: the search's own answer for the arm, for every organ-safe direction.
-
-How far a tip is expected to miss from another stand of the arm, its markers touched anew from there.
-
-Where the needle itself cannot stand before the insertion, whatever holds it.
-
-The search's result on disk: ``placements.csv`` for a table, ``place.json`` with everything.
+A finalist is checked as the batch search checks it: the arm for every organ-safe direction, the expected tip error with
+the markers touched anew from there, and whether the needle can wait before the insertion at all.
+Results: ``placements.csv`` as a table, ``place.json`` with everything.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""The planning of a sweep: as far as every direction is safe and reachable, and the arm can go on from the one before.
+"""Sweeps: the needle's axis through one fixed point while its direction changes, as far as every direction is safe.
 
-A direction is passed only if the search calls it safe: organs, skin and the arm's straight insertion. The needle stays
-outside the body; arm, holder and needle keep their distance all the way.
-
-A sweep: the needle's axis through one fixed point while its direction changes.
+A direction is passed only if the search calls it safe: organs, skin and the arm's straight insertion; and if the arm
+can go on from the one before. The needle stays outside the body; arm, holder and needle keep their distance all along.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Poses for a pivot calibration: the tip on one place, the needle tilted to several sides, as the workcell allows.
 
-The place is a hole or a dimple beside the patient. Of the free poses those are taken that leave the tip least
+The place is a hole or a dimple next to the patient. Of the free poses those are taken that leave the tip least
 uncertain: greedily, the next one that adds most to det(A'A) of `R_i x + p_i = c` (D-optimal design).
 """
 

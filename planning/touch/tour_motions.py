@@ -1,11 +1,9 @@
-"""Markers to be touched, and the motions of a tour: from home through all standoffs at least cost, and back.
+"""Motions of a marker tour: from home through all standoffs at least cost and back, each touch, and the puncture after.
 
-The last stretch to a marker: a straight line along the needle, and whether the arm may take it.
-
-The needle must touch nothing but the marker: with its foremost `TIP_MM` taken off, it keeps its padding from
-the patient all the way, so that no shaft passes through them. Arm and holder keep their distance as everywhere.
-
-The puncture after touches: to where their registration puts the target, in the posture they were chosen for.
+A touch is a straight line along the needle onto the marker. The needle must touch nothing but the marker: with its
+foremost `TIP_MM` taken off, it keeps its padding from the patient all the way, so that no shaft passes through them.
+Arm and holder keep their distance as everywhere. `plan_puncture` goes to where the touches' registration puts the
+target, in the posture that they were chosen for.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A URDF as plain values: links with their shapes, and joints; in mm and rad. What cannot be read whole is refused."""
+"""URDF documents as plain values, mm and rad: links with their shapes, and joints. What cannot be read whole is refused."""
 
 from __future__ import annotations
 

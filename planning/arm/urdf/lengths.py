@@ -1,11 +1,10 @@
-"""The lengths of an arm built as a UR, from its URDF's chain; another arm is refused, with the joint that differs.
+"""Denavit-Hartenberg lengths and joint limits of an arm built as a UR, from its URDF; another arm is refused.
 
-At the angle zero a UR's axes are, in the controller's base frame (Denavit-Hartenberg, see `planning.arm.ur`): axis 1
-along z through the origin; axes 2, 3 and 4 along -y at the heights d1, at x = 0, a2 and a2 + a3; axis 5 along -z at
-x = a2 + a3, y = -d4; axis 6 along -y at the height d1 - d5; the flange d6 farther, its z along axis 6, its x along x.
-Joint limits are its own, or narrower ones that the case states; none is guessed.
-
-Which joints of a URDF are the arm: six that turn, one after another from the root to the flange, and fixed ones.
+`arm_chain` finds the six rotating joints, one after another from the root to the flange; `ur_lengths` compares their
+axes at the angle zero with a UR's, and names the joint that differs. In the controller's base frame (see
+`planning.arm.ur`) these are: axis 1 along z through the origin; axes 2, 3 and 4 along -y at the heights d1, at x = 0,
+a2 and a2 + a3; axis 5 along -z at x = a2 + a3, y = -d4; axis 6 along -y at the height d1 - d5; the flange d6 farther,
+its z along axis 6, its x along x. Joint limits are its own, or narrower ones that the case states; none is guessed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What lies in a folder of DICOM files, told from the headers alone."""
+"""The contents of a folder of DICOM files, from the headers alone."""
 
 from __future__ import annotations
 

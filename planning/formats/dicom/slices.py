@@ -1,12 +1,9 @@
-"""The slices of CT files: where each lies, and how its stored values become Hounsfield units.
+"""The slices of CT files: Hounsfield units and place of each, and whether together they make one regular stack.
 
 A classic file holds one slice; an enhanced one holds many, each with functional groups of its own or shared by all
-(DICOM PS3.3, C.7.6.16). Here both are the same.
-
-Slices in the order in which they lie, and whether they make one regular stack.
-
-Order and steps come from each slice's own position and orientation. Names, instance numbers and slice locations are
-not looked at: they are often wrong, and nothing in the patient depends on them.
+(DICOM PS3.3, C.7.6.16). Here both are the same. Order and steps come from each slice's own position and orientation.
+Names, instance numbers and slice locations are not used: they are often wrong, and nothing in the patient depends on
+them.
 """
 
 from __future__ import annotations

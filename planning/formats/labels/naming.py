@@ -1,9 +1,8 @@
-"""Which label is which organ, and which organs a case's name patterns mean.
+"""Names of labels: which label is which organ, and which organs a case's name patterns select.
 
-Class numbers of TotalSegmentator's main task, versions 1 (104 classes) and 2 (117 classes).
-
-Facts from its ``map_to_binary.py`` (``total_v1`` and ``total``), Wasserthal et al., Radiology: Artificial
-Intelligence 2023;5(5):e230024. The versions number organs differently: the aorta is 7 or 52.
+The class numbers are those of TotalSegmentator's main task, versions 1 (104 classes) and 2 (117 classes), from its
+``map_to_binary.py`` (``total_v1`` and ``total``), Wasserthal et al., Radiology: Artificial Intelligence
+2023;5(5):e230024. The versions number organs differently: the aorta is 7 or 52.
 """
 
 from __future__ import annotations

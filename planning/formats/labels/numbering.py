@@ -1,4 +1,4 @@
-"""Which version of TotalSegmentator numbered a label map: told by whether its organs lie where organs lie.
+"""Which version of TotalSegmentator numbered a label map, inferred from whether its organs lie where organs lie.
 
 Versions 1 and 2 give the same numbers to other organs. Under the wrong one, left organs lie on the right, or vertebrae
 lie in no order.

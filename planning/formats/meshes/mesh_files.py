@@ -1,12 +1,10 @@
 """Mesh files of other programs, as guarded meshes in mm: STL, OBJ, PLY, GLB, VTP and legacy VTK.
 
-Each format has its own strict reader beside this file, because a lost triangle makes a path "free": a file must hold
-what it promises to the byte. General loaders are made to show something. trimesh 5.2, measured on a box of 12
-triangles: half an ASCII STL loads as 6, one misspelt ``vertex`` as 11, an ASCII PLY without its last line as 11, and
-relative OBJ indices put every face on the last vertices; none with an exception. The tests hold our readers against
-trimesh on whole files.
-
-What a mesh leaves open: triangles without area, an open surface, inverted normals.
+Each format has its own strict reader, because a lost triangle makes a path "free": a file must hold what it promises to
+the byte. General loaders are made to show something. trimesh 5.2, measured on a box of 12 triangles: half an ASCII STL
+loads as 6, one misspelt ``vertex`` as 11, an ASCII PLY without its last line as 11, and relative OBJ indices put every
+face on the last vertices; none with an exception. The tests compare our readers with trimesh on whole files.
+`mesh_warnings` names triangles without area, open surfaces and inverted normals.
 """
 
 from __future__ import annotations
