@@ -240,9 +240,9 @@ def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
 
     A file has a group ``TransformGroup`` with groups ``0``, ``1``, ... of ``TransformType`` (one text),
     ``TransformParameters`` and ``TransformFixedParameters``; files of ITK 4 spell both ``Tranform``. A composite is
-    group 0 without parameters, its parts the groups after it. What is read are the bytes that were hashed: nothing that points
-    elsewhere is followed. The texts are found by `heap_text`: HDF5's own library never ends on some damaged heaps.
-    Needs the extra ``hdf5`` (h5py), which is imported only here.
+    group 0 without parameters, its parts the groups after it. What is read are the bytes that were hashed: nothing
+    that points elsewhere is followed. The texts are found by `heap_text`: HDF5's own library never ends on some damaged
+    heaps. Needs the extra ``hdf5`` (h5py), which is imported only here.
 
     Args:
         data: The whole file.

@@ -1,6 +1,6 @@
 """Whether a point lies inside a surface, by winding number or by rays, and where rays from a point cross it.
 
-Both answers are compared, and a point for which they differ is reported as undecidable.
+Rays decide where triangles are wound against their neighbours; an open surface has no answer (`Side.UNKNOWN`).
 
 All rays of `crossings` start at one point, so a triangle is hit exactly by the rays inside the solid angle that it
 subtends. Rays are binned by direction; each triangle visits the bins that its bounding cone touches, and of their rays

@@ -1,25 +1,12 @@
-"""What a rigid motion leaves of all points: per axis of the CT, against a declaration, and by one strain.
-
-With z the stacked residuals in CT axes, A the motion's design and C the declaration's covariance:
-
-    chi^2 = z' P z,   P = C^-1 - C^-1 A (A' C^-1 A)^-1 A' C^-1,   3 p - 6 degrees of freedom for p points,
-
-and a strain that moves the points by k b takes (b' M z)^2 / (b' M b) off the sum of squares, M = I - A (A' A)^-1 A'.
-
-Many experiments drawn from a declaration, and where the paper's own one stands among them.
-
-One number that the paper's own points show: a skew of the CT's y against z, found from markers, tried on lesions.
-
-What somebody declares of the experiment's errors, and carton and touches drawn from it; mm and rad.
-
-The pose of the carton does not matter: touches err alike in all directions, so that they are drawn in the CT's axes.
-
-Every error that Chen et al. 2019 print (Tables 3, 5, 6, 7), from touches of either setup; many at once.
-
-What Chen et al. 2019 measured: Tables 1, 2 and 4, mm.
+"""Chen et al. 2019 in numbers: the paper's measurements, its printed errors, and whether a declaration explains them.
 
 Chen G. et al., "Robot-Assisted Puncture Positioning Methods under CT Navigation", J. Xi'an Jiaotong Univ. 53(4),
-2019, DOI 10.7652/xjtuxb201904013.
+2019, DOI 10.7652/xjtuxb201904013: Tables 1, 2 and 4 as measured (mm), errors of Tables 3, 5, 6, 7 computed from touches
+of either setup, many at once.
+
+`run_draws` draws many experiments from a declaration and ranks the paper's own one among them. Touches err alike in all
+directions, so that the carton's pose does not matter and they are drawn in the CT's axes. `find_skew` tests the one
+number that the paper's own points show: a skew of the CT's y against z, found from markers, tried on lesions.
 """
 
 from __future__ import annotations
@@ -169,7 +156,12 @@ def axis_squares(residuals: tuple[Floats, ...]) -> Floats:
 
 
 def chi_squared(residuals: tuple[Floats, ...], declaration: Declaration) -> Floats:
-    """Of both setups against a declaration, shape (n,); `FREEDOM` degrees. Both touch one carton: C is not diagonal."""
+    """Of both setups against a declaration, shape (n,); `FREEDOM` degrees. Both touch one carton: C is not diagonal.
+
+    With z the stacked residuals in CT axes, A the motion's design and C the declaration's covariance:
+
+        chi^2 = z' P z,   P = C^-1 - C^-1 A (A' C^-1 A)^-1 A' C^-1,   3 p - 6 degrees of freedom for p points.
+    """
     rows = np.array([row for names in POINTS for row in rows_of(names)])
     axes = (3 * rows[:, None] + np.arange(3)).ravel()
     cov = declaration.carton_covariance(READ)[np.ix_(axes, axes)] + declaration.touch_mm**2 * np.eye(len(axes))
@@ -185,7 +177,10 @@ def _design(names: str) -> Floats:
 
 
 def strain_gains(residuals: tuple[Floats, ...]) -> dict[str, Floats]:
-    """Fraction of both setups' sum of squares that each strain alone takes away, shape (n,) each."""
+    """Fraction of both setups' sum of squares that each strain alone takes away, shape (n,) each.
+
+    A strain that moves the points by k b takes (b' M z)^2 / (b' M b) off the sum of squares, M = I - A (A' A)^-1 A'.
+    """
     whole = axis_squares(residuals).sum(axis=1)
     gains = {}
     for name, (moved, along) in STRAINS.items():

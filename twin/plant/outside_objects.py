@@ -1,12 +1,8 @@
-"""What lies beside a patient in a scanner, as asked for; lines and cables on and before the skin.
+"""Objects outside of a patient in a scanner: arms beside or upon the trunk, what they lie on, and lines and cables.
 
-Arms beside or upon a trunk, with hands and bones: drawn anew by every generator, sizes of adults.
-
-What a patient lies on: a flat table with a mattress, a curved table, or a pad as dense as the body.
-
-Closed surfaces along a line: limbs, bones and lines with round ends, and what has one section along the bed.
-
-Where a skin is, seen from beside it: sections across the bed, and how far the body reaches in them.
+Arms have hands and bones, drawn anew by every generator, sizes of adults. A patient lies on a flat table with a
+mattress, a curved table, or a pad as dense as the body. Limbs, bones and lines are closed surfaces along a line
+(`tube`), tables have one section along the bed (`loft`). `Outline` gives the skin's sections across the bed.
 """
 
 from __future__ import annotations

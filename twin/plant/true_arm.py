@@ -1,6 +1,6 @@
-"""An arm as it really is: links and joints off their nominal values, play in the gears, a hand that trembles.
+"""The ground truth of an arm: links and joints off their nominal values, play in the gears, joints that miss.
 
-What planning believes is a :class:`planning.arm.ur.UrModel`; this is the truth beside it. A commanded configuration
+What planning believes is a :class:`planning.arm.ur.UrModel`. A commanded configuration
 becomes a true one in three steps: the gears stop at the edge of their play (:func:`settle`), the joints miss by their
 repeatability, and the true Denavit-Hartenberg numbers carry the flange somewhere near where the nominal ones say.
 """

@@ -1,18 +1,4 @@
-"""Where the needle truly is, for many arms at once, each with errors of its own.
-
-The tissue on a needle's way, as the arm feels it: it presses along the shaft, and to the side of the bevel.
-
-Along the shaft: capsules, cutting and friction over depth (`planning.needle.insertion_force`). A capsule pushes out
-whatever the tip does; friction and cutting work against the motion. At rest friction holds what it is pulled with:
-Dahl's solid friction, elastic up to a shift (Dahl 1968, "A solid friction model"), in place of a sign of the speed.
-
-Across it: the beam in its foundation says what its holder bears, a force and a moment (`planning.needle.beam`). The
-simulated needle is rigid, so both act on it as two forces, at the tip and where the shaft is held.
-
-How hard tissue pressed on a needle, as a person is told.
-
-What is true when markers are touched: where patient and markers are, and what is wrong with the arm.
-"""
+"""The ground truth of needles and touches: the place of each, for many erring arms at once, and the tissue's force."""
 
 from __future__ import annotations
 
@@ -99,6 +85,14 @@ class StraightPath(NamedTuple):
 
 class TrueTissue:
     """Presses on a needle while it goes in; it keeps how deep the tip has been, and where friction holds it.
+
+    Along the shaft: capsules, cutting and friction over depth (`planning.needle.insertion_force`). A capsule pushes out
+    whatever the tip does; friction and cutting work against the motion. At rest friction resists the
+    pull on the needle: Dahl's solid friction, elastic up to a shift (Dahl 1968, "A solid friction model"), in place of
+    a sign of the speed.
+
+    Across it: the beam in its foundation (`planning.needle.deflection`) loads its holder with a force and a moment.
+    The simulated needle is rigid, so both act on it as two forces, at the tip and where the shaft is clamped.
 
     Args:
         insertion: What the needle passes, from the skin on.

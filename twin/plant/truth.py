@@ -1,4 +1,4 @@
-"""What is really so, beside what the planner believes: where the patient lies and what the joints truly do."""
+"""The ground truth of a rehearsal: where the patient lies and what the joints do, drawn or from a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A puncture rehearsed in many rooms: what was realised, beside what was predicted."""
+"""The distribution of a puncture over many Monte Carlo trials: what was realised, next to what was predicted."""
 
 from __future__ import annotations
 

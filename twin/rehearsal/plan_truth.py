@@ -1,17 +1,13 @@
-"""The truth that a plan meets: as a file says, or as the declared errors draw it, one room or the median of many.
+"""The ground truth that a plan is rehearsed with: from a file, or drawn from the declared errors (the median trial).
 
-A room without physics says where the needle ended in the patient. For the simulator its errors, those of the markers
-and of the arm alike, become one: where the patient truly lies. Executed by an arm without errors, the same plan then
-ends at the room's own place, and turned as there:
+A trial without physics says where the needle ended in the patient. For the simulator its errors, those of the markers
+and of the arm alike, become one: where the patient lies. Executed by an arm without errors, the same plan then
+ends at the trial's own place, and rotated as there:
 
-    T_base_ct_true = T_base_tip T_ct_tip^-1,   T_base_tip as planned, T_ct_tip as the room found it
+    T_base_ct_true = T_base_tip T_ct_tip^-1,   T_base_tip as planned, T_ct_tip as the trial found it
 
-That holds at the target; on the way the arm's own errors would differ a little from those at its end.
-
-Punctures in the simulator whose truth something else has drawn: touches of the same erring arm, or rooms.
-
-The simulated arm is the nominal one. What its lengths and the needle err by at the target becomes a part of where the
-patient lies, as in `plan_truth`; the error of the joints on arrival stays one of joints.
+That is exact at the target; before it the arm's own errors would differ a little from those at its end. The error of
+the joints on arrival stays one of joints. `rehearse_touched` does the same for touches of an erring arm.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
-"""A plan, executed in the twin: the arm moves under its motors, the patient lies at their true place.
+"""A plan executed in the twin: the approach by motors, a pause, and the insertion, the patient at their true place.
 
 What is modelled: rigid bodies, gravity, motor lag and torque limits, joint offsets, a registration that errs; the
 insertion by a spring at the tip, or by the motors (``[rehearsal] control``); where ``[tissue]`` is declared, its force
-on the needle, and how far the needle bends, in where the patient lies. What is not: tissue that moves, breathing.
-
-A plan's motions in the simulator: the approach by position motors, a pause, and the insertion as the case wants it.
-
-Where the case declares tissue, it presses on the needle from the skin on, whoever controls the insertion.
+on the needle from the skin on, and how far the needle bends, in where the patient lies. What is not: tissue that moves,
+breathing.
 """
 
 from __future__ import annotations

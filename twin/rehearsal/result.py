@@ -1,4 +1,4 @@
-"""What a rehearsal measured: values alone, which pictures and pages read without the simulator."""
+"""The result of a rehearsal: values alone, which images and pages read without the simulator."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Many rooms at once, without physics: markers read and touched, registered, and the needle moved to the target.
+"""Monte Carlo trials without physics, many at once: markers read and touched, registered, the needle at the target.
 
-Every room draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
+Every trial draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
 parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised;
-tissue does not move. A needle that bends ends off its straight line, its bevel pointing to a side drawn in each room.
+tissue does not move. A needle that bends ends off its straight line, its bevel pointing to a side drawn in each trial.
 """
 
 from __future__ import annotations

@@ -1,34 +1,21 @@
-"""A motion of the tip under one of the controllers, taken over from the position motors while the arm is at rest.
+"""Control of the tip along a motion: impedance, admittance or position motors, taken over while the arm is at rest.
 
-A spring and a damper at the needle's tip, by joint torques (Hogan 1985).
+**Impedance** (`Impedance`): a spring and a damper at the needle's tip, by joint torques (Hogan 1985).
 
     tau = ID(q, qd, qdd_ref) + J' (K e + D de/dt + K_i K int e dt)
 
 e is the reference's tip minus the measured one: position, then the rotation between them, in base axes. Without
 contact the model's torque alone follows the reference and the spring corrects what the masses err by; in contact the
-tip yields by F / K. The integral takes the rest away, and with it, in 1/K_i seconds, the compliance: it stands still
-while contact is felt, where the compliance is to be kept.
+tip yields by F / K. The integral takes the rest away, and with it, in 1/K_i seconds, the compliance: it stops
+while contact is measured, where the compliance is to be kept.
 
-Stiffness and damping at the tip, and the rule by which a stiffness is refused before it diverges.
-
-Along one mode of effective mass m the loop of stiffness K = m w^2 and damping 2 zeta w m, integrated with the step dt,
-is stable while (w dt)^2 + 4 zeta w dt < 4; for zeta = .8 that is w dt < .96. What is allowed is `MOST_RATIO`.
+**Stability** (`damping`, `refuse_unstable`): along one mode of effective mass m the loop of stiffness K = m w^2 and
+damping 2 zeta w m, integrated with the step dt, is stable while (w dt)^2 + 4 zeta w dt < 4; for zeta = .8 that is
+w dt < .96. What is allowed is `MOST_RATIO`.
 
 Source: Hogan 1985, "Impedance control"; Albu-Schaeffer, Ott, Frese, Hirzinger 2003, "Cartesian impedance control of
 redundant robots": damping by factors of mass and stiffness at once ("double diagonalisation"). Their other design, from
 the roots of both, is not positive where position and rotation are coupled, and an arm with a long needle oscillates.
-
-What the tip shall do: a joint motion at every step of the controller, with its speeds and accelerations.
-
-The arm under a controller or its own motors, step by step: what it felt and where its tip went.
-
-The controller's own model of the arm: its inverse dynamics and mass matrix, right for any mount.
-
-PyBullet evaluates inverse dynamics as if the body's base were not turned in the world: gravity enters in world axes and
-leaves in base axes. The model therefore stands in a world of its own, its URDF base unturned, under a gravity that was
-turned instead: g_urdf = R_urdf_base g_base.
-
-The needle's tip as the controller computes it: pose and Jacobian, in metres.
 """
 
 from __future__ import annotations
@@ -561,6 +548,10 @@ class Motors:
 @dataclass(frozen=True)
 class RigidModel:
     """What the controller knows of the arm's masses; it never moves.
+
+    PyBullet evaluates inverse dynamics as if the body's base were not rotated in the world: gravity enters in world
+    axes and leaves in base axes. The model therefore has a world of its own, its URDF base unrotated, under a gravity
+    that was rotated instead: g_urdf = R_urdf_base g_base.
 
     Attributes:
         kinematics: Lengths of the arm.

@@ -1,7 +1,4 @@
-"""Commands in, what happened out: the arm moved by its motors, step by step of the physics.
-
-Who touches the arm, and how near two bodies are, according to the physics.
-"""
+"""Execution by the position motors, step by step of the physics, and the contacts that the physics reports."""
 
 from __future__ import annotations
 

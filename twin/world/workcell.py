@@ -1,10 +1,6 @@
-"""The whole workcell: the arm with its needle, the patient at their true place, and the boxes around them.
+"""The simulated workcell: the arm with its needle, the patient at their true place, boxes, and headless images of it.
 
-The world frame is the controller's base frame.
-
-What else stands in the workcell: the patient's skin, boxes, and surfaces that are only seen.
-
-Pictures of the workcell, drawn without a screen or a graphics card.
+The world frame is the controller's base frame. Surfaces may be loaded to be seen only.
 """
 
 from __future__ import annotations

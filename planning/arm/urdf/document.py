@@ -1,4 +1,4 @@
-"""URDF documents as plain values, mm and rad: links with their shapes, and joints. What cannot be read whole is refused."""
+"""URDF documents as plain values, mm and rad: links with shapes, and joints. What cannot be read whole is refused."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Markers and a lesion found in a CT, by a voxel and by less than a voxel.
+"""Markers and a lesion found in a CT: by a voxel, as a person reads them, and by less than a voxel.
 
-The rule of Chen 2019, section 3.1: the number of the slice that shows a marker best, times the spacing, and its place
-in that slice to 1 mm. Beside it the middle of the metal, by weights.
+The rule of Chen 2019, section 3.1, is a voxel's: the number of the slice that shows a marker best, times the spacing,
+and its place in that slice to 1 mm. The finer place is the middle of the metal, by weights.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A needle in a CT: its axis by the line of least squares through its metal, its tip by a blurred rod's image."""
+"""A needle found in a CT: its axis by the least-squares line through its metal, its tip by a blurred rod's image."""
 
 from __future__ import annotations
 

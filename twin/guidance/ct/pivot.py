@@ -1,4 +1,4 @@
-"""Pivot calibration: where the tip is on the flange, from arms that stand differently with the tip in one place.
+"""Pivot calibration: the tip's place on the flange, from poses of the arm with the tip in one place.
 
 With T_base_flange = (R_i, p_i) of pose i, the tip x in the flange frame and the place c in the base frame:
 

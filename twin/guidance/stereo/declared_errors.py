@@ -1,8 +1,8 @@
-"""The one declaration of errors of a servo case, in the estimator's units: what may be off, and by how much.
+"""Declared errors of a servo case, in the estimator's units: what may be off, and by how much.
 
-The belief computes with it, the twin's truth is drawn from it. Defaults and reasons: docs/reference/servo-case.md. What
-is not here (a rod that bends, cameras that move after the calibration, tissue) is not modelled, which is something else
-than 0.
+The belief computes with them, the twin's truth is drawn from them. Defaults and reasons: docs/reference/servo-case.md.
+What is not here (a rod that bends, cameras that move after the calibration, tissue) is not modelled, which is something
+else than 0.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What the guidance gets to see: a ball's centre in each camera, from pictures of the true workcell.
+"""Detections of the stereo guidance: a ball's centre in each camera, from images of the true workcell.
 
-``picture_detector`` draws a picture with the true camera and measures it with the believed one. Another `Detector` may
-leave the picture out: for studies of everything behind it.
+``picture_detector`` renders an image with the true camera and measures it with the believed one. Another `Detector` may
+leave the image out: for studies of everything behind it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Many seeds of one case, in processes of this machine, and what they say together."""
+"""Many seeds of one servo case, in processes of this machine, and the statistics over them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who tells the servo where ball and target are: the paper's chain, or the joint estimate of everything."""
+"""Estimates of ball and target for the servo: the paper's chain, or the joint estimate of everything."""
 
 from __future__ import annotations
 

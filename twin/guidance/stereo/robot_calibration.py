@@ -1,7 +1,7 @@
-"""The robot holds the ball at twelve points: they calibrate the cameras, define C, and tie the robot to it.
+"""Calibration by the robot: its ball at twelve points calibrates the cameras, defines C, and ties the robot to it.
 
 A coordinate measuring arm measures each point once, in its own frame: that is C. Each camera is calibrated from the
-ball's images against those points; r_T_c is the rigid fit of where the robot believes it held the ball (Liu 2007).
+ball's images against those points; r_T_c is the rigid fit of where the robot believes it had the ball (Liu 2007).
 """
 
 from __future__ import annotations

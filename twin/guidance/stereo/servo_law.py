@@ -1,19 +1,18 @@
-"""One servo step: from where the ball is to where it should be, as a joint path (Liu 2007, section 1).
+"""One servo step: a joint path from where the ball is to where it should be; the mapping of the head; the posture.
 
-    dX = R_base_c (target_c - ball_c),    dq = J^+ [dX; da]
+    dX = R_base_c (target_c - ball_c),    dq = J^+ [dX; da]                             (Liu 2007, section 1)
 
-J is the nominal Jacobian at the ball, da the needle's orientation error from forward kinematics. The way is cut into
+J is the nominal Jacobian at the ball, da the needle's orientation error from forward kinematics. The path is cut into
 short pieces with a Jacobian each, so that it is straight and can be checked for contacts. Near a singularity the
 orientation is given up first: damped steps of the position alone (Nakamura and Hanafusa 1986), as long as the needle
-turns by no more than a limit.
+rotates by no more than a limit.
 
-From the image to the calibration frame: c_T_m by markers that both cameras see, and the error to expect at a target.
+`map_head` estimates c_T_m, from the image to the calibration frame, by markers that both cameras see. Each marker errs
+in the image and in the cameras, and the cameras err most along their view. The fit weighs each marker by both
+covariances (maximum likelihood; Gauss-Newton from the plain rigid fit), and its normal matrix says how far the mapped
+target may be off. With equal round errors both agree with the plain fit and Fitzpatrick's formula.
 
-Each marker errs in the image and in the cameras, and the cameras err most along their view. The fit weighs each marker
-by both covariances (maximum likelihood; Gauss-Newton from the plain rigid fit), and its normal matrix says how far the
-mapped target may be off. With equal round errors both agree with the plain fit and Fitzpatrick's formula.
-
-How the arm holds the rod: one orientation, one inverse-kinematics branch for every point of a session.
+`configurations` gives one orientation and one inverse-kinematics branch of the rod for every point of a session.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Look, move, look again: the servo on what the cameras see of the ball and of the head.
+"""The visual servo loop: look, move, look again, on what the cameras see of the ball and of the head.
 
-The robot's own accuracy does not enter the error that is moved to zero; its kinematics only say which way to turn.
-Where the ball is not seen the arm does not move, and every way is checked for contacts before it is moved.
+The robot's own accuracy does not enter the error that is moved to zero; its kinematics only give the direction of a
+step. Where the ball is not seen the arm does not move, and every path is checked for contacts before it is moved along.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A whole session: calibrate, map the head, then servo onto every target; belief and truth kept apart."""
+"""A whole stereo session: calibrate, map the head, then servo onto every target; belief and truth kept apart."""
 
 from __future__ import annotations
 

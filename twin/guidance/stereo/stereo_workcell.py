@@ -1,7 +1,7 @@
-"""The room as it truly is: an arm off its nominal model, two cameras, a head; drawn once for each seed.
+"""The ground truth of a stereo workcell: an arm off its nominal model, two cameras, a head; drawn once for each seed.
 
-Two frames matter to the guidance. The base's, in which the arm is commanded; and C, which the measuring arm defines at
-the calibration and in which the cameras know themselves. Nobody is told how C lies in the base.
+Two frames matter to the guidance: the base's, in which the arm is commanded, and C, which the measuring arm defines at
+the calibration and in which the cameras are known. How C lies in the base is not given to the guidance.
 """
 
 from __future__ import annotations

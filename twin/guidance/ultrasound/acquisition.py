@@ -1,6 +1,6 @@
-"""Recording in the twin: go to a pose, jog the needle into the slice, take a picture, detect, write down.
+"""Recordings made in the twin: go to a pose, jog the needle into the slice, take an image, detect, record.
 
-The workcell in which a recording is made: two arms as they move, the mounts, the needle.
+`WorkcellTruth` is the workcell in which a recording is made: two arms as they move, the mounts, the needle.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Poses that both arms can take with the needle in the image, and which of them to record.
+"""Poses that both arms can take with the needle in the image, and the choice of those to record.
 
-The geometry of the picture is drawn first (where the tip shows, how steep the needle is, how the probe is tilted); the
+The geometry of the image is drawn first (where the tip shows, how steep the needle is, how the probe is tilted); the
 arms follow by inverse kinematics. Every draw that cannot be taken falls to a reason, and the reasons are counted.
 
 Those are recorded that tell most about the error at the tip. The bound can count errors of the arms that all poses

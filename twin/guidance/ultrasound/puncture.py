@@ -1,4 +1,4 @@
-"""After the calibration: the needle is sent to a target that is seen in the image, and where its tip truly ends."""
+"""Punctures after the calibration: the needle sent to a target seen in the image, and the ground truth of its tip."""
 
 from __future__ import annotations
 

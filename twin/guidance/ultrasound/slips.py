@@ -1,4 +1,4 @@
-"""Recordings that were written in another reading: inverse poses, arms in each other's place, metres.
+"""Calibration of a recording, with refusal of one written in another reading: inverse poses, swapped arms, metres.
 
 Such a recording still has a best fit, with residuals of centimetres, and no pose stands out because all are wrong. So
 where the reading as given does not fit, the slips that people make are undone one by one; the one that then fits is

@@ -1,8 +1,8 @@
-"""The room: an arm with a probe and an arm with a needle about a block of tissue, and whether anything touches.
+"""The ultrasound workcell: an arm with a probe and an arm with a needle about a block of tissue, and their contacts.
 
 Each arm alone is checked as everywhere (:class:`planning.collision.fast_checker.FastChecker`: itself, the table, the
 phantom); here the probe's head and the two arms against each other are added, with the same convex bodies and FCL.
-Everything stands where the *drawing* has it; the clearance covers what the truth differs by.
+Everything is placed where the *drawing* has it; the clearance covers what the truth differs by.
 """
 
 from __future__ import annotations

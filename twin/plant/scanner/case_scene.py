@@ -1,6 +1,6 @@
 """A case as a scene in the scanner: its structures with Hounsfield units, markers of metal, the table, a needle.
 
-Which voxels a scan has: the whole body, or as much of it as the field of view shows.
+`scan_grid` gives the voxels of a scan: the whole body, or as much of it as the field of view shows.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What fills each voxel: solids cut by many lines along the voxels' rows, and each line's pieces measured exactly.
+"""Partial volumes: solids cut by many lines along the voxels' rows, and each line's pieces measured exactly.
 
 Every slice is cut by some planes and every row by some lines. A plane cuts a closed surface in closed chains of
 segments, and a line cuts these in crossings; both by half-open intervals, of which neighbours share the end, so that

@@ -1,6 +1,6 @@
-"""A scan of a scene: exact partial volume, blur in the plane, noise, and the range that a scanner stores.
+"""A CT image of solids: exact partial volume, blur in the plane, noise, and the range that a scanner stores.
 
-What lies in a scanner: closed surfaces with Hounsfield units, and the simple bodies of devices.
+A `Solid` is a closed surface with Hounsfield units; balls, rods and boxes are the simple bodies of devices.
 """
 
 from __future__ import annotations

@@ -1,16 +1,15 @@
-"""Where the ball's outline crosses spokes around its centre, to a small part of a pixel.
+"""The outline of a ball in an image: edges along spokes to a small part of a pixel, and the circle through them.
 
-A spoke runs over the sphere of viewing directions, from inside the outline to outside, and is laid on the picture by
-the camera: so the lens and the ellipse are in the spoke and the outline is at the same angle on each. The grey along it
-is read with cubic splines. The edge is where the grey changes fastest after a Gaussian's derivative (Canny 1986), the
-peak refined by a parabola.
+A spoke runs over the sphere of viewing directions, from inside the outline to outside, and is projected into the image
+by the camera: so lens and ellipse are in the spoke, and the outline is at the same angle on each. The grey along it is
+read with cubic splines. The edge is where the grey changes fastest after a Gaussian's derivative (Canny 1986), the peak
+refined by a parabola.
 
-The outline of a ball as a circle: exactly one on the sphere of viewing directions, whatever the lens.
-
-A ball fills a cone of rays around the direction of its centre. So the circle is fitted there and not in the picture:
-its centre is the projection of the ball's centre itself, while the outline's ellipse has its centre elsewhere. Points
-near a direction d0 are given by polar coordinates (angle from d0, direction around it) or, for circles, by the
-stereographic plane touching at d0, which takes circles to circles (Snyder 1987, Map Projections, chapter 21).
+A ball fills a cone of rays around the direction of its centre, a circle on that sphere whatever the lens. So the circle
+is fitted there and not in the image: its centre is the projection of the ball's centre itself, while the outline's
+ellipse has its centre elsewhere. Points near a direction d0 are given by polar coordinates (angle from d0, direction
+around it) or, for circles, by the stereographic plane touching at d0, which takes circles to circles (Snyder 1987, Map
+Projections, chapter 21).
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""A picture of the ball on its rod, computed rather than drawn: where accuracy is measured, the picture must be truer.
+"""Image of the ball on its rod, computed per pixel instead of rasterised, so that it is truer than what measures it.
 
-Each pixel is cut into 4 x 4 cells. A cell's ray is met with ball, rod and occluder in closed form: the outline is that
-of the sphere itself (an ellipse, bent by the lens), not of a disc. Along an outline a cell is covered by the share that
-a straight edge at the outline's distance would cover. The ball's centre errs by less than 1e-3 px and a pixel by less
-than one grey level of 140, which the tests hold against 40 x 40 plain rays per pixel. Then the lens's blur (a
-Gaussian), the sensor's noise (normal) and rounding to 8 bits follow.
+Each pixel is cut into 4 x 4 cells. A cell's ray is intersected with ball, rod and occluder in closed form: the outline
+is that of the sphere itself (an ellipse, bent by the lens), not of a disc. Along an outline a cell is covered by the
+fraction that a straight edge at the outline's distance would cover. The ball's centre errs by less than 1e-3 px and a
+pixel by less than one grey level of 140, which the tests compare with 40 x 40 plain rays per pixel. Then the lens's
+blur (a Gaussian), the sensor's noise (normal) and rounding to 8 bits follow.
 """
 
 from __future__ import annotations

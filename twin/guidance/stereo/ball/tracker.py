@@ -1,9 +1,8 @@
-"""Find the ball in a picture near where the robot's kinematics predict it, and measure its centre.
+"""The ball found in an image near where the robot's kinematics predict it, and its centre measured.
 
 Hough's transform finds circles; edges on spokes measure them; three edges propose a circle, the others vote, and a
 robust fit refines it. What is measured is the projection of the ball's **centre**, as the circle is fitted on the
-sphere of viewing directions (see circle). A ball that is not there, mostly hidden or too faint is a ``LostBall``, not a
-number.
+sphere of viewing directions. A ball that is absent, mostly hidden or too faint is a ``LostBall``, not a number.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Bundle adjustment: cameras, poses of rigid bodies and points of those bodies that reproject best, all at once.
 
 A point k of body j is seen by camera i at  pixel = camera_i(T_c_body_j point_k).  Every parameter has a standard
-deviation around its start: 0 holds it, infinity frees it, a number between is a normal prior. So one function is a
-camera's refinement from known points (body held, points held), a chessboard calibration (bodies free, points held), and
-the joint optimum of cameras, held points and frames with all their known errors.
+deviation around its start: 0 fixes it, infinity frees it, a number between is a normal prior. So one function is a
+camera's refinement from known points (body and points fixed), a chessboard calibration (bodies free, points fixed), and
+the joint optimum of cameras, fixed points and frames with all their known errors.
 
 Rotations and translations move as  p -> Exp(w) p + t, in the frame that the map leads to. The solver is
 Levenberg-Marquardt (MINPACK, Moré 1978) with a dense analytic Jacobian: fit for thousands of observations and hundreds

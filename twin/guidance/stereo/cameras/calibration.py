@@ -1,7 +1,7 @@
 """A camera from known points: direct linear transform, then the least reprojection error with the lens's distortion.
 
-**What twelve points tell about the lens.** In a picture that spans 28 degrees the grid of the robot's points fills a
-radius of a tenth of the focal length. There k1 = -0.1 bends by a quarter of a pixel: a ball found to 0.02 px tells k1
+**What twelve points tell about the lens.** In an image that spans 28 degrees the grid of the robot's points fills a
+radius of a tenth of the focal length. There k1 = -0.1 bends by a quarter of a pixel: a ball found to 0.02 px gives k1
 to about 0.01. But k2 = 0.1 bends by 0.003 px and cannot be found; p1, p2 can, though mostly together with the principal
 point. So each coefficient has a prior (normal, mean 0): what the points cannot show stays near 0 and keeps the prior's
 variance, and ``identified`` names the coefficients whose standard deviation the points at least halved.

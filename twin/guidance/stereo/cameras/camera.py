@@ -1,13 +1,8 @@
-"""A calibrated camera: where a point of the calibration frame C appears, and which ray belongs to a pixel.
+"""Camera model: the pixel of a point of the calibration frame C, the ray of a pixel, and the lens's distortion.
 
-Pixel (u, v) is column and row; **pixel centres are at integers**, so the picture spans -0.5 .. width - 0.5. The
-camera's frame is the field's: x right, y down, z forward. Distortion is Brown's k1, k2, p1, p2 as OpenCV has it
-(see lens).
-
-What a lens does to a pinhole's picture: radial and tangential distortion, its slope, and its inverse.
-
-All points here are normalised: x/z and y/z in the camera's frame, without unit, shape (..., 2). The coefficients are
-k1, k2, p1, p2 of Brown's model, in the order and with the signs of OpenCV:
+Pixel (u, v) is column and row; **pixel centres are at integers**, so the image spans -0.5 .. width - 0.5. The
+camera's frame is the field's: x right, y down, z forward. Distortion is Brown's k1, k2, p1, p2, in the order and with
+the signs of OpenCV, of normalised points x/z and y/z in the camera's frame, without unit, shape (..., 2):
 
     x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y_d = y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y

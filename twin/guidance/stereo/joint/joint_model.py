@@ -1,19 +1,15 @@
-"""Everything that was measured in a session, as one least-squares problem: the bundle adjustment over all images.
+"""The joint estimate of a stereo session: one least-squares problem over all images, and the bound of any estimate.
 
-Unknown are both cameras, where C lies in the base, the errors of arm and rod, where the head stands, its markers, and
-the ball at every stay. Known are the ball and marker pixels, the measuring arm's readings, the markers in the image,
-what the arm was commanded, and how far each of these may be off, as the case declares it. Each residual is divided by
-its standard deviation, so the normal matrix is Fisher's information and its inverse the Cramer-Rao bound (van Trees'
-for what has a declared deviation). That is counted in deviations, so that one of 0 fixes it.
-
-The statistically best estimate of ball and target, and the bound that no estimate can beat.
+Unknown are both cameras, where C lies in the base, the errors of arm and rod (26, `rod_poses`), the head's pose, its
+markers, and the ball at every stay. Known are the ball and marker pixels, the measuring arm's readings, the markers in
+the image, what the arm was commanded, and how far each of these may be off, as the case declares it. Each residual is
+divided by its standard deviation, so the normal matrix is Fisher's information and its inverse the Cramer-Rao bound
+(van Trees' for what has a declared deviation). That is counted in deviations, so that one of 0 fixes it.
 
 The chain of the paper calibrates, triangulates and maps one after the other, and each step forgets what the others
-know: the servo's own images also see the cameras, the arm's commands also see the ball. Here everything that was
-measured is adjusted together (`joint_model`). With normal errors and small curvature that attains the
-Cramer-Rao bound, which is the same normal matrix taken at the truth.
-
-How an arm that errs holds its rod: ball and flange, and how each of 26 errors moves them.
+know: the servo's own images also see the cameras, the arm's commands also see the ball. Here all of it is adjusted
+together. With normal errors and small curvature that attains the Cramer-Rao bound, which is the same normal matrix
+taken at the truth.
 """
 
 from __future__ import annotations

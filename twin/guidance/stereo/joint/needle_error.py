@@ -1,4 +1,4 @@
-"""The needle's pose against the anatomy, and its covariance: by the arm and the mapping alone, and after the servo.
+"""Covariance of the needle's pose against the anatomy: by arm and mapping alone, and after the servo.
 
 With F the information matrix of the joint model, d the tip minus the target and phi the needle's rotation, both in the
 image's axes at the target, every row of E says what an unknown does to them:
@@ -6,12 +6,12 @@ image's axes at the target, every row of E says what an unknown does to them:
     Sigma6 = E F^-1 E' + arrival + R_m_flange diag(tip_offset^2, needle_direction^2) R' + what the head moved since
 
 Before the servo the ball's rows are those of base and arm, and the arrival is new: J Jq Sigma_q Jq' J'. After it they
-are those of the ball at the last look, so that the arm drops out of d; phi stays the arm's, but for what the last look
-says of this arrival: with r the ball's stray from where the arm should have it, the joints missed by
+are those of the ball at the last image, so that the arm drops out of d; phi stays the arm's, but for what the last
+image says of this arrival: with r the ball's deviation from where the arm should have it, the joints missed by
 
     eps | r ~ N(K r, Sigma_q - K Jq Sigma_q),   K = Sigma_q Jq' (Jq Sigma_q Jq')^-1
 
-A needle as it was predicted beside the needle as it came to stand, as plain values.
+`needle_outcome` compares the predicted needle with the true one, as plain values.
 """
 
 from __future__ import annotations

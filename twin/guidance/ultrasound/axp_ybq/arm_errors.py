@@ -1,16 +1,16 @@
-"""Errors of both arms that repeat from pose to pose: wrong lengths, twists and joint zeros, and what differs each time.
+"""Errors of both arms: lengths, twists and joint zeros that repeat from pose to pose, and what differs each time.
 
-An arm's flange stands where its nominal numbers say, moved by J eta (Mooring, Roth, Driels 1991): eta are the errors of
-its 23 parameters, which stay, and J follows from the joints. A calibration does not ask for eta. It takes eta as normal
-with the declared deviations, and lets what the recording says of it correct the aim. Beside eta the joints stop a
+An arm's true flange is its nominal one moved by J eta (Mooring, Roth, Driels 1991): eta are the errors of its 23
+parameters, which stay, and J follows from the joints. A calibration does not solve for eta. It takes eta as normal
+with the declared deviations, and lets what the recording says of it correct the aim. In addition the joints stop a
 little differently at each arrival: repeatability.
 
-Play leaves a joint half of its width b short of where it was sent. Which way the joint turned says the sign (the play
+Play leaves a joint half of its width b short of where it was sent. Which way the joint rotated says the sign (the play
 operator: Visintin, Differential Models of Hysteresis, 1994, chapter III):
 
     q = q_sent - s b (1 + c z) / 2,   s = 1 or -1,   z normal, c = PLAY_KNOWN.
 
-b / 2 moves the recorded flanges beforehand, and c z is one more error per joint that stays. Where nobody knows s, play
+b / 2 moves the recorded flanges beforehand, and c z is one more error per joint that stays. Where s is unknown, play
 is an arrival's noise of variance (b / 2)^2.
 """
 

@@ -1,4 +1,4 @@
-"""What a self-calibration found, and how well it is known."""
+"""The result of a self-calibration, with its covariance."""
 
 from __future__ import annotations
 

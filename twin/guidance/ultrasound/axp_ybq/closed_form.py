@@ -1,8 +1,7 @@
-"""The unknowns of A X P = Y B Q: their names, which are free, one value of each, and how a small step changes it.
+"""The unknowns of A X P = Y B Q (names, free ones, estimate, small steps), and their linear solution as a start.
 
-The linear solution of A X P = Y B Q (spec 3, section 1): no start value needed, exact without noise.
-
-Every pose gives three rows, R_A R_X p + R_A t_X + t_A = R_Y R_B t_Q + R_Y t_B + t_Y, linear in
+The linear solution (spec 3, section 1) needs no start value and is exact without noise. Every pose gives three rows,
+R_A R_X p + R_A t_X + t_A = R_Y R_B t_Q + R_Y t_B + t_Y, linear in
 z = [x1; x2; t_X; vec(t_Q^T (x) R_Y); vec(R_Y); t_Y] (48 unknowns), or, with a known tip, in
 z = [x1; x2; t_X; vec(R_Y); t_Y] (21 unknowns). x1, x2 are the first two columns of R_X times mm per unit of P: the
 image is a plane, so that its third column is never excited and is left out.

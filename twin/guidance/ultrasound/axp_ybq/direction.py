@@ -1,6 +1,6 @@
-"""The needle's direction V in its flange frame, from the directions seen in the image or from the image plane alone.
+"""The needle's direction V in its flange frame, and the residuals of tip and direction with their Jacobians.
 
-What every pose says of tip and direction: residuals of A X P = Y B Q and their Jacobians.
+`needle_direction` takes V from the directions seen in the image, or from the image plane alone.
 
 F = R_Y (R_B t_Q + t_B) + t_Y - R_A (R_X S p + t_X) - t_A (mm, base1), S = diag(scale).
 With R <- R exp([w]x) its derivatives by w_X, t_X, w_Y, t_Y, t_Q, scale are

@@ -1,13 +1,13 @@
-"""The parts of the noise that the residuals themselves show, and the confidence region of unknowns beside them.
+"""Parts of the noise as the residuals show them, and the confidence region of unknowns estimated with them.
 
 The residuals' covariance is C = sum_k v_k D_k + what is declared. The likelihood demands of every part that
 
     r^T P D_k P r = tr(P D_k),   P = C^-1 - C^-1 J (J^T C^-1 J)^-1 J^T C^-1,
 
-and the ratio of the two sides is the factor by which v_k is moved. The region where they were found from few residuals:
+and the ratio of the two sides is the factor by which v_k is moved. The region where v was found from few residuals:
 Kenward and Roger, "Small sample inference for fixed effects from restricted maximum likelihood", Biometrics 53(3),
-1997: an F whose freedom comes from the doubt of v, Var(v)^-1 = tr(P D_k P D_l) / 2, and a covariance with that doubt
-in it.
+1997: an F whose freedom comes from the uncertainty of v, Var(v)^-1 = tr(P D_k P D_l) / 2, and a covariance with that
+uncertainty in it.
 """
 
 from __future__ import annotations

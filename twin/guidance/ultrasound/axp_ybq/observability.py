@@ -1,15 +1,15 @@
-"""What a set of poses cannot show (spec 3, section 3): the motions of the unknowns that hardly change any residual.
+"""Observability: motions of the unknowns that a set of poses hardly shows (spec 3, section 3), and poses to add.
 
-Columns are counted in rad and 100 mm, and base 2 turns about the middle of all tips rather than about its own origin:
+Columns are counted in rad and 100 mm, and base 2 rotates about the middle of all tips rather than about its own origin:
 wherever that origin lies, the same poses show the same. A recording is refused where the least singular value of the
-Jacobian over the largest falls below ``LEAST_RATIO``. The weak motion is then named: each of four families of motions
-has a known cause, and a family (or a line or plane of it) is weak when the Jacobian, restricted to it, is.
+Jacobian over the largest falls below ``LEAST_RATIO``. The ill-conditioned motion is then named: each of four families
+of motions has a known cause, and a family (or a line or plane of it) is ill-conditioned when the Jacobian, restricted
+to it, is.
 
-Which further poses would make a refused recording usable: what to turn, and by how much.
-
-Simple changes of one recorded pose are tried by computation: the probe turned about an axis of the image through the
-tip, the tip brought elsewhere in the image, the insertion angle changed, the needle turned about itself. Those that add
-most information where there is least are proposed, until the recording would be accepted with room to spare.
+`propose` suggests further poses: simple changes of one recorded pose are tried by computation (the probe rotated about
+an axis of the image through the tip, the tip brought elsewhere in the image, the insertion angle changed, the needle
+rotated about itself). Those that add most information where there is least are proposed, until the recording would be
+accepted with a margin.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What is estimated from what, and what is expected of the residuals: their covariance, pose by pose and in common.
+"""The least-squares problem of a calibration: unknowns, data, the residuals' covariance by pose and in common.
 
-The residuals themselves, and the letters, are in `residuals`.
+The residuals themselves, and the letters, are in `direction`.
 """
 
 from __future__ import annotations

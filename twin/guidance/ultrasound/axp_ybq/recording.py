@@ -1,7 +1,7 @@
-"""What both arms and the image said, pose by pose: the input of the self-calibration.
+"""A recording of both arms and the image, pose by pose: the input of the self-calibration.
 
-Frames: ``base1`` and ``end1`` of the arm that holds the probe, ``image`` (mm, the slice is z = 0), ``base2`` and
-``end2`` of the arm that holds the needle.
+Frames: ``base1`` and ``end1`` of the arm with the probe, ``image`` (mm, the slice is z = 0), ``base2`` and
+``end2`` of the arm with the needle.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Weighted least squares (Gauss-Newton on the rotations' tangent space), and what is known where it ended.
+"""Weighted least squares (Gauss-Newton on the rotations' tangent space), and the test for errors of the image.
 
 Each pose's own noise Omega_i is whitened alone. Errors that all poses share (N per standard deviation of each) couple
 the poses: the residuals' covariance is C = Omega + N N^T, and with S = Omega^-1/2 N
@@ -6,13 +6,6 @@ the poses: the residuals' covariance is C = Omega + N N^T, and with S = Omega^-1
     C^-1/2 = (I + S S^T)^-1/2 Omega^-1/2,   (I + S S^T)^-1/2 = I - S V diag(1 / (s (s + 1))) V^T S^T,   s^2 = 1 + d^2,
 
 where S^T S = V diag(d^2) V^T. The same estimate comes from taking the shared errors as unknowns with a prior.
-
-What the image may do to tip and direction that a calibration does not ask for: is it there, and what does it cost?
-
-A tip that is read as p lies at S p, S = [[1 + a, k], [0, 1 + b]]: mm per unit of P that are off, and axes that are not
-square. A direction read as v points along S v, turned by w. The residuals' derivatives by (a, b, k, w) stand beside the
-Jacobian, and the F-test of all of them together says whether residuals that are only noise would be so well explained:
-once in a hundred recordings. The calibration does not use them; what they leave at the tips counts in its error.
 """
 
 from __future__ import annotations
@@ -204,7 +197,13 @@ TEXT = ("mm per unit of P along u: {:.3f} times", "along v: {:.3f} times", "skew
 
 
 class ImageErrors(NamedTuple):
-    """The errors of the image that the residuals show."""
+    """The errors of the image that the residuals show.
+
+    A tip that is read as p lies at S p, S = [[1 + a, k], [0, 1 + b]]: mm per unit of P that are off, axes not square. A direction read as v points along S v, rotated by w. The residuals' derivatives by (a, b, k, w) join the
+    Jacobian, and the F-test of all of them together says whether residuals that are only noise would be so well
+    explained: once in a hundred recordings. The calibration does not use them; what they leave at the tips
+    counts in its error.
+    """
 
     names: tuple[str, ...]
     """Of those that were tested: ``scale_u``, ``scale_v``, ``skew``, ``turn``."""

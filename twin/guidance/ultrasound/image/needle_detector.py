@@ -1,4 +1,4 @@
-"""The needle in a B-mode picture: its tip, its direction, and whether to believe either.
+"""Needle detection in a B-mode image: its tip, its direction, and whether to believe either.
 
 Every line of a grid of angles and offsets is sampled (a Radon transform that may begin and end anywhere); along it the
 segment with the largest sum is found in one pass (Kadane's maximum subarray, Bentley, Commun. ACM 27, 1984). What a
@@ -11,7 +11,7 @@ stays small where there is no needle.
 4. The tip: where the amplitude along the line falls half way from the shaft's level to the background's, for good.
 
 The needle goes down into the body, so the deeper end is the tip. What shows is where the needle leaves the *slice*: of
-a needle that is tilted against the image plane the end that shows need not be the tip, and no picture alone can tell.
+a needle that is tilted against the image plane the end that shows need not be the tip, and no image alone can tell.
 """
 
 from __future__ import annotations

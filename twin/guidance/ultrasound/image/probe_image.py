@@ -1,15 +1,13 @@
-"""Speckle: what a pulse makes of many small scatterers, and how the pulse spreads with depth.
+"""B-mode images of a needle in a speckle phantom, from the ground truth of needle and image plane.
+
+The frame ``image``: its origin is the middle of the upper left pixel, x (u) runs along the probe's face to the right,
+y (v) into the depth, z out of the plane; mm. A needle off the plane fades as the slice's Gaussian profile (spec 3,
+section 5). One image's speckle is independent of the next one's: two poses of a calibration show different cells.
 
 A beam-formed image before its envelope is taken is the tissue's reflectivity, blurred by the point spread. Many
 scatterers in one resolution cell add up to a complex Gaussian (Goodman, "Some fundamental properties of speckle",
 J. Opt. Soc. Am. 66, 1976), so its envelope is Rayleigh: mean over standard deviation sqrt(pi / (4 - pi)) = 1.913
 (Burckhardt, "Speckle in ultrasound B-mode scans", IEEE Trans. Sonics Ultrason. 25, 1978).
-
-A B-mode picture of a needle in a speckle phantom, from where needle and image plane really are.
-
-The frame ``image``: its origin is the middle of the upper left pixel, x (u) runs along the probe's face to the right,
-y (v) into the depth, z out of the plane; mm. A needle off the plane fades as the slice's Gaussian profile (spec 3,
-section 5). One picture's speckle is independent of the next one's: two poses of a calibration show different cells.
 """
 
 from __future__ import annotations
