@@ -24,7 +24,7 @@ from puncture_twin.planning.geometry.triangle_distance import nearest_point
 
 @dataclass(frozen=True, eq=False)
 class AxisDistances:
-    """How far needle axes are from structures, mm.
+    """Distances of n needle axes from k structures, mm.
 
     Attributes:
         distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they meet.
@@ -38,12 +38,12 @@ class AxisDistances:
     nearest: Ints32
 
     def at(self, rows: Ints) -> AxisDistances:
-        """Those of some axes."""
+        """The distances of some axes."""
         return AxisDistances(self.distance[rows], self.depth[rows], self.nearest[rows])
 
 
 class ClearanceEngine(Protocol):
-    """Prepared once for a set of surfaces, wanted any target.
+    """A clearance engine: prepared once for a set of surfaces, it measures from any target.
 
     An engine sees surfaces only. That a needle lies wholly inside a closed surface is the caller's to find, and is
     decided by the target alone, because every axis starts there (see `puncture_twin.planning.clearance.engine`).
@@ -51,12 +51,12 @@ class ClearanceEngine(Protocol):
 
     @property
     def triangles(self) -> tuple[Floats, ...]:
-        """Of each structure, shape (m, 9), corners in rows, mm: what `AxisDistances.nearest` counts."""
+        """Triangles of each structure, shape (m, 9), corners in rows, mm: the rows of `AxisDistances.nearest`."""
         ...
 
     @property
     def blocks(self) -> tuple[Blocks, ...]:
-        """Of each structure: among them `near_faces` finds what a displaced needle can meet."""
+        """Packed blocks of each structure, in which `near_faces` finds what a displaced needle can touch."""
         ...
 
     def measure(
@@ -70,7 +70,7 @@ class ClearanceEngine(Protocol):
         ...
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
-        """FCL's own word on whether a capsule of this radius about one axis (3,) touches one structure."""
+        """Whether FCL finds a capsule of this radius about one axis (3,) in contact with one structure."""
         ...
 
     def of(self, columns: Ints) -> ClearanceEngine:
@@ -116,7 +116,7 @@ def too_near(
 
 @dataclass(frozen=True, eq=False)
 class Clearances:
-    """Needle to organ, for n candidates and k structures; mm.
+    """Clearances of n candidates from k structures; mm.
 
     Attributes:
         clearance: Shape (n, k), axis distance minus needle radius, never below minus the radius.
@@ -139,7 +139,7 @@ def measure(
     radius: float,
     axes: AxisDistances | None = None,
 ) -> Clearances:
-    """Measure all candidates.
+    """Measure the clearance of all candidates, with the verdict at each margin.
 
     Every axis starts at the target: where the target lies inside a closed structure, the whole axis is inside it or
     crosses its surface, and the distance is 0 whatever the surfaces say.
@@ -173,7 +173,7 @@ def measure(
 
 
 def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
-    """Of n axes and k surfaces, shape (n, k, 3): unit, from the surface to the axis; NaN where they meet.
+    """Unit vectors from each surface to each axis, shape (n, k, 3); NaN where they intersect.
 
     Nothing is searched again. Where several points of a surface are equally near, it is any one of them.
 

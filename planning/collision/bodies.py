@@ -100,21 +100,21 @@ class Body:
 
     @property
     def hollow(self) -> bool:
-        """Whether FCL sees no more than its surface against the skin."""
+        """Whether FCL sees only its surface when it is tested against the skin."""
         return self.full.surface not in self.full.solids
 
     @cached_property
     def half_spaces(self) -> tuple[Floats, ...]:
-        """Of each piece of ``full`` the half spaces whose intersection it is, (m, 4), in the frame of the shapes."""
+        """Half spaces (m, 4) of each piece of ``full``, whose intersection it is, in the frame of the shapes."""
         return tuple(half_spaces(corners) for corners in self.full.hulls)
 
     def pose(self, poses: Floats) -> fcl.Transform:
-        """Where ``link_poses`` (7, 4, 4) has the body's shapes."""
+        """Pose of the body's shapes where ``link_poses`` (7, 4, 4) has its link."""
         T = poses[self.frame] @ self.T_frame_body
         return fcl.Transform(T[:3, :3], T[:3, 3])
 
     def place(self, poses: Floats) -> None:
-        """Move the shapes to where ``link_poses`` (7, 4, 4) has them."""
+        """Move the shapes with ``link_poses`` (7, 4, 4)."""
         transform = self.pose(poses)
         for shape in (self.bare,) if self.full is self.bare else (self.bare, self.full):
             for item in (*shape.solids, shape.surface):
@@ -201,7 +201,7 @@ class Solid:
 
     @cached_property
     def made(self) -> fcl.CollisionObject:
-        """The shape where it stands, and wherever it is placed from now on."""
+        """The FCL object where the shape is now; it moves with `place`."""
         return fcl.CollisionObject(self._make(), self.pose)
 
     def place(self, pose: fcl.Transform) -> None:
@@ -212,7 +212,7 @@ class Solid:
 
 
 def touch(a: fcl.CollisionObject, b: fcl.CollisionObject) -> bool:
-    """A fresh result for every question: a reused one keeps its old hit."""
+    """Whether two FCL objects touch; a fresh result each time, since a reused one keeps its old hit."""
     return bool(fcl.collide(a, b, fcl.CollisionRequest(), fcl.CollisionResult()))
 
 
@@ -381,13 +381,13 @@ class LooseParts(NamedTuple):
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> LooseParts:
-        """Of a mesh that has been checked."""
+        """The connected parts of a checked mesh."""
         points, begins = _in_parts(mesh)
         sizes = np.maximum.reduceat(points, begins) - np.minimum.reduceat(points, begins)
         return cls(points[begins], sizes)
 
     def no_larger_than(self, mm: float) -> LooseParts:
-        """Those about which a box is not longer than that from corner to corner."""
+        """The parts whose box has a diagonal no longer than that."""
         small = np.linalg.norm(self.sizes, axis=1) <= mm
         return LooseParts(self.corners[small], self.sizes[small])
 

@@ -49,10 +49,10 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
 
 ANGLES = 72
-"""At which a joint is looked at, evenly over the turn: every 5 degrees."""
+"""Angles at which a joint is tested, evenly over the turn: every 5 degrees."""
 
 APART_MM = 1.0
-"""What two pieces may leave between them and still hang together: too little for a surface to pass through."""
+"""mm between two pieces that still count as joined: too little for a surface to pass through."""
 
 
 @cache
@@ -83,7 +83,7 @@ Solids = Sequence[Sequence[fcl.CollisionObject]]
 
 
 def _joined(model: UrModel, links: Sequence[Link], solids: Solids, joint: int) -> Bools:
-    """Of the two links at a joint, which pieces lie within ``APART_MM`` of each other at every angle."""
+    """Which pieces of the two links at a joint lie within ``APART_MM`` of each other at every angle."""
     always = np.ones((len(solids[joint]), len(solids[joint + 1])), bool)
     for angle in 2.0 * np.pi * np.arange(ANGLES) / ANGLES:
         q = np.zeros(len(links) - 1)
@@ -135,7 +135,7 @@ def _gaps_mm(first: Sequence[fcl.CollisionObject], second: Sequence[fcl.Collisio
 
 
 class CellChecker:
-    """FCL's verdict on configurations of one arm, tool, room and patient. Holds no state but its FCL objects.
+    """The reference checker: FCL's verdict on configurations of one arm, tool, workcell and patient.
 
     Not for several threads at once: the FCL objects are moved for each question.
 
@@ -218,7 +218,7 @@ class CellChecker:
     def contacts(
         self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
     ) -> list[Contact | None]:
-        """:meth:`contact` of many states by themselves, shape (n, 6), rad; what is known of them is checked again.
+        """First contact of each of many states, shape (n, 6), rad; known contacts are checked first.
 
         Raises:
             InputError: If a state is not finite.
@@ -226,7 +226,7 @@ class CellChecker:
         return [self.contact(state, needle_may_touch_patient=needle_may_touch_patient) for state in q]
 
     def folded(self, q: Floats) -> Bools:
-        """At which of many states (n, 6), rad, two links touch that come before the last joint: so at any q6.
+        """Which of many states (n, 6), rad, have contact between links before the last joint: at any q6.
 
         Raises:
             InputError: If a state is not finite.
@@ -275,7 +275,7 @@ class CellChecker:
         return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
 
     def distances(self, q: Floats) -> Distances:
-        """How close the moving links and the tool are to patient and boxes.
+        """Least distances of moving links and tool from patient and boxes.
 
         Args:
             q: Shape (6,), rad.

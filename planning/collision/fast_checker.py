@@ -45,7 +45,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
 class FastChecker(CellChecker):
-    """Asks FCL the questions of :class:`CellChecker` that cheap lower bounds on the distances leave open.
+    """Answers :class:`CellChecker`'s questions by bounds, and queries FCL for those that bounds leave open.
 
     The questions come in the same order and their answers are FCL's or proven, so each verdict is the same, down to the
     contact that is named (docs/concepts/arm-collisions.md). Distances are FCL's. Not for several threads at once.
@@ -138,7 +138,7 @@ class FastChecker(CellChecker):
         return None
 
     def _contact_of(self, check: int, answer: int, frames: Floats) -> Contact | None:
-        """What a check finds at frames (7, 4, 4): its answer, or FCL's where it has none."""
+        """Contact of one check at frames (7, 4, 4): by bounds, or by FCL where they prove nothing."""
         if answer == OPEN:
             return self._tested[check].contact_at(frames)
         if answer == CLEAR:
@@ -160,11 +160,11 @@ class FastChecker(CellChecker):
 
     @cached_property
     def _segment_scratch(self) -> SegmentScratch:
-        """Where segments are checked, one after the other."""
+        """Scratch in which segments are checked, one after the other."""
         return segment_scratch(self._proofs.scene, self._proofs.movers)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
-        """The questions at ``q`` (6,) that are left to FCL."""
+        """The checks at ``q`` (6,), rad, that are left to FCL."""
         motion = self.motion(np.asarray(q, dtype=np.float64)[None])
         mask = self._masks[needle_may_touch_patient]
         return [self._tested[check].contact for _, check in self._proofs.unproven(motion, mask)]
@@ -190,7 +190,7 @@ class FastChecker(CellChecker):
         return -1
 
     def motion(self, path: Floats) -> Motion:
-        """States (m, 6) with what the bounds need of them."""
+        """States (m, 6), rad, with the frames and motions that the bounds need."""
         if len(path) <= 1:
             return Motion(link_poses(self.model, path), *self._still)
         return Motion(*self._swept_full.moving(path))
@@ -204,11 +204,11 @@ FINE_MM = 1.0
 no more than 2 mm of motion apart, which with 1 mm of padding proves the path between them; see :class:`CellChecker`."""
 
 QUESTIONS = 256
-"""Room for what one segment leaves to FCL, at first."""
+"""Space for the queries that one segment leaves to FCL, at first."""
 
 
 class _Filled(NamedTuple):
-    """What the compiled code fills."""
+    """Arrays that the compiled code fills."""
 
     scratch: SegmentScratch
     answer: Answer
@@ -239,7 +239,7 @@ class SegmentChecker:
         self._filled = _Filled(scratch, _empty_answer(QUESTIONS))
 
     def __call__(self, start: Floats, end: Floats) -> Contact | None:
-        """A contact on the segment between two states (6,), rad, the needle being outside the patient; None if free.
+        """Contact on the segment between two states (6,), rad, the needle outside the patient; None if free.
 
         The end is checked as it is, and then the middles of ever smaller parts; all of the segment is proven clear but
         for parts within which no body moves farther than ``FINE_MM`` from a state where FCL finds nothing. The start

@@ -128,7 +128,7 @@ def cached_enclosed(hulls: Sequence[Floats], cache: Cache) -> Arrays:
 
 
 def enclosed(hulls: Sequence[Floats]) -> Arrays:
-    """Of each convex hull a sphere about it and a coarse hull: their numbers, one array each."""
+    """A sphere about each convex hull and a coarse hull: their numbers, one array each."""
     coarse, edges = [coarse_hull(corners) for corners in hulls], [neighbours(corners) for corners in hulls]
     first = row_starts([len(corners) for corners in hulls])
     rows = [hull.rows + start for hull, start in zip(edges, first[:-1], strict=True)]
@@ -164,7 +164,7 @@ def packed_trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], 
 
 
 def settings() -> dict[str, float]:
-    """The numbers of this folder that decide what it makes."""
+    """Constants of this room that decide its results, for cache keys."""
     return {
         "leaf": LEAF_RADIUS_MM,
         "slack": SLACK_MM,
@@ -175,7 +175,7 @@ def settings() -> dict[str, float]:
 
 
 def made_from(what: str, pieces: Sequence[NDArray[Any]]) -> dict[str, object]:
-    """What decides a result about some convex pieces, for the cache: their corners and how they are enclosed."""
+    """Cache key of results about some convex pieces: their corners and how they are enclosed."""
     digest = hashlib.sha256()
     for corners in pieces:
         digest.update(f"{corners.shape}".encode())
@@ -237,7 +237,7 @@ def in_frame(corners: Floats, body: Body) -> Floats:
 
 
 def joint_levers(model: UrModel, check: Check) -> Floats:
-    """How far a turn of each joint (6,) may move the second body against the first, mm/rad.
+    """How far a rotation of each joint (6,) may move the second body against the first, mm/rad.
 
     A body's point is no farther from a joint's axis than the links between reach, end to end, and the body itself.
     Only the joints between the two bodies move them against one another.
@@ -254,7 +254,7 @@ def joint_levers(model: UrModel, check: Check) -> Floats:
 
 
 def packed_movers(checks: Sequence[Check]) -> Movers:
-    """The piece that each check is about, or all of a body for the skin."""
+    """The moving piece of each check, or all of a body for the skin."""
     rows: dict[int, int] = {}
     frames, spheres, mover = [], [], []
     for check in checks:

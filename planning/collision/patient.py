@@ -36,7 +36,7 @@ from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of
 
 PART_TRIANGLES = 8192
-"""So many triangles share a tree: FCL takes some 4 us to build for each, and 20 us to ask a tree."""
+"""Triangles in one tree: FCL takes some 4 us to build for each, and 20 us to query a tree."""
 
 ROUNDING_MM = 1e-6
 """By how much a body's box is grown: far above the rounding of its pose."""
@@ -94,7 +94,7 @@ class FclSkin:
         return bool(near.any()) and bool(within(points[near], body.half_spaces).any())
 
     def _near(self, pose: fcl.Transform, box: Floats) -> list[int]:
-        """The parts that a box about a body, in the body's frame, may meet where the body stands."""
+        """Parts of the surface that a box about a body, in the body's frame, may touch."""
         low, high = _bounds_at(pose, box)
         near = np.all((self._bounds[:, 1] >= low) & (self._bounds[:, 0] <= high), axis=1)
         found: list[int] = np.flatnonzero(near).tolist()
@@ -129,13 +129,13 @@ class FclSkin:
 
 
 class FclPatient(NamedTuple):
-    """The skin, and what besides it is not to be touched."""
+    """The patient for FCL: the skin, and what else the CT shows."""
 
     skin: FclSkin
     outside: FclSkin | None
 
     def touched_part(self, body: Body) -> str | None:
-        """What of it a body touches where it stands: the skin, ``outside_body`` where that is all, or None."""
+        """The part that a body touches where it is: the skin, ``outside_body`` where that is all, or None."""
         if self.skin.collides_with(body):
             return PATIENT
         return OUTSIDE_BODY if self.outside is not None and self.outside.collides_with(body) else None
@@ -150,7 +150,7 @@ def _bounds_at(pose: fcl.Transform, box: Floats) -> tuple[Floats, Floats]:
 
 
 class Check(NamedTuple):
-    """One question to FCL: do two shapes touch."""
+    """One query to FCL: whether two shapes touch."""
 
     contact: Contact
     """What it means if they do."""

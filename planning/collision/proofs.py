@@ -43,7 +43,7 @@ class Motion(NamedTuple):
 
 
 class Around(NamedTuple):
-    """What :meth:`Proofs.clear_about` leaves open."""
+    """The checks that :meth:`Proofs.clear_about` leaves open."""
 
     touching: Bools
     """Shape (m, k): at the state itself the reference must be queried, and is likely to find that something touches."""
@@ -52,7 +52,7 @@ class Around(NamedTuple):
 
 
 class NotClear(NamedTuple):
-    """Of each state the first check that is not proven clear."""
+    """The first check of each state that is not proven clear."""
 
     checks: Ints
     """Shape (m,); -1 where all is clear."""
@@ -61,7 +61,7 @@ class NotClear(NamedTuple):
 
 
 class Proofs:
-    """The checks of one cell, ready to be proven. Not for several threads: the scratch is shared.
+    """The checks of one workcell, ready to be proven. Not for several threads: the scratch is shared.
 
     ``joint_spans`` (k, 3) says of each check whether it is between two bodies of the arm, and the frames of both.
 
@@ -150,7 +150,7 @@ class Proofs:
         return found
 
     def settled_at(self, check: int, frames: Floats) -> int:
-        """What a check comes to at frames (7, 4, 4), see :mod:`puncture_twin.planning.collision.kernels.settled`."""
+        """Result of a check at frames (7, 4, 4), see :mod:`puncture_twin.planning.collision.kernels.settled`."""
         return int(settled_kernels.settled_at(self.scene, self._work, self._beside, check, frames))
 
     def clear_about(self, frames: Floats, turns: Floats, tested: Bools) -> Around:
@@ -179,7 +179,7 @@ QUARTERS = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
 
 
 def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, cache: Cache) -> tuple[Check, ...]:
-    """The checks that may find a contact at some angle; the proofs are made to ask the same ones.
+    """The checks without pairs that touch at no angle; the proofs are made to test these.
 
     Args:
         model: The arm.

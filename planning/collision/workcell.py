@@ -35,19 +35,19 @@ TREE_COPIES = 8
 
 
 def case_tool(case: Case) -> Tool:
-    """The needle, its holder, and what else the flange carries."""
+    """Tool of the case: the needle, its holder, and what else the flange carries."""
     needle = case.needle
     return Tool(needle.length_mm, needle.shaft_mm, needle.diameter_mm, needle.holder_diameter_mm, case.tool)
 
 
 def outside_surface(anatomy: Anatomy) -> TriangleMesh | None:
-    """What the CT shows outside of the skin that the arm must not touch, CT frame; None where there is nothing."""
+    """Surface outside of the skin that the arm must not touch, CT frame; None where there is nothing."""
     outside = [one.mesh for one in anatomy.surroundings if one.role is Role.UNKNOWN]
     return joined(outside) if outside else None
 
 
 def patient_surface(anatomy: Anatomy) -> TriangleMesh:
-    """What the arm must not touch as the patient, CT frame: the skin, and what the CT shows outside of it."""
+    """Surface that the arm must not touch as the patient, CT frame: the skin, and what lies outside of it."""
     outside = outside_surface(anatomy)
     return anatomy.skin.mesh if outside is None else joined([anatomy.skin.mesh, outside])
 
@@ -85,7 +85,7 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
 
 
 def _placing_key(case: Case) -> str:
-    """Where the case says where its robot's base is."""
+    """Key of the case that states where its robot's base is."""
     if case.registration is not None:
         return "registration"
     return "robot.mount" if case.robot.transform is None else "registration.transform"
@@ -194,7 +194,7 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
 
 
 def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) -> Anatomy:
-    """The anatomy with the case's obstacles and gantry beside what the CT shows outside of the body.
+    """The anatomy with the case's obstacles and gantry as further structures outside of the body.
 
     Raises:
         InputError: An obstacle has the name of a structure, or the gantry's wall stands in the patient.

@@ -51,7 +51,7 @@ SPLINE_SAMPLES = 8
 
 
 class _Straight(NamedTuple):
-    """A stretch of a segment."""
+    """A straight stretch of a segment."""
 
     start: Floats
     direction: Floats
@@ -86,7 +86,7 @@ _Stretch = _Straight | _Round
 
 
 class _Slow(NamedTuple):
-    """What slows an arm down beside its own limits."""
+    """Further speed limits besides the arm's own: the tip's."""
 
     speed_scale: float
     tip: TipLimit | None
@@ -100,7 +100,7 @@ class _Slow(NamedTuple):
 
 
 def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction: Floats) -> Floats:
-    """The curve past a corner.
+    """The curve past a corner, as in the module's equations.
 
     Args:
         corner: Shape (6,), rad.
@@ -155,7 +155,7 @@ def follow(
 
 
 def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
-    """What the rounded corners leave of each segment, shape (k - 1,), rad."""
+    """Length of each segment between its rounded corners, shape (k - 1,), rad."""
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
     fits = cuts.shape == (len(lengths) - 1,) and bool((cuts >= 0.0).all() and (lengths > 0.0).all())
     straight = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts) if fits else lengths
@@ -166,7 +166,7 @@ def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
 
 
 def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slow: _Slow) -> Iterator[list[_Stretch]]:
-    """From stop to stop: straight stretches (``straight`` long, one a segment) and rounded corners in turn."""
+    """Straight stretches (``straight`` long, one a segment) and rounded corners in turn, from stop to stop."""
     steps = np.diff(waypoints, axis=0)
     directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
     rates = [_segment_rates(model, *ends, slow) for ends in pairwise(waypoints)]
@@ -240,7 +240,7 @@ def _sampled(waypoints: Floats, runs: Iterable[list[_Stretch]]) -> Trajectory:
 
 
 def _steps(duration_s: float) -> int:
-    """How many samples a duration takes."""
+    """Number of samples in a duration."""
     return max(1, math.ceil(duration_s / SAMPLE_S - SAME_STEP))
 
 

@@ -41,7 +41,7 @@ branches touch something, a tree that later found its way out grew every 25 samp
 
 
 class Connected(NamedTuple):
-    """What one run of the planner came to."""
+    """Result of one run of the planner."""
 
     waypoints: Floats | None
     """Shape (k, 6), rad: from home exactly to a goal exactly; None if it found no path."""
@@ -58,7 +58,7 @@ class Connected(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Where a run looks, and when it stops."""
+    """Where a run samples, and when it stops."""
 
     bounds: Floats
     """Shape (6, 2), rad: where samples are drawn; home and goals lie in it."""

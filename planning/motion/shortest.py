@@ -53,12 +53,12 @@ class Path(NamedTuple):
 
     @property
     def length(self) -> float:
-        """Of the joints' travel, rad."""
+        """Length of the joints' path, rad."""
         return math.fsum(starmap(math.dist, pairwise(self.waypoints.tolist())))
 
 
 class Task(NamedTuple):
-    """What a path is sought for."""
+    """A planning problem: ends, limits and checks of a path."""
 
     joint_limits: Floats
     """Shape (6, 2), rad."""
@@ -90,7 +90,7 @@ def direct_path(contact_of: SegmentContact, home: Floats, goals: Floats) -> Path
 
 
 def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> Path | Connected:
-    """The shortest path found to any goal, or what the run came to that found none.
+    """The shortest path found to any goal, or the result of the run that found none.
 
     No path is shorter than the straight line to its goal, so once there is one, only goals nearer than it is long are
     sought.
@@ -118,7 +118,7 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
 
 
 def _distances(home: Floats, goals: Floats) -> list[float]:
-    """From home to each goal, rad."""
+    """Joint distance from home to each goal, rad."""
     start = home.tolist()
     return [math.dist(start, goal) for goal in goals.tolist()]
 
@@ -252,7 +252,7 @@ class Cut:
 
 
 def _unturned(angles: Floats) -> tuple[Floats, Ints]:
-    """The different ones of some angles but for whole turns, and which of them each is."""
+    """Distinct angles modulo whole turns, and the index of each angle's."""
     turns = np.round((angles % (2.0 * np.pi)) / SAME_ANGLE).astype(np.int64)
     _, rows, which = np.unique(turns, return_index=True, return_inverse=True)
     return angles[rows], which

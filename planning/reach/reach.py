@@ -43,7 +43,7 @@ from puncture_twin.planning.reach.survey import (
 
 
 def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAnswer:
-    """Of a request without a clear motion: what came farthest.
+    """The refusal of a request without a clear motion: that of the motion that came farthest.
 
     Args:
         model: The arm.
@@ -130,7 +130,7 @@ def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswe
 
 
 def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[ReachAnswer]:
-    """Of each request; round by round the next motion of all that have no answer yet."""
+    """The reach answer of each request; round by round the next motion of all that have none yet."""
     surveys = _surveyed(checker, requests, n_rolls)
     search = FirstClear(surveys)
     _try_next(checker, search)
@@ -153,7 +153,7 @@ def _try_next(checker: StateChecker, search: FirstClear) -> bool:
 
 
 def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[Surveyed]:
-    """What kinematics alone says of the requests, which are checked first."""
+    """Kinematics of the requests, which are checked first."""
     for request in requests:
         if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
             allowed = f"the tool's {checker.tool.needle_length_mm}"
@@ -167,7 +167,7 @@ def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: 
 
 
 class NextMotions(NamedTuple):
-    """Of each request whose search goes on, the motion that is tried next."""
+    """The next motion to try of each request whose search goes on."""
 
     rows: Ints
     """Shape (m,): which requests."""
@@ -180,7 +180,7 @@ class NextMotions(NamedTuple):
 
 
 class FirstClear:
-    """The searches of many requests, side by side: of each the motions that kinematics allows, the best margin first.
+    """Searches of many requests, side by side: motions that kinematics allows, the best margin first.
 
     All motions of a request begin with the needle in the same place, and needle and holder are round about its axis: if
     they were clear of patient and boxes once, they need not be checked again.
@@ -204,7 +204,7 @@ class FirstClear:
         self._round_clear = np.zeros(len(surveyed), np.bool_)
 
     def next_motions(self) -> NextMotions:
-        """What is tried next; of no requests where all searches are over."""
+        """The motions to try next; of no requests where all searches are over."""
         rows = np.flatnonzero(self._left.any(axis=1))
         at = self._left[rows].argmax(axis=1)
         branches, rolls = self._branches[rows, at], self._rolls[rows, at]
@@ -244,7 +244,7 @@ class FirstClear:
     def _tried(
         self, checker: StateChecker, motions: NextMotions, at: int, contact: Contact | None
     ) -> ReachAnswer | Blocked:
-        """What comes of one of the motions, which touches so at its standoff."""
+        """Result of one motion with this contact, or none, at its standoff."""
         if contact is not None:
             return blocked_at_standoff(contact)
         found, branch, roll = self._surveyed[motions.rows[at]], int(motions.branches[at]), int(motions.rolls[at])
@@ -288,7 +288,7 @@ def tried_all(checker: StateChecker, motions: Sequence[tuple[Surveyed, Insertion
 
 
 def blocked_at_standoff(contact: Contact) -> Blocked:
-    """What a contact at its standoff makes of a motion."""
+    """The block that a contact at the standoff means for a motion."""
     detail = f"{contact.body} touches {contact.other} at standoff"
     return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
 
@@ -314,7 +314,7 @@ def tried(checker: StateChecker, found: Surveyed, insertion: Insertion) -> Reach
 
 
 def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
-    """What keeps every branch from one flange pose (4, 4), in mm: one sentence for people."""
+    """Why no branch of the arm reaches one flange pose (4, 4), mm: one sentence for people."""
     place = (
         f"the flange would stand {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
     )
@@ -417,7 +417,7 @@ OUTWARD = np.array([[0.0, 0.0, 1.0], [-0.3, 0.2, 0.93], [0.9, 0.1, 0.3], [0.3, 0
 CORNERS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 
 FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-"""Of an octahedron, seen from outside counterclockwise."""
+"""Faces of an octahedron, counterclockwise from outside."""
 
 
 def small_workcell() -> FastChecker:
@@ -428,11 +428,11 @@ def small_workcell() -> FastChecker:
 
 
 def check_small_workcell(checker: FastChecker) -> list[ReachAnswer]:
-    """Of each of the small workcell's directions whether the arm reaches it."""
+    """Reach of the small workcell's directions: compiles every kernel of the arm before a case needs it."""
     outward = OUTWARD / np.linalg.norm(OUTWARD, axis=1, keepdims=True)
     return assess_reach_all(checker, [ReachRequest(TARGET, u, NEEDLE.needle_length_mm, STANDOFF_MM) for u in outward])
 
 
 def octahedron(at: Floats, radius_mm: float) -> TriangleMesh:
-    """Six corners so far from a place (3,), mm."""
+    """Corners (6, 3) at a distance from a place (3,), mm."""
     return TriangleMesh(at + radius_mm * CORNERS, FACES)

@@ -44,7 +44,7 @@ class Insertion(NamedTuple):
 
 
 class Surveyed(NamedTuple):
-    """What kinematics alone says of one request; see :class:`Survey`."""
+    """Kinematics of one request; see :class:`Survey`."""
 
     request: ReachRequest
     line: NeedleLine
@@ -72,7 +72,7 @@ class Surveyed(NamedTuple):
 def surveyed(
     model: UrModel, requests: Sequence[ReachRequest], lines: Sequence[NeedleLine], rolls: Floats
 ) -> list[Surveyed]:
-    """What kinematics says of each request.
+    """Kinematics of each request.
 
     Args:
         model: The arm.
@@ -97,7 +97,7 @@ def _depths(standoff_mm: float) -> Floats:
 
 
 class Survey(NamedTuple):
-    """What kinematics alone says of many directions, every branch and roll."""
+    """Kinematics of many directions, every branch and roll."""
 
     stop_at: NDArray[np.int64]
     """Shape (n, 8): index of the sample at which the path ends, -1 where it reaches the target."""
@@ -237,12 +237,12 @@ def _rolled(limits, rolls, full, reached, margins, turns):  # type: ignore[no-un
 
 
 SAME_UNIT = 1e-9
-"""How far a direction's length may be from 1."""
+"""Tolerance of a unit direction's length."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReachRequest:
-    """One direction to reach along.
+    """One direction that the arm shall reach along.
 
     Attributes:
         target_base: Shape (3,), mm: the lesion, base frame.
@@ -306,7 +306,7 @@ class ReachAnswer:
     def refused(
         cls, reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None
     ) -> ReachAnswer:
-        """Of a direction that the arm does not reach, or not to the target."""
+        """The answer for a direction that the arm does not reach, or not to the target."""
         return cls(False, reason, depth_mm, detail, contact, math.nan, -1, np.empty((0, 6)), np.empty(0), 0.0)
 
     def __post_init__(self) -> None:
@@ -375,7 +375,7 @@ def fill_branch_path(lengths, R, target, outward, distances, branch, turn, q):  
 
 
 class Sampled(NamedTuple):
-    """A motion's states and where they are."""
+    """States of a motion and their distances from the standoff."""
 
     q: Floats
     """Shape (m, 6), rad; NaN from where the branch first does not exist."""

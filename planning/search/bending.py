@@ -76,7 +76,7 @@ def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance:
 
 
 class Insertion(NamedTuple):
-    """A bevel that never turns, along one path; N and mm."""
+    """The insertion along one path with a bevel that never rotates; N and mm."""
 
     path: BevelPath
     force: InsertionForce
@@ -89,7 +89,7 @@ class Insertion(NamedTuple):
         return float(self.path.cut_mm[-1])
 
     def lines(self, greatest_mm: float) -> list[str]:
-        """For a person.
+        """Lines of text for a person.
 
         Args:
             greatest_mm: The bound that the search keeps.
@@ -105,7 +105,7 @@ class Insertion(NamedTuple):
 def insertion_along(
     bending: Bending, anatomy: Anatomy, end_ct: Floats, outward_ct: Floats, path_length: float
 ) -> Insertion:
-    """The insertion along one direction.
+    """Deflection, forces and buckling of the insertion along one direction.
 
     Args:
         bending: Of the case.
@@ -151,7 +151,7 @@ def check_tissues(case: Case, anatomy: Anatomy) -> None:
 def path_layers(
     bending: Bending, anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_length: float
 ) -> tuple[Layer, ...]:
-    """What a needle passes, the skin first. In nested structures the smallest counts, by its box.
+    """The tissue layers of a path, skin first; in nested structures the smallest box counts.
 
     A surface is a capsule where it is entered. That of the rest is the skin: coming out of an organ there is none.
 
@@ -237,7 +237,7 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
 
 
 def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
-    """At which depths the path is inside a closed structure: the parity of the crossings before.
+    """Which depths of a path are inside a closed structure, by the parity of the crossings before.
 
     Args:
         structure: Closed.

@@ -66,7 +66,7 @@ def with_chances(
 
 
 def limited(case: Case, candidates: Candidates) -> Candidates:
-    """Reject what is too unlikely to hit, or too likely to touch."""
+    """Reject candidates too unlikely to hit, or too likely to touch."""
     chances, least = candidates.chances, case.search.min_hit
     assert chances is not None
     if least is not None:
@@ -84,14 +84,14 @@ def limited(case: Case, candidates: Candidates) -> Candidates:
 
 
 def _rejected(candidates: Candidates, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Candidates:
-    """With some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
+    """The candidates with some rows rejected, each by a structure, shape (m,), and a number, shape (m,)."""
     arrays = {field.name: getattr(candidates.verdict, field.name).copy() for field in fields(candidates.verdict)}
     arrays["reason"][rows], arrays["structure"][rows], arrays["amount"][rows] = reason.value, structure, amount
     return replace(candidates, verdict=Verdict(**arrays))
 
 
 BEST = 200
-"""Of the ranked candidates: how many get the dearer chances."""
+"""How many of the ranked candidates get the chances that cost more."""
 
 
 REFINED_FROM = 1 / 60
@@ -99,7 +99,7 @@ REFINED_FROM = 1 / 60
 side at all is 56 times that to one side at 3.5 standard deviations, and less for less."""
 
 ROWS_AT_ONCE = 4096
-"""Of candidates: a table of gradients of 60 structures stays below 20 MB."""
+"""Candidates at once: a table of gradients of 60 structures stays below 20 MB."""
 
 
 def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidates:
@@ -129,7 +129,7 @@ def _touch_bounds(candidates: Candidates, model: ChanceModel) -> Floats:
 
 
 def with_refined(candidates: Candidates, model: ChanceModel, rows: Ints) -> Candidates:
-    """Refine some rows."""
+    """The chances with some rows refined by line sampling."""
     chances = candidates.chances
     assert chances is not None
     names = [field.name for field in fields(chances) if field.name != "structures"]
@@ -139,7 +139,7 @@ def with_refined(candidates: Candidates, model: ChanceModel, rows: Ints) -> Cand
 
 
 def with_best_refined(candidates: Candidates, model: ChanceModel | None) -> Candidates:
-    """Refine what is shown: the best of all, and the best of every window.
+    """Refine the candidates that people are shown: the best of all, and the best of every window.
 
     Those that break a limit then are rejected, and the rest ranked again, until no new one is among them.
 
@@ -155,7 +155,7 @@ def with_best_refined(candidates: Candidates, model: ChanceModel | None) -> Cand
 
 
 def _shown(candidates: Candidates) -> Ints:
-    """Rows that people are shown, and whose chances are of first order yet."""
+    """Rows that people are shown, and whose chances are still of first order."""
     assert candidates.chances is not None
     best = [window.best for window in find_windows(candidates).windows]
     shown = np.unique(np.append(candidates.ranked[:BEST], best)).astype(np.int64)

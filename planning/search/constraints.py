@@ -29,7 +29,7 @@ from puncture_twin.planning.search.candidates import ARM_CHECKED, ArmColumns, Ca
 Column = NDArray[Any] | str | float
 
 SKIN = "skin"
-"""Its name in the reasons."""
+"""The skin's name in the reasons."""
 
 
 def first_broken(
@@ -84,7 +84,7 @@ def first_broken(
 
 
 def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:
-    """Column of the structure that lacks most of its margin, shape (n,); equal lacks go to the one met first.
+    """Column of the structure that lacks most of its margin, shape (n,); of equal ones the first along the needle.
 
     0 where none lacks any.
     """
@@ -128,7 +128,7 @@ def _first_of(candidates: Candidates, reasons: tuple[Reason, ...]) -> int | None
 
 @dataclass(frozen=True, eq=False)
 class ArmReach:
-    """Checks whether the arm reaches a candidate: the workcell, and where the patient is in it."""
+    """The arm in its workcell, as the check of candidates needs it, and where the patient is."""
 
     checker: CellChecker
     T_base_ct: Floats
@@ -157,12 +157,12 @@ def with_reach(case: Case, candidates: Candidates, reach: ArmReach, progress: Co
 
 
 def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Floats) -> ReachRequest:
-    """What the arm has to reach for one candidate."""
+    """The reach request of one candidate: its needle line and standoff."""
     return reach_requests(case, candidates, np.array([row]), T_base_ct)[0]
 
 
 def reach_requests(case: Case, candidates: Candidates, rows: Ints, T_base_ct: Floats) -> list[ReachRequest]:
-    """What the arm has to reach for some candidates."""
+    """The reach requests of some candidates."""
     R, target = T_base_ct[:3, :3], T_base_ct[:3, :3] @ case.target_ct + T_base_ct[:3, 3]
     lengths = standoffs(case.needle, candidates.path.length[rows], candidates.path.skin_angle[rows]).tolist()
     outward = [R @ candidates.outward_ct[row] for row in rows]

@@ -51,10 +51,10 @@ from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
-"""Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
+"""Clearance engines by name: the fast exact engine, and FCL alone as the plain reference."""
 
 COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
-"""What each of them counts while it measures."""
+"""The unit of each engine's progress."""
 
 NO_BASE = "the case does not say where the robot's base is"
 ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]; or a check without the arm"
@@ -62,7 +62,7 @@ ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]; or
 
 @dataclass(frozen=True, eq=False)
 class CaseContext:
-    """What every question about a case needs, read once.
+    """A prepared case: everything that questions about it need, read once.
 
     Attributes:
         placement: Where the patient lies for the robot, or None when the case does not say.
@@ -93,12 +93,12 @@ class CaseContext:
 
     @property
     def pose_error(self) -> PoseError | None:
-        """Of the needle, where the case declares errors and has markers, also where the arm is not checked."""
+        """The needle's pose error, if the case declares errors and has markers, also where the arm is not checked."""
         return pose_error(self.case, None if self.placement is None else self.placement.registration)
 
     @cached_property
     def sides(self) -> tuple[Side, ...]:
-        """From where a needle can come, and where the case's grid looks."""
+        """Open sides of the body around the target, and which of them the case's grid covers."""
         return sides_of(self.case, self.anatomy)
 
     def search(self) -> Candidates:
@@ -123,7 +123,7 @@ class CaseContext:
         return replace(candidates, arm_note=self.arm)
 
     def explain(self, theta: float, beta: float) -> Explanation:
-        """Check a single direction (rad), and say what it was checked against and how sure it is."""
+        """Check a single direction (rad), with everything it was checked against and its uncertainty."""
         candidates = self.check(theta, beta)
         known = candidates.chances is not None and np.isfinite(candidates.chances.hit[0])
         breakdown = self.breakdown_at(candidates.outward_ct[0], candidates.arm.q_insertion[0]) if known else None
@@ -131,7 +131,7 @@ class CaseContext:
         return Explanation(self.case, self.anatomy, candidates, facts, breakdown)
 
     def entry_facts(self, entry_ct: Floats, outward_ct: Floats) -> EntryFacts:
-        """A path for whoever stands at the patient: its skin entry (3,), mm, and its direction outward (3,), unit."""
+        """Skin entry (3,), mm, and outward direction (3,), unit, described to a person at the patient."""
         registration = None if self.placement is None else self.placement.registration
         if registration is None:
             return entry_facts(self.case, (), entry_ct, outward_ct)
@@ -140,11 +140,11 @@ class CaseContext:
         return entry_facts(self.case, markers, entry_ct, outward_ct)
 
     def breakdown_at(self, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown | None:
-        """How sure one direction (3,) is in one configuration (6,), rad, as of a plan; None without declared errors."""
+        """Uncertainty breakdown of a direction (3,) at joints (6,), rad, as of a plan; None without declared errors."""
         return None if self.chance is None else uncertainty_breakdown(self.chance, outward_ct, q)
 
     def region_ct(self, q: Floats) -> Floats | None:
-        """Within x' inv(region) x <= 1 about the target the tip is expected in 95 of 100, shape (3, 3), mm^2, CT axes.
+        """The tip's 95 % region about the target: x' inv(region) x <= 1, shape (3, 3), mm^2, CT axes.
 
         Args:
             q: Shape (6,), rad, the tip on the target; NaN where the arm does not reach it.
@@ -194,7 +194,7 @@ def prepare(
     options: CaseOptions = NO_OPTIONS,
     memory: Memory = NO_MEMORY,
 ) -> CaseContext:
-    """Read a case and everything that it names.
+    """Prepare a case: read it and everything that it names.
 
     Args:
         path: Case file, or the folder that holds ``case.toml``.
@@ -249,7 +249,7 @@ def prepare(
 
 
 def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Iterator[Finding]:
-    """What else would be safe for the organs; ``found`` are the case's directions, ranked."""
+    """Findings on what else would be safe for the organs, from the ranked candidates of the case."""
     more = safe_without_beyond(case, anatomy, candidates)
     if more:
         said = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
@@ -259,7 +259,7 @@ def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidat
 
 
 def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) -> int:
-    """How many directions are kept from being safe by that alone by which a body is wider beyond its image."""
+    """How many directions only the assumed body beyond the image keeps from being safe."""
     clearance, named = candidates.clearance, candidates.verdict.structure == BEYOND_IMAGE
     others = ~np.isnan(clearance.margins) & (np.array(clearance.structures) != BEYOND_IMAGE)
     rows = np.flatnonzero(named & (clearance.distance[:, others] >= clearance.margins[others]).all(axis=1))

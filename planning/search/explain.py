@@ -22,7 +22,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
 
 NEAREST = 8
-"""Structures that are listed where nobody wants all: a case has a hundred, and those far away decide nothing."""
+"""Structures listed by default: a case has a hundred, and those far away decide nothing."""
 
 COARSE_VOXEL_MM = 1.0
 """A surface drawn around voxels of this size is somewhere within half of it."""
@@ -35,7 +35,7 @@ UNITS = {
     Reason.HIT_UNLIKELY.value: "chance to hit",
     Reason.TOUCH_LIKELY.value: "chance to touch",
 }
-"""Of the number that fell short, by reason; of all others it is a clearance in mm."""
+"""Unit of the number that fell short, by reason; for all others it is a clearance in mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class Explanation:
         }
 
     def _breathing(self) -> dict[str, Any]:
-        """Only of a case that declares its breathing."""
+        """The key ``breathing``, of a case that declares its breathing."""
         breathing = self.candidates.breathing
         if breathing is None:
             return {}
@@ -135,14 +135,14 @@ class Explanation:
         return {"breathing": values}
 
     def _chances(self) -> dict[str, Any]:
-        """Only of a case that declares errors, so that others keep their keys."""
+        """The key ``chances``, of a case that declares errors."""
         if self.case.errors is None:
             return {}
         return {"chances": None if self.breakdown is None else self.breakdown.summary()}
 
     @cached_property
     def along_path(self) -> tuple[Stretch, ...]:
-        """The CT along the path, beside the structures; empty without a CT."""
+        """Hounsfield units and structures along the path; empty without a CT."""
         row = self.candidates
         return stretches(self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path.length[0]))
 
@@ -154,7 +154,7 @@ class Explanation:
         return [head, *self._reason()]
 
     def text(self, most: int | None = NEAREST) -> str:
-        """All of it for a person.
+        """The whole explanation for a person.
 
         Args:
             most: How many structures are listed, the nearest first; None lists all.
@@ -203,7 +203,7 @@ class Explanation:
 
     @cached_property
     def insertion(self) -> Insertion | None:
-        """Where the needle bends to, and what it feels; None without tissue, or without an entry."""
+        """Deflection and forces along the path; None without tissue, or without an entry."""
         row, bending = self.candidates, self.case.bending
         if bending is None or np.isnan(row.path.length[0]):
             return None
@@ -215,7 +215,7 @@ class Explanation:
         return self.insertion.lines(float(self.candidates.deflection[0]))
 
     def _needle(self) -> dict[str, Any]:
-        """Only of a case that declares its tissue."""
+        """The key ``bending``, of a case that declares its tissue."""
         if self.candidates.deflection is None:
             return {}
         insertion = self.insertion
@@ -229,7 +229,7 @@ class Explanation:
         return {"bending": values}
 
     def _breath(self) -> list[str]:
-        """The least clearance of all phases that the gate lets through."""
+        """Text of the least clearance of all phases that the gate lets through."""
         found, breathing = self.candidates.breathing, self.case.breathing
         if found is None or breathing is None or np.isnan(found.clearance[0]):
             return []
@@ -291,18 +291,18 @@ class Explanation:
 
 
 def decimals(structure: Structure) -> int:
-    """Of a clearance, in mm, as people read it: a surface drawn around coarse voxels has no hundredths."""
+    """Decimals of a clearance in mm for people: a surface drawn around coarse voxels has no hundredths."""
     return 1 if structure.voxel_mm >= COARSE_VOXEL_MM else 2
 
 
 def _beside(clearance_mm: float, short: bool) -> str:
-    """What a clearance means for people: one below zero is a needle that goes through."""
+    """Text after a clearance: too close, or crossed where it is below zero."""
     said = ["too close"] * short + ["crossed"] * (clearance_mm < 0)
     return f"  {', '.join(said)}" if said else ""
 
 
 def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
-    """What to say where a longer needle would free more directions than this one does."""
+    """Warnings where a longer needle would free more directions than this one does."""
     short = candidates.verdict.reason == Reason.TOO_LONG.value
     crossed = (candidates.clearance.distance < candidates.clearance.margins).any(axis=1)
     freed = short & ~crossed & (candidates.path.skin_angle <= case.search.max_skin_angle)
@@ -342,7 +342,7 @@ def deep_text(clearance_mm: float) -> str:
 
 
 def _amount_text(candidates: Candidates, row: int) -> str:
-    """The number that fell short; a clearance ends at minus the radius, how much deeper an axis is nobody measures."""
+    """Text of the number that fell short; a negative clearance ends at minus the radius."""
     reason, amount = str(candidates.verdict.reason[row]), float(candidates.verdict.amount[row])
     margin = _margin(candidates, row) if reason == Reason.TOO_CLOSE.value else np.nan
     if reason not in UNITS and amount < 0:
@@ -353,7 +353,7 @@ def _amount_text(candidates: Candidates, row: int) -> str:
 
 
 def _margin(candidates: Candidates, row: int) -> float:
-    """What the structure that the reason names demands, mm."""
+    """Margin of the structure that the reason names, mm."""
     found = candidates.clearance
     return float(found.margins[found.structures.index(str(candidates.verdict.structure[row]))])
 

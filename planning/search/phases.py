@@ -113,7 +113,7 @@ def _at_phase(
 
 
 def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float) -> Anatomy:
-    """The anatomy with what an arm may touch, the skin and what lies outside of the body, where the breath puts it."""
+    """The anatomy at a position of the breath: skin and what lies outside of the body, which an arm may touch."""
     inside, outside = np.split(weights.structures, [len(anatomy.structures)])
     del inside  # an arm does not come to it
     return replace(
@@ -129,7 +129,7 @@ def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s
 def _with_moved_solids(
     case: Case, anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float, T_base_ct: Floats
 ) -> Case:
-    """The case with its obstacles and gantry, which the arm's checker takes from there, where their weights say."""
+    """The case with obstacles and gantry moved as their weights say: the arm's checker takes them from it."""
     names = [one.name for one in anatomy.checked]
     of = dict(zip(names, weights.structures.tolist(), strict=True))
 
@@ -154,7 +154,7 @@ def _moved(mesh: TriangleMesh, by_ct: Floats) -> TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class BreathingBody:
-    """A case that breathes, ready to be asked for any position.
+    """A case that breathes, measured at any position of the breath.
 
     Attributes:
         case: The case.
@@ -176,7 +176,7 @@ class BreathingBody:
 
     @cached_property
     def lengths(self) -> Floats:
-        """How far the axes of the n candidates are checked against the k structures, shape (n, k), mm.
+        """Lengths to which the n axes are checked against the k structures, shape (n, k), mm.
 
         Up to the farthest place at which the flange waits at any position.
         """
@@ -185,7 +185,7 @@ class BreathingBody:
         return np.asarray(np.max(at, axis=0))
 
     def paths(self, outward_ct: Floats, s: float) -> SkinPaths:
-        """The skin along paths (n, 3) at a position; entries in the moved skin's own coordinates."""
+        """Skin paths (n, 3) at a position; entries in the moved skin's own coordinates."""
         moved = (1 - self.weights.skin) * self.breathing.moved_ct(s)
         return own_paths(self.case, self.anatomy.skin, outward_ct, moved)
 
@@ -196,7 +196,7 @@ class BreathingBody:
 
     @property
     def margins(self) -> Floats:
-        """Of these, shape (k,), mm."""
+        """Margins of the structures with one, shape (k,), mm."""
         return np.array([self.anatomy.checked[column].margin_mm for column in self.demanding], dtype=np.float64)
 
     def moves_mm(self, low: float, high: float) -> Floats:
@@ -205,7 +205,7 @@ class BreathingBody:
         return np.asarray(abs(high - low) * self.breathing.amplitude_mm * np.abs(1 - weights))
 
     def at(self, rows: Ints, s: float) -> Phase:
-        """Some candidates, ``rows`` (m,), at a position, as if inserted there."""
+        """The phase of candidates ``rows`` (m,) at a position, as if inserted there."""
         case, checked, outward = self.case, self.anatomy.checked, self.candidates.outward_ct[rows]
         moved = self.breathing.moved_ct(s)
         paths = self.paths(outward, s)
@@ -220,7 +220,7 @@ class BreathingBody:
         return Phase(s, rows, verdict, clearance, clearance - self.margins, deflection)
 
     def excess_at(self, rows: Ints, s: float, columns: Ints) -> Floats:
-        """What the surfaces of some structures leave over their margins at a position, shape (m, c), mm.
+        """Clearance beyond the margins of some structures at a position, shape (m, c), mm.
 
         Args:
             rows: Shape (m,), which candidates.
@@ -237,7 +237,7 @@ class BreathingBody:
         return np.asarray(distance - case.needle.radius_mm - self.margins[columns])
 
     def _clearances(self, rows: Ints, shifts_ct: Floats) -> Clearances:
-        """To all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
+        """Clearances to all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
         checked, candidates, radius = self.anatomy.checked, self.candidates, self.case.needle.radius_mm
         clearance = candidates.clearance.distance[rows].copy()
         depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
@@ -253,7 +253,7 @@ class BreathingBody:
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """What some candidates are at one position of the breath.
+    """Verdict and clearances of some candidates at one position of the breath.
 
     Attributes:
         s: The position.
@@ -273,17 +273,17 @@ class Phase:
 
     @property
     def safe(self) -> Bools:
-        """Shape (m,)."""
+        """Which of the candidates are safe at this position, shape (m,)."""
         return np.asarray(self.verdict.reason == Reason.NONE.value)
 
     @property
     def least_excess(self) -> Floats:
-        """Shape (m,), mm; minus infinity where something else than a clearance rejects."""
+        """Least clearance beyond a margin, shape (m,), mm; minus infinity where another reason rejects."""
         near = np.isin(self.verdict.reason, CLEARANCES) | self.safe
         return np.asarray(np.where(near, self.excess.min(axis=1, initial=np.inf), -np.inf))
 
     def of(self, which: Bools) -> Phase:
-        """Of some of the candidates; ``which`` of shape (m,)."""
+        """The phase of some of the candidates; ``which`` of shape (m,)."""
         rows = np.flatnonzero(which)
         arrays = (self.clearance[rows], self.excess[rows], self.deflection[rows])
         return Phase(self.s, self.rows[rows], self.verdict.of(rows), *arrays)
@@ -315,7 +315,7 @@ def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Brea
 
 
 def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
-    """The verdict with those rejected that no measurement shows to be clear between two positions.
+    """The verdict with those candidates rejected that no measurement shows to be clear between two positions.
 
     Args:
         body: The case.
@@ -329,7 +329,7 @@ def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Pha
 
 
 class _Gap(NamedTuple):
-    """Between the positions low and high: m candidates, k structures, what both leave over the margins, (m, k), mm."""
+    """The interval between two positions: m candidates, k structures, excess over the margins (m, k), mm, at both."""
 
     rows: Ints
     columns: Ints
@@ -340,14 +340,14 @@ class _Gap(NamedTuple):
     deflection: Floats
 
     def of(self, rows: Bools, columns: Bools) -> _Gap:
-        """Of some candidates and structures."""
+        """The interval for some candidates and structures."""
         part = np.ix_(rows, columns)
         ends = self.at_low[part], self.at_high[part]
         return _Gap(self.rows[rows], self.columns[columns], self.low, self.high, *ends, self.deflection[rows])
 
 
 LEAST_MM = 0.1
-"""Positions this near to each other are not parted: what is not shown to be clear there counts as too close."""
+"""mm of motion below which an interval is not divided: what is not shown to be clear counts as too close."""
 
 
 def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
@@ -375,7 +375,7 @@ def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
 
 
 def _names(body: BreathingBody, gap: _Gap, left: Floats) -> Texts:
-    """The structure that leaves each candidate least."""
+    """Name of the structure with the least excess for each candidate."""
     names = np.array([body.anatomy.checked[column].name for column in body.demanding], dtype=object)
     return np.asarray(names[gap.columns[left.argmin(axis=1)]])
 
@@ -393,7 +393,7 @@ class MovingWeights(NamedTuple):
 
 
 def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> MovingWeights:
-    """The weights that a case states for its structures.
+    """The weight of every structure of a case that breathes: how much of the target's motion it follows.
 
     The target's own structure moves with the target, and obstacles and the gantry, which the case file describes, not
     at all.
@@ -417,7 +417,7 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
 
 
 def _by_itself(case: Case, structure: Structure) -> float | None:
-    """The weight of what needs no statement; None of all else."""
+    """The weight of a structure that needs no statement; None of all others."""
     if structure.name in {case.target_structure, BEYOND_IMAGE}:  # which the breath has widened already
         return 1.0
     return 0.0 if structure.source == OF_CASE_FILE else None
@@ -436,7 +436,7 @@ OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside of the ga
 
 
 def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
-    """The warnings of a case; none where it declares no breathing.
+    """Warnings about what a breathing case's verdicts mean; none where it declares no breathing.
 
     Raises:
         InputError: See `moving_weights`.

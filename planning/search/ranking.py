@@ -36,7 +36,7 @@ TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach", "safe_cone
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """The order of n safe candidates, by their cost.
+    """Cost, rank and Pareto front of n safe candidates.
 
     Attributes:
         terms: Shape (n, 6), each in 0..1, 0 is best, columns as `TERMS`.
@@ -158,7 +158,7 @@ def pareto_front(terms: Floats) -> NDArray[np.bool_]:
 
 
 DIAGONAL = np.sqrt(2.0)
-"""Of a cell, in steps, at the equator; nearer to the poles cells are narrower."""
+"""Diagonal of a cell, in steps, at the equator; nearer to the poles cells are narrower."""
 
 
 def with_grid_cone(candidates: Candidates) -> Candidates:
@@ -175,7 +175,7 @@ def with_grid_cone(candidates: Candidates) -> Candidates:
 
 
 def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
-    """By how much each safe direction may be off, in any direction, shape (number of safe ones,), rad.
+    """Safe cone of each safe direction: how far it may be off in any direction, shape (safe ones,), rad.
 
     The angle to the nearest direction of the grid that is not safe, or to the nearest beyond the grid, less a cell's
     diagonal. A disc as wide as that diagonal holds a direction of the grid; so where such a disc fits into what is not
@@ -197,7 +197,7 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
 
 
 def _border(grid: AngleGrid, safe: Bools) -> Bools:
-    """Directions among which, or beyond the grid, is one that is not safe and nearest to a safe one, whichever it is.
+    """Unsafe directions next to a safe one, or at the grid's end: among them is one nearest to any safe direction.
 
     They are not safe themselves, and lie beside a safe one or at an end of the azimuths. From any other, the step
     towards the safe one, first in azimuth the shorter way and then in θ, stays in the grid and ends nearer (at a pole

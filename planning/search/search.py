@@ -63,7 +63,7 @@ def search(
 
 
 def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> AxisDistances:
-    """How far the needle's axis is from every structure in every direction."""
+    """Distances of the needle's axis from every structure in every direction."""
     outward = directions.outward_ct
     return engine.measure(case.target_ct, outward, own_lengths(case, anatomy, outward))
 

@@ -18,16 +18,16 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.search.explain import finite
 
 STEP = np.radians(10.0)
-"""Between the directions that look around: each side has about a hundred of them."""
+"""rad between the directions that are tested: each side has about a hundred of them."""
 
 LEAST_OPEN = 0.1
-"""Of a side's solid angle: what is less than that open is no side to puncture from."""
+"""Open fraction of a side's solid angle below which it is no side to puncture from."""
 
 LEAST_SEARCHED = 0.4
 """Of a side's: a grid about the front holds half of what is to the right and to the left."""
 
 ROUND_ABOUT = ("front", "back", "right", "left")
-"""The sides that are spoken of; through feet and head no image shows skin."""
+"""The sides that are reported; through feet and head no image shows skin."""
 
 NOT_SHOWN = "lies on what no image shows"
 """Of the back of a patient without a CT, while the front is open."""
@@ -37,7 +37,7 @@ FRONT, BACK, WHOLE = '"bed"', '{ z = "posterior", x = "head" }', (0.0, 180.0)
 
 
 class Side(NamedTuple):
-    """What is nearest to one axis of the body, seen from the target.
+    """The open directions nearest to one axis of the body, seen from the target.
 
     Attributes:
         name: For a person.
@@ -55,23 +55,23 @@ class Side(NamedTuple):
 
     @property
     def is_open(self) -> bool:
-        """Whether it is a side to puncture from."""
+        """Whether a needle can come from this side."""
         return self.open >= LEAST_OPEN
 
     def document(self) -> dict[str, Any]:
-        """As it stands under ``sides`` of ``--json``."""
+        """The side as one entry of ``sides`` in ``--json``."""
         return {**self._asdict(), "nearest_mm": finite(self.nearest_mm)}
 
 
 class Grid(NamedTuple):
-    """Which directions are searched: the range of theta, degrees, and the entry frame as TOML writes it."""
+    """The directions that are searched: range of theta, degrees, and the entry frame as TOML writes it."""
 
     theta_deg: tuple[float, float]
     frame: str
 
 
 def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
-    """Look around from the target, at the skin, what lies outside of it and the needle's length; organs do not count.
+    """The sides of the body by skin, what lies outside of it and the needle's length; organs do not count.
 
     Args:
         case: The validated case; none of a patient has no sides.
@@ -101,7 +101,7 @@ def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
 
 
 def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) -> list[tuple[str, Bools]]:
-    """Why no needle comes from some directions, and from which, whatever organs are there."""
+    """Why no needle comes from some directions, whatever organs are there, and from which."""
     length, needle = paths.path_length, case.needle
     unseen = np.isnan(length) | ~np.isnan(paths.unknown_depth)
     table = "lies on the table" if anatomy.couch is not None else "is near to where the image ends"
@@ -119,7 +119,7 @@ def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) 
 
 
 def _crosses(mesh: TriangleMesh, target_ct: Floats, outward_ct: Floats, length_mm: float) -> Bools:
-    """Which straight needles meet a surface, shape (n,)."""
+    """Which straight needles intersect a surface, shape (n,)."""
     return np.asarray(crossings(mesh, target_ct, outward_ct, length_mm).count > 0)
 
 
@@ -141,7 +141,7 @@ def grid_of(sides: Sequence[Side]) -> Grid:
 
 
 def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
-    """From where a needle can come, and why not from the others.
+    """The open sides in words, and why the others are closed.
 
     Args:
         sides: As `sides_of` found them.
@@ -160,7 +160,7 @@ def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Both sides as one.
+    """Two sides merged into one.
 
     >>> _listed(["front", "right", "left"])
     'front and sides'

@@ -94,13 +94,13 @@ def _series(weight, e1, e2, x):  # type: ignore[no-untyped-def]
 
 
 DIRECTIONS = 512
-"""Of a mesh, spread evenly: against a million draws P errs by .001, for axis ratios of 10 by .004."""
+"""Directions for a mesh, spread evenly: against a million draws P errs by .001, for axis ratios of 10 by .004."""
 
 QUANTILES = 64
 """Of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
 
 TABLE_STEPS = 256
-"""Of F3 for every standard deviation: straight lines between err by 2e-6."""
+"""Steps of the table of F3 per standard deviation: straight lines between err by 2e-6."""
 
 ROOT_HALF = math.sqrt(0.5)
 ROOT_TWO_OVER_PI = math.sqrt(2.0 / math.pi)
@@ -115,7 +115,7 @@ GRAZING = 0.2
 """Least cosine between ray and normal: a crossing that a surface moves farther than this says is not moved by it."""
 
 ROWS_AT_ONCE = 512
-"""Of covariances, so that a table of rows times crossings stays below some MB."""
+"""Covariances at once: a table of rows times crossings stays below some MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def _areas(mesh: TriangleMesh) -> Floats:
 
 
 def mean_over_faces(mesh: TriangleMesh, cov: Floats) -> float:
-    """Sqrt of the mean of n' S n over a surface, for S of shape (3, 3)."""
+    """Standard deviation along the normals, as the root of the mean of n' S n over a surface, S (3, 3)."""
     area = _areas(mesh)
     size = np.linalg.norm(area, axis=1)
     return float(np.sqrt(np.einsum("ma,ab,mb->", area / (size[:, None] + LEAST_VARIANCE), cov, area) / size.sum()))
@@ -208,7 +208,7 @@ def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, su
 
 @nb.njit(cache=True, error_model="numpy")
 def _directional(x, y, z, ray, depth, sign, table, inverse, chances):  # type: ignore[no-untyped-def]  # numba infers
-    """The sum of the module's docstring, row by row; directions' coordinates apart, so that several go at once."""
+    """The sum of the module's first equation, row by row."""
     weights, lengths, last = np.empty(len(x)), np.empty(len(x)), len(table) - 1.0
     for row in range(len(inverse)):
         S = inverse[row]
@@ -241,7 +241,7 @@ def _with_unknown_size(rays: TargetRays, inverse: Floats, freedom: int) -> Float
 
 
 def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Floats:
-    """The chance that the tip is within a radius of the point that was meant.
+    """The chance that the tip is within a radius of the intended point.
 
     Args:
         cov: Shape (n, 3, 3), mm^2, of tip against that point, any frame.
@@ -260,7 +260,7 @@ def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Fl
 
 
 def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) -> float:
-    """Within which of the point that was meant the tip ends with a chance, mm: `hit_in_ball` the other way round.
+    """Radius about the intended point within which the tip ends with a chance, mm: the inverse of `hit_in_ball`.
 
     Args:
         cov: Shape (3, 3), mm^2, of tip against that point, any frame.
@@ -314,7 +314,7 @@ def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) ->
 
 @dataclass(frozen=True, eq=False)
 class Proximity:
-    """How n needles pass k structures; CT frame.
+    """Distances, gradients and deviations of n needles and k structures; CT frame.
 
     Attributes:
         distance: Shape (n, k), of the axis from the surface, mm.
@@ -349,7 +349,7 @@ def proximity(
 
 @nb.njit(cache=True, error_model="numpy")
 def _first_order(depth, normal, outward, cov, surface, gradient, deviation):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill g = (n; s u x n) and sigma of every pair."""
+    """Fill the gradients g = (n; s u x n) and deviations sigma of every pair."""
     for i in range(len(outward)):
         ux, uy, uz = outward[i]
         for j in range(depth.shape[1]):
@@ -380,7 +380,7 @@ def touch_chance(near: Proximity, threshold_mm: Floats | float, freedom: int | N
 
 
 def touching_any(touch: Floats) -> Floats:
-    """At most the chance to touch any of k structures, shape (n,), from the chances (n, k) to touch each."""
+    """Upper bound of the chance to touch any of k structures, shape (n,), from the chances (n, k) to touch each."""
     return np.asarray(np.minimum(1.0, touch.sum(axis=1)))
 
 

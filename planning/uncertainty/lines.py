@@ -64,7 +64,7 @@ def line_chance(near: NearFaces, doubt: NeedleUncertainty, length: float, thresh
 
 
 def _slack(problem: Problem) -> float:
-    """Of the nominal needle, mm."""
+    """Slack of the nominal needle: its distance beyond the threshold, mm."""
     triangles, faces, blocks, origin, outward, length, threshold = problem
     tip = (float(origin[0]), float(origin[1]), float(origin[2]))
     along = (float(outward[0]), float(outward[1]), float(outward[2]))
@@ -88,7 +88,7 @@ def by_lines(
 
 
 class Lines(NamedTuple):
-    """Where n lines lie.
+    """Offsets and sizes of n lines.
 
     Attributes:
         offsets: Shape (n, 5), standard deviations, four of the pose and one mixed with the surface.
@@ -103,7 +103,7 @@ class Lines(NamedTuple):
 
 @cache
 def few_lines(surface: bool) -> Lines:
-    """The small rule."""
+    """The 25 lines of the small rule."""
     signs = list(itertools.product((1.0, -1.0), repeat=2))
     pairs = list(itertools.combinations(range(4), 2))
     offsets, weights = np.zeros((1 + len(signs) * len(pairs), 5)), np.full(1 + len(signs) * len(pairs), 1.0 / 36.0)
@@ -118,7 +118,7 @@ def few_lines(surface: bool) -> Lines:
 
 @cache
 def many_lines(surface: bool, count: int, freedom: int | None) -> Lines:
-    """Spread evenly over a normal, and over the sizes that are as likely."""
+    """Lines spread evenly over a normal, with sizes that are equally likely."""
     mixed = 1 if surface else 0
     drawn = _sobol(4 + mixed + (freedom is not None), count)
     normal = ndtri(np.clip(drawn[:, : 4 + mixed], 1e-12, 1 - 1e-12))
@@ -178,7 +178,7 @@ def line_basis(slope: Floats, by_surface: float, by_pose: float) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What must not be touched about one target; CT frame, mm.
+    """The structures that must not be touched about one target; CT frame, mm.
 
     Attributes:
         blocks: The faces of each of the k structures.
@@ -193,7 +193,7 @@ class Surroundings:
 
 @dataclass(frozen=True, eq=False)
 class Needles:
-    """n needles and the doubt about them.
+    """n needles with their covariances and proximity to the structures.
 
     Attributes:
         outward_ct: Shape (n, 3), unit.
@@ -211,7 +211,7 @@ class Needles:
 
 
 def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first: Floats, wanted: Bools) -> Floats:
-    """First-order chances, those that are wanted refined.
+    """First-order chances with the wanted ones refined by line sampling.
 
     A structure of which no face is within the needle's reach keeps its first order: it is touched less than once in
     100,000 times.
@@ -260,7 +260,7 @@ SIZES = 16
 
 @dataclass(frozen=True, eq=False)
 class NeedleUncertainty:
-    """One needle, and how it may be displaced; CT frame, mm and rad.
+    """One needle and the distribution of its displacement; CT frame, mm and rad.
 
     Attributes:
         origin: Shape (3,), the tip's own place, where the axis starts.
@@ -305,7 +305,7 @@ class NeedleUncertainty:
 def needle_uncertainty(
     origin: Floats, outward: Floats, cov_ct: Floats, surface_mm: float, freedom: int | None = None
 ) -> NeedleUncertainty:
-    """From Sigma6.
+    """The uncertainty of one needle from its Sigma6.
 
     Args:
         origin: Shape (3,), mm, the covariance's point of reference.
@@ -328,7 +328,7 @@ def _scales(cov: Floats) -> Floats:
 
 
 def _balanced(cov: Floats) -> Floats:
-    """Correlations."""
+    """A covariance scaled to correlations."""
     scale = np.where(_scales(cov) > 0, _scales(cov), 1.0)
     return np.asarray(cov / np.outer(scale, scale))
 
@@ -468,7 +468,7 @@ def _walk(scene, start, ahead, hint):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, error_model="numpy")
 def _swallowed(scene, start, ahead, beta):  # type: ignore[no-untyped-def]
-    """Whether a needle that is near no face is inside: its tip came through an odd number of them.
+    """Whether a needle that is near no face lies inside a structure: its tip crossed an odd number of faces.
 
     Faces that the tip can come through are near the nominal needle, all of them.
     """

@@ -30,7 +30,7 @@ from puncture_twin.planning.uncertainty.sources import reading_parts
 
 
 def not_cancelled(fit: FitUncertainty, J: Floats, target_base: Floats) -> Floats:
-    """G = J_f - X L J: the arm's error Jacobian, the part that the registration takes off taken off.
+    """G = J_f - X L J: the arm's error Jacobian without the part that the registration cancels.
 
     Where nobody says how the arm touched the markers, sqrt(2) J_f stands for it: errors of equal size at the markers
     and at the target, independent.
@@ -57,7 +57,7 @@ class Bend(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """Answers how far the needle may be off, for any configuration that puts its tip on the target.
+    """The needle's pose error in any configuration that puts its tip on the target.
 
     Attributes:
         model: The arm.
@@ -91,7 +91,7 @@ class PoseError:
         return straight if self.bend is None else straight + _bend_covariance(self.model, q, self.bend)
 
     def tip_covariance(self, q: Floats) -> Floats:
-        """Of the tip against the point that was meant, its reading included: shape (n, 3, 3), mm^2, base axes."""
+        """Covariance of the tip about the intended point, its reading included: (n, 3, 3), mm^2, base axes."""
         return self.covariance(q)[:, :3, :3] + self.target_covariance
 
     def covariance_ct(self, q: Floats) -> Floats:
@@ -105,12 +105,12 @@ class PoseError:
         return np.asarray(R.T @ self.tip_covariance(q) @ R)
 
     def surface_cov_ct(self, voxel_ct: Floats | None) -> Floats:
-        """`ErrorModel.surface_cov_ct`, scaled as all that is declared."""
+        """`ErrorModel.surface_cov_ct`, scaled like everything that is declared."""
         return np.asarray(self.fit.test.scale**2 * self.errors.surface_cov_ct(voxel_ct))
 
     @property
     def target_covariance_ct(self) -> Floats:
-        """Of the target's reading, shape (3, 3), mm^2, CT axes, scaled."""
+        """Covariance of the target's reading, shape (3, 3), mm^2, CT axes, scaled."""
         return np.asarray(self.fit.test.scale**2 * self.errors.target_cov_ct)
 
     @property
@@ -127,7 +127,7 @@ class PoseError:
         return parts if self.bend is None else {**parts, "bend": _bend_covariance(self.model, q, self.bend)}
 
     def _reading_parts(self, count: int) -> dict[str, Floats]:
-        """Of the markers: in the CT, at the touch, and by the arm's repeatability there; the same for all rows."""
+        """Parts of the markers: CT reading, touch, and the arm's repeatability there; the same for all rows."""
         at, noise = self.fit.map_at(self.target_base), self.fit.noise
         marks = at.reshape(6, -1, 3)
         R, touch = self.fit.R_base_ct, self.errors.touch_mm**2 * np.eye(3)
@@ -143,7 +143,7 @@ class PoseError:
         return {source: np.broadcast_to(cov, (count, 6, 6)) for source, cov in covs.items()}
 
     def _arm_parts(self, J: Floats) -> dict[str, Floats]:
-        """Of the arm's parameters, of its drift since the touches, and of one arrival at the target."""
+        """Parts of the arm's parameters, of its drift since the touches, and of one arrival at the target."""
         G, eta = not_cancelled(self.fit, J, self.target_base), self.fit.noise.eta_variances
         found = {source: _outer(G[..., part], eta[part]) for source, part in PARAMETERS.items()}
         Jq, arm = J[..., PARAMETERS["joint"]], self.errors.arm
@@ -153,7 +153,7 @@ class PoseError:
 
 
 def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
-    """Of a tip off by d to a side drawn evenly, the shaft rotated about its clamp, shape (n, 6, 6), base axes.
+    """Covariance of a tip off by d to a uniform side, the shaft rotated about its clamp, (n, 6, 6), base axes.
 
     For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h, and
     by d y with the shaft about -x; each with half the variance.
@@ -202,7 +202,7 @@ class ErrorBudget:
 
 
 def expected_error_mm(error: PoseError, q: Floats) -> float:
-    """The tip's expected (rms) error against the point that was meant, of one configuration (6,), rad."""
+    """The tip's expected (rms) error about the intended point at one configuration (6,), rad; mm."""
     return float(np.sqrt(np.trace(error.tip_covariance(q[None])[0])))
 
 
@@ -229,7 +229,7 @@ def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudg
 
 
 class AnyPose(NamedTuple):
-    """Bounds of a pose's error, whatever the configuration; see above.
+    """Bounds of the needle's pose error over all configurations that put its tip on the target.
 
     Every column of the arm's error Jacobian is bounded by its lever, and a lever's length by the chain between tip and
     joint. For matrices |A + B| <= |A| + |B| and |[A B]|^2 <= |A|^2 + |B|^2 (largest singular values), so that for all q
@@ -251,7 +251,7 @@ class AnyPose(NamedTuple):
     deviation_rad: float
 
     def of_distance(self, depth_mm: Floats, surface_mm: Floats) -> Floats:
-        """Bound of the standard deviation of distances whose nearest axis points lie no deeper than this, (k,), mm."""
+        """Bound of the deviation of distances with nearest axis points no deeper than this, (k,), mm."""
         return np.hypot(self.deviation_mm + depth_mm * self.deviation_rad, surface_mm)
 
     def margin(
@@ -312,7 +312,7 @@ def any_pose(error: PoseError) -> AnyPose:
 
 
 def _levers_mm(error: PoseError) -> Floats:
-    """Of each frame's origin, 0 to 6, from a tip on the target: the chain between them from either end, shape (7,)."""
+    """Bounds of distances of frame origins 0 to 6 from a tip on the target, shape (7,): the chain from either end."""
     model, target = error.model, error.target_base
     links = np.hypot(model.a, model.d)
     from_tip = error.tip_mm + np.append(np.cumsum(links[::-1])[::-1], 0.0)

@@ -32,7 +32,7 @@ SWEEPS = 4
 
 
 class Candidates(NamedTuple):
-    """Joints that keep the tip on a point, each shape (n, 6), rad; the nearest to the insertion's first."""
+    """Joints (n, 6), rad, that keep the tip on a point; the nearest to the insertion's first."""
 
     alike: Floats
     """On the insertion's own branch."""

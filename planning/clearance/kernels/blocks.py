@@ -43,12 +43,12 @@ class Blocks:
 
     @property
     def nbytes(self) -> int:
-        """What the arrays hold."""
+        """Bytes of the arrays."""
         return sum(array.nbytes for array in (self.triangles, self.local, self.center, self.disc, self.base))
 
 
 def block_order(mesh: TriangleMesh) -> NDArray[np.int32]:
-    """The order in which a surface's triangles fill its blocks, shape (m,): what takes longest to find of them."""
+    """Order in which a surface's triangles fill its blocks, shape (m,): half of the time of packing."""
     return kd_order(_middles(mesh.vertices, mesh.faces), LANES).astype(np.int32)
 
 

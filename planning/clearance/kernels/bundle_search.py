@@ -113,7 +113,7 @@ def _others(needle, groups, m, group, low, waiting, scratch, answer):  # type: i
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _contact_from(chosen, group, lane, u, slack):  # type: ignore[no-untyped-def]  # numba infers
-    """Depth before which an axis cannot meet what a disc holds: where it enters its sphere and its slab, mm."""
+    """Depth before which an axis cannot touch a disc's content: where it enters its sphere and its slab, mm."""
     center = (chosen[group, 0, lane], chosen[group, 1, lane], chosen[group, 2, lane])
     normal = (chosen[group, 3, lane], chosen[group, 4, lane], chosen[group, 5, lane])
     h, slope = chosen[group, 7, lane] + slack, _dot(normal, u)

@@ -143,7 +143,7 @@ APART = 8
 
 
 class Scratch(NamedTuple):
-    """Room for one bundle of at most 16 directions.
+    """Scratch arrays for one bundle of at most 16 directions.
 
     Attributes:
         found: Shape (r,), the blocks that the bundle may have to look at.
@@ -177,7 +177,7 @@ class Scratch(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a search writes: squared distance (mm^2), depth (mm), nearest triangle of each axis; `COUNTED`."""
+    """Output of a search: squared distance (mm^2), depth (mm), nearest triangle of each axis; `COUNTED`."""
 
     square: NDArray[np.float64]
     depth: NDArray[np.float64]
@@ -202,7 +202,7 @@ class NeedleAxes(NamedTuple):
 
 
 def scratch_for(groups: int) -> Scratch:
-    """Room for bundles that may have to look at all of ``groups`` groups of blocks."""
+    """Scratch arrays for bundles that may have to test all of ``groups`` groups of blocks."""
     size = groups + 1
     return Scratch(
         found=np.empty(size * LANES, np.int64),

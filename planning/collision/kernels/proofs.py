@@ -63,7 +63,7 @@ class ProofScene(NamedTuple):
 
 
 class Movers(NamedTuple):
-    """What moves in each check, and a sphere about it in the frame that it moves with."""
+    """The moving body of each check, and a sphere about it in the frame that it moves with."""
 
     of_check: Ints
     frames: Ints
@@ -72,7 +72,7 @@ class Movers(NamedTuple):
 
 
 class ProofScratch(NamedTuple):
-    """What the search for a proof remembers and where it works: see :func:`scratch`."""
+    """Memory and scratch of the search for a proof: see :func:`scratch`."""
 
     axes: Floats
     """Shape (k, 3): the last direction of each check; zero to begin anew."""
@@ -88,7 +88,7 @@ class ProofScratch(NamedTuple):
 
 @nb.njit(cache=True)
 def scratch(checks, hulls):
-    """Room to work in for so many checks and hulls."""
+    """Scratch for so many checks and hulls."""
     axes, corners, spheres = np.zeros((checks, 3)), np.zeros((checks, 2), np.int64), np.empty((hulls, 3))
     stacks = np.empty(STACK, np.int64), np.empty(STACK, np.int64)
     return ProofScratch(axes, corners, spheres, stacks[0], stacks[1], np.empty((3, 4)), np.empty((4, 3)))
@@ -246,7 +246,7 @@ def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
 
 @allocation_free()
 def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
-    """How far a body may move while each joint turns by no more than a fraction of ``turns`` (6,), rad, either way.
+    """How far a body may move while each joint rotates by at most a fraction of ``turns`` (6,), rad, either way.
 
     Fills ``paths`` (7,), mm: entry j bounds the motion against the frame before joint j, the arm standing at ``frames``
     (7, 4, 4) in the middle. A point's distance from axis j is at most that of the body's sphere, plus what the joints
@@ -264,7 +264,7 @@ def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
 
 @nb.njit(cache=True)
 def clear_about(scene, movers, frames, turns, work, gaps, unproven):
-    """Which checks are not proven clear at some states and wherever each joint turns by ``turns`` either way from them.
+    """Which checks are not proven clear at some states and wherever each joint rotates by ``turns`` from them.
 
     Args:
         scene: See :class:`ProofScene`.

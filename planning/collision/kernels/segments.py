@@ -311,7 +311,7 @@ class Segment(NamedTuple):
 
 
 class SegmentScratch(NamedTuple):
-    """Where a segment is checked: see :func:`segment_scratch`. Nothing in it outlasts the segment."""
+    """Scratch in which a segment is checked: see :func:`segment_scratch`. Nothing in it outlasts the segment."""
 
     work: ProofScratch
     kept: Floats
@@ -329,7 +329,7 @@ class SegmentScratch(NamedTuple):
 
 
 def segment_scratch(scene: ProofScene, movers: Movers) -> SegmentScratch:
-    """Room for the checks of a cell."""
+    """Scratch for segments of a workcell's checks."""
     checks, count = len(scene.checks), len(movers.frames)
     lists, spans = np.empty((2, checks << HALVINGS), np.int64), np.empty((2, 2 << HALVINGS, 2), np.int64)
     work, paths = scratch(checks, len(scene.hulls.radii)), np.empty((count, 7))

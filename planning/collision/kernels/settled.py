@@ -52,7 +52,7 @@ class Triangle(NamedTuple):
 
 
 def triangle_scratch(hulls: Hulls, stack: int) -> Triangle:
-    """Room for a triangle beside the hulls, and for a descent as deep as ``stack``."""
+    """Scratch for a triangle tested against hulls, and for a descent as deep as ``stack``."""
     count, spare = len(hulls.corners), np.zeros((3, 3))
     starts = np.concatenate([hulls.neighbour_starts, hulls.neighbour_starts[-1] + np.array([2, 4, 6])])
     ends = np.concatenate([hulls.neighbours, count + np.array([1, 2, 0, 2, 0, 1])])

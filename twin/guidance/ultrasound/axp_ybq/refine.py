@@ -199,9 +199,10 @@ TEXT = ("mm per unit of P along u: {:.3f} times", "along v: {:.3f} times", "skew
 class ImageErrors(NamedTuple):
     """The errors of the image that the residuals show.
 
-    A tip that is read as p lies at S p, S = [[1 + a, k], [0, 1 + b]]: mm per unit of P that are off, axes not square. A direction read as v points along S v, rotated by w. The residuals' derivatives by (a, b, k, w) join the
-    Jacobian, and the F-test of all of them together says whether residuals that are only noise would be so well
-    explained: once in a hundred recordings. The calibration does not use them; what they leave at the tips
+    A tip that is read as p lies at S p, S = [[1 + a, k], [0, 1 + b]]: mm per unit of P that are off, axes not square.
+    A direction read as v points along S v, rotated by w. The residuals' derivatives by (a, b, k, w) join the Jacobian,
+    and the F-test of all of them together says whether residuals that are only noise would be so well explained: once
+    in a hundred recordings. The calibration does not use them; what they leave at the tips
     counts in its error.
     """
 
