@@ -126,7 +126,7 @@ def _first_stop_at(lengths, path, depths, at_least, fastest):  # type: ignore[no
 
 
 def reach_margin(model: UrModel, q: Floats) -> float:
-    """The least over a motion of each joint's distance to its limits over a quarter turn, and of the singularity terms.
+    """Margin of a motion: least of each joint's distance to its limits over a quarter turn, and the singularity terms.
 
     Args:
         model: The arm.

@@ -137,7 +137,7 @@ def wrist_angles(lengths, R, p, c1, s1, flip):  # type: ignore[no-untyped-def]  
 
 @allocation_free()
 def _bend(lengths, x, y):  # type: ignore[no-untyped-def]  # numba infers
-    """Cosine of the elbow that reaches (x, y) in the shoulder's plane. NaN where that is too far or too near."""
+    """Cosine of the elbow that reaches (x, y) in the shoulder's plane; NaN where that is too far or too near."""
     a2, a3 = lengths[1], lengths[2]
     cosine = (x * x + y * y - a2 * a2 - a3 * a3) / (2.0 * a2 * a3)
     if abs(cosine) <= 1.0:

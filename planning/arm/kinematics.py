@@ -25,7 +25,7 @@ from puncture_twin.planning.formats.points import JointRecording
 
 
 def _rows(q: Floats) -> Floats:
-    """Configurations (..., 6) as one new (n, 6): a copy, since read-only arrays would be compiled for once more."""
+    """Configurations (..., 6) as a new array (n, 6): read-only arrays would be compiled for once more."""
     return np.array(q, dtype=np.float64, order="C").reshape(-1, 6)
 
 
@@ -232,7 +232,7 @@ ELBOW_DIGITS = 6
 
 
 class Singularity(NamedTuple):
-    """How far a configuration is from the three singularities of a UR arm; each 0 (singular) to 1. Shapes (...)."""
+    """Distance of a configuration from the three singularities of a UR arm; each 0 (singular) to 1. Shapes (...)."""
 
     shoulder: Floats
     """In-plane distance of the wrist centre from axis 1, over the longest possible."""
@@ -273,7 +273,7 @@ def away_from_singularities(model: UrModel, q: Floats) -> NDArray[np.bool_]:
 
 
 def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> Floats:
-    """Of configurations the one farthest from singular; of equals the one whose elbow lies farthest along a direction.
+    """The configuration farthest from singular; of equals the one whose elbow lies farthest along a direction.
 
     A branch and its mirror image, and all rolls about the flange's axis, are equally far but for rounding: a choice
     among them by the last bit differs between machines.
@@ -316,7 +316,7 @@ def least_term(lengths, q):  # type: ignore[no-untyped-def]  # numba infers
 
 
 class SpeedLimits(NamedTuple):
-    """What a case allows, and its plan keeps. The names are the keys of ``[robot]``."""
+    """Speed limits that a case allows, and its plan keeps. The names are the keys of ``[robot]``."""
 
     tip_speed_mm_s: float = 250.0
     """Of the needle's tip, on the approach: what ISO 10218-1 calls reduced speed."""
@@ -410,7 +410,7 @@ def check_arm(
     where: str | Path,
     any_tool: bool = False,
 ) -> None:
-    """Refuse joints that do not put the tool where the same file says that it was.
+    """Refuse joints of another arm: ones that do not put the tool where the same file says that it was.
 
     A UR3e's joints read as a UR3's are 18 mm off, and six angles alone do not show it. But a recording often states the
     same thing twice: a controller's own pose with its joints, a touched point, a flange. With the arm's nominal lengths

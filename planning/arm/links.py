@@ -110,7 +110,7 @@ def _convex_links(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
 
 
 def _packed(links: Sequence[Sequence[TriangleMesh]]) -> Arrays:
-    """The links' pieces for the cache, and how many each link has."""
+    """The links' pieces for the cache, and the number of pieces of each link."""
     return {**packed_meshes([piece for link in links for piece in link]), "pieces": np.array([*map(len, links)])}
 
 
@@ -127,7 +127,7 @@ def visual_links(model: UrModel) -> tuple[Link, ...]:
 
 
 def _link_shapes(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
-    """The collision shapes of the seven bodies, turned from the URDF's link frames to ours: a constant motion each."""
+    """The collision shapes of the seven bodies, from the URDF's link frames to ours: a constant motion each."""
     urdf = model_urdf(model)
     T_link_urdflink = np.linalg.inv(link_poses(model, np.zeros(6))) @ urdf.body_poses(np.zeros(6))
     return [

@@ -100,7 +100,7 @@ class Tool:
 
     @property
     def holder_length_mm(self) -> float:
-        """From the flange to where the needle leaves the holder, mm."""
+        """Distance from the flange to where the needle leaves the holder, mm."""
         return self.needle_length_mm - self.shaft_mm
 
     @property

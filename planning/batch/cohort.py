@@ -130,7 +130,7 @@ def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
 
 
 def _rows(content: bytes, path: Path) -> Any:
-    """The lines, as a reader that counts them."""
+    """Lines of a CSV as a reader that counts them."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -182,7 +182,7 @@ def target_option(text: str) -> dict[str, Any]:
 
 
 def _value(cell: str) -> Any:
-    """A cell as TOML reads it: a number, a list, a text in quotes; else it is a text as it stands."""
+    """A cell as TOML reads it: a number, a list, a text in quotes; else its own text."""
     try:
         return tomllib.loads(f"value = {cell}\n")["value"]
     except (tomllib.TOMLDecodeError, KeyError, RecursionError):
@@ -207,7 +207,7 @@ AXES = {
 
 
 class CohortFile(Section):
-    """The whole file."""
+    """Schema of a whole ``cohort.toml``."""
 
     schema_: SchemaOne = Field(1, alias="schema")
     cases: Annotated[tuple[Text, ...], Field(min_length=1)]
@@ -267,7 +267,7 @@ def _axis(stated: Any, axis: str, kind: str, path: Path) -> list[_Choice]:
 
 
 def _table(values: Any, kind: str, where: str) -> Mapping[str, Any]:
-    """A table as it stands; of a target a point, of an arm its model, without the key."""
+    """The option's table of the case file; of a target a point, of an arm its model, without the key."""
     if isinstance(values, Mapping):
         return values
     if kind == "target" and isinstance(values, list | tuple):
@@ -305,4 +305,4 @@ class CohortCase:
 
 
 MOST_CASES = 1_000_000
-"""Of one cohort: more is a slip in a grid of options."""
+"""Cases of one cohort: more is a slip in a grid of options."""

@@ -59,7 +59,7 @@ class Part(NamedTuple):
 
     @property
     def text(self) -> str:
-        """As it is typed."""
+        """The part as it is typed."""
         return f"{self.number}/{self.parts}"
 
     def of(self, items: Sequence[Item]) -> Sequence[Item]:
@@ -111,7 +111,7 @@ ALLOWED_AT_ONCE = "one run at a time, parts beside each other (--part i/n), or a
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be run, and how.
+    """Cases to be run, and how.
 
     Attributes:
         part: Of the plan.
@@ -128,7 +128,7 @@ class Request:
 
 @dataclass
 class RunCounts:
-    """What a run did.
+    """Counts of one run.
 
     Attributes:
         planned: Cases of the part.
@@ -203,7 +203,7 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
 
 
 def distinct(cases: Iterable[PlannedCase]) -> list[PlannedCase]:
-    """The first case of each id: of the same bytes, options and version the answer is one."""
+    """The first case of each id: the same bytes, options and version have one answer."""
     return list({one.id: one for one in reversed(list(cases))}.values())[::-1]
 
 
@@ -214,7 +214,7 @@ def _ends(tasks: Sequence[CaseTask], request: Request, elsewhere: RunTasks | Non
 
 
 def _kept_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | None:
-    """The row of a case; what is there otherwise, a failure of the program or half a result, goes."""
+    """The stored row of a case; a failure of the program or half a result is removed."""
     row = read_row(out, planned.id)
     if is_final(row):
         return row
@@ -224,7 +224,7 @@ def _kept_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | N
 
 @contextmanager
 def running(out: Path, part: Part) -> Iterator[Path]:
-    """Hold a part of a cohort; yields a folder for what is being written, which goes in the end.
+    """Lock a part of a cohort; yields a folder for drafts, which is removed in the end.
 
     The system frees the locks of a process that dies, and its folder is removed by the next run of the same part, or of
     the whole.
@@ -269,7 +269,7 @@ COPIES = 2
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of a cohort.
+    """Estimated time, memory and disk of a cohort.
 
     Attributes:
         cases: In all.
@@ -289,7 +289,7 @@ class Estimate:
 
 
 def estimate(cases: Sequence[PlannedCase]) -> Estimate:
-    """Run the first case that can be read twice, the second time warm, and take all others to be like it.
+    """Estimate a cohort from its first case that can be read, run twice, the second time warm.
 
     Args:
         cases: The plan's.
@@ -310,7 +310,7 @@ def estimate(cases: Sequence[PlannedCase]) -> Estimate:
 
 @dataclass
 class CohortState:
-    """Cases of a plan, each counted once.
+    """State of a cohort's cases, each counted once: done, failed, missing or stale.
 
     Attributes:
         planned: Cases in all.
@@ -375,7 +375,7 @@ class CohortState:
 
 
 def cohort_state(out: Path, progress: Count) -> CohortState:
-    """Look at every case of a plan.
+    """The state of every case of a plan.
 
     Args:
         out: The cohort's folder.
@@ -399,7 +399,7 @@ KEPT = "puncture_twin_kept"
 
 
 class _Kept:
-    """Of one worker process. Its threads run one case at a time: FCL's objects are moved for each question."""
+    """Cache of one worker process. Its threads run one case at a time: FCL's objects are moved for each query."""
 
     def __init__(self) -> None:
         self.memory = Memory(MEMORY_BYTES)
@@ -407,7 +407,7 @@ class _Kept:
 
 
 def on_scheduler(address: str) -> RunTasks:
-    """Whoever runs cases on a scheduler's workers.
+    """A function that runs cases on a scheduler's workers.
 
     Args:
         address: Such as ``tcp://10.0.0.1:8786``.
@@ -456,7 +456,7 @@ def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Gene
 
 
 def _killed(task: CaseTask) -> CaseEnd:
-    """Its row; or the result that was there before its worker died."""
+    """The row of a case that killed its workers; or the result that was there before."""
     return ended(task) or commit_failure(task, WORKER_DIED)
 
 

@@ -43,12 +43,12 @@ WritePage = Callable[[CaseContext, Candidates, Path], None]
 BAD_INPUT = 2
 
 READY = "ready"
-"""A worker's first word: its modules are loaded."""
+"""A worker's first message: its modules are loaded."""
 
 
 @dataclass(frozen=True)
 class CaseTask:
-    """One case to be run; whoever runs it needs nothing else.
+    """One case to be run, with all that a worker needs.
 
     Attributes:
         planned: The case.
@@ -106,7 +106,7 @@ def run_case(task: CaseTask, memory: Memory = NO_MEMORY) -> CaseEnd:
 
 
 def ended(task: CaseTask) -> CaseEnd | None:
-    """How a case has ended already; None where it has no row."""
+    """The end of a case that has a row already; None without one."""
     row = read_row(task.out, task.planned.id)
     return None if row is None else CaseEnd(task.planned.id, row["exit_code"], row["reason"])
 
@@ -168,7 +168,7 @@ def _committed(
 
 
 def work(connection: Connection, memory_bytes: int) -> None:
-    """Run what comes until nothing more does.
+    """Run tasks from the queue until none is left.
 
     Args:
         connection: Gives `CaseTask`, takes `READY` and then a `CaseEnd` for each.

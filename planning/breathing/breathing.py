@@ -22,7 +22,7 @@ from puncture_twin.planning.formats.labels.naming import ByName
 
 @dataclass(frozen=True, eq=False)
 class Breathing:
-    """What a case declares of the breath; mm.
+    """The breathing that a case declares; mm.
 
     Attributes:
         amplitude_mm: b, of the target, from exhale to full inhale.
@@ -55,7 +55,7 @@ class Breathing:
 
     @property
     def in_window(self) -> Bools:
-        """Which of `positions` the gate lets through, shape (m,)."""
+        """Which of `positions` lie in the gate's window, shape (m,)."""
         s = self.positions
         return np.asarray(s <= (1.0 if self.gate is None else self.gate))
 
@@ -74,7 +74,7 @@ class Breathing:
 
     @property
     def window_text(self) -> str:
-        """When a safe candidate is safe. It never says that a needle may stay while the patient breathes."""
+        """When a safe candidate is safe, in words; never that a needle may stay while the patient breathes."""
         if self.gate is None and not self.whole:
             return "at exhale, if inserted there; no other phase was looked at"
         if self.gate is None:
@@ -130,4 +130,4 @@ def mean_square_within(position: float, exponent: int, about: float) -> float:
 
 
 NODES = 32
-"""Of Gauss and Legendre: powers of a sine up to the 24th are exact to 1e-12 over a quarter of its period."""
+"""Nodes of Gauss and Legendre: powers of a sine up to the 24th are exact to 1e-12 over a quarter period."""

@@ -89,7 +89,7 @@ class Cells:
         return np.where(wide > WIDEST_BETA / 2, "b", best)
 
     def take(self, rows: NDArray[np.int64] | Bools) -> Cells:
-        """Some of the cells."""
+        """Some of the cells, by rows."""
         return Cells(self.theta[rows], self.beta[rows])
 
     def cones(self, R_ct_entry: Floats) -> Cones:
@@ -103,7 +103,7 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Cones:
-    """What encloses n cells, in the CT frame.
+    """Cones that enclose n cells, in the CT frame.
 
     Attributes:
         centres: Shape (n, 3), unit, the middle of each cell.

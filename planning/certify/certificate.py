@@ -71,10 +71,10 @@ CERTIFIED = (
 """The constraints that hold all over a safe cell."""
 
 TOUCH_CERTIFIED = "chance to touch each structure: at most {:g}"
-"""That too, where a chance was asked for; margins are then so wide that a cell is rejected for it."""
+"""Also certified where a chance was stated; margins are then so wide that a cell is rejected for it."""
 
 NOT_CERTIFIED = ("reach of the arm", "approach of the arm", "limits of chances (min_hit, max_touch)")
-"""What a certificate says nothing about."""
+"""Constraints that a certificate does not prove."""
 
 PROVED_SAFE, REJECTED, UNDECIDED = "SRU"
 """Letters of the leaves in the tree; lower-case letters are splits (`puncture_twin.planning.certify.cells.SPLITS`)."""
@@ -82,7 +82,7 @@ PROVED_SAFE, REJECTED, UNDECIDED = "SRU"
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Which directions are proven safe, which are proven not to be, and which cells are too small to say.
+    """A certified map: directions proven safe, proven rejected, and cells too small to decide.
 
     Attributes:
         question: What it answers.
@@ -118,7 +118,7 @@ class Certificate:
         return f"case {self.question.case_name}, {len(self.verdict):,} cells to {np.degrees(self.size):g} deg: {areas}"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
+        """HTML for a notebook."""
         return certificate_html(self)
 
     @cached_property
@@ -140,7 +140,7 @@ class Certificate:
         return found
 
     def safe_cone(self, outward_ct: Floats) -> Floats:
-        """By how much each direction may be off, in any direction, and still be proven safe; shape (n,), rad.
+        """Angle by which each direction may be off in any direction and still be proven safe, shape (n,), rad.
 
         0 for a direction in a cell that is not safe, or outside the cap: nothing is proven there.
 

@@ -81,7 +81,7 @@ class _Cell:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What is proven all over a cell: which triangles may be near, the skin, where the flanges of waiting needles are.
+    """Facts proven all over a cell: triangles that may be near, the skin, the flanges of waiting needles.
 
     Those count along which a tip may wait; at least and at most so far from the target, mm.
     """
@@ -170,7 +170,7 @@ class _Checker:
         return Verification(*(int((self._certificate.verdict == letter).sum()) for letter in "SRU"))
 
     def _learn(self, cell: _Cell, whole: _Known) -> _Known:
-        """What is known of a cell beyond what is known of the whole that it is part of."""
+        """Facts of a cell beyond those of the whole that it is part of."""
         question = self._question
         if cell.rho > WIDEST:
             return whole
@@ -194,7 +194,7 @@ class _Checker:
         return organs[~_apart(self._organs[organs], limit, cell, length)]
 
     def _flange(self, skin: SkinFacts, known: tuple[float, float]) -> tuple[float, float]:
-        """Where the flanges are by the skin's facts, and by what was known before (lemma 9)."""
+        """Bounds of the flanges by the skin's facts, and by those known before (lemma 9)."""
         longest, largest = self._question.longest, self._question.max_skin_angle
         shallow, steep = max(skin.least_angle - ANGLE_PAD_RAD, 0.0), skin.largest_angle + ANGLE_PAD_RAD
         least = waiting_flange(self._needle, min(skin.least_skin, longest), min(shallow, largest))
@@ -218,7 +218,7 @@ class _Checker:
             raise InputError(what, where="certificate", allowed="claims that follow from the case")
 
     def _safe(self, known: _Known) -> bool:
-        """No structure comes near, and the skin is met once, soon enough and steeply enough."""
+        """Whether no structure comes near, and the skin is crossed once, soon enough and steeply enough."""
         lost = any(self._inside) or self._even
         return not lost and len(known.organs) == 0 and known.skin_good
 
@@ -294,7 +294,7 @@ def _apart(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools
 
 
 def _before_own_plane(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools:
-    """Where every axis of the cell ends before the triangle's own plane, or leads away from it."""
+    """Which triangles every axis of the cell ends before, or leads away from."""
     normal = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     height = np.einsum("kci,ki->kc", corners, normal)
     side = np.where(height[:, :1] >= 0.0, 1.0, -1.0)

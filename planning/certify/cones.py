@@ -40,7 +40,7 @@ class Lists:
 
     @classmethod
     def one(cls, items: Ints) -> Lists:
-        """A single list."""
+        """Lists with a single list."""
         return cls(np.array([0, len(items)]), items)
 
     def take(self, rows: Ints) -> Lists:

@@ -47,7 +47,7 @@ class Organs:
 
 @dataclass(frozen=True, eq=False)
 class OrganFacts:
-    """What holds for every axis of n cells.
+    """Facts about organs that hold for every axis of n cells.
 
     Attributes:
         near: The triangles of which a cell is not proven clear; a cell without one is clear of all.
@@ -166,7 +166,7 @@ def _elsewhere(toward, cosine, sine, cos_radius, sin_radius):  # type: ignore[no
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _beside_cell(t, u, four, bulge, limit, pad, lengths, unlike):  # type: ignore[no-untyped-def]  # numba infers
-    """What a triangle is to a cell about u: clear of it or not; its `_corners`, where a witness is not too unlike.
+    """Relation of a triangle to a cell about u: clear of it or not; its `_corners`, where a witness is not too unlike.
 
     Last, by how much the line along u is farther from it than the limit.
     """

@@ -60,7 +60,7 @@ class Question:
     touch: float | None = None
 
     def cap(self) -> Cells:
-        """The whole cap as one cell."""
+        """The whole cap of directions as one cell."""
         return Cells(np.array([self.theta], float), np.array([self.beta], float))
 
 

@@ -48,7 +48,7 @@ LEAST_DIGIT_MM, CHANCE_DIGIT = 0.01, 0.01
 
 
 def direction_finding(check: CheckSection, found: Explanation) -> Finding:
-    """What of a direction is not as expected."""
+    """Differences of one direction from what is expected."""
     differences = (*_verdict(check, found), *_clearances(check, found), *_least(check, found), *_touch(check, found))
     if not differences:
         return Finding()
@@ -116,7 +116,7 @@ MOST_SHOWN = 6
 
 
 def window_finding(window: WindowSection, direction: Candidates, search: Candidates) -> Finding:
-    """What of a window is not as expected.
+    """Differences of one window from what is expected.
 
     Args:
         window: What is expected.
@@ -170,7 +170,7 @@ class CollisionMismatchError(AssertionError):
 
 @dataclass(frozen=True)
 class Table:
-    """One expectation of a file.
+    """One table of expectations, as a test needs it.
 
     Attributes:
         kind: ``check``, ``window`` or ``plan``.
@@ -221,7 +221,7 @@ def _tables(content: ChecksFile, data: bytes, folder: Path) -> Iterator[Table]:
 
 
 class CollisionItem(pytest.Item):
-    """One expectation."""
+    """One expectation as a test."""
 
     def __init__(self, *, table: Table, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -260,7 +260,7 @@ class CollisionItem(pytest.Item):
 
 
 def arm_properties(session: Session, table: Table) -> list[tuple[str, object]]:
-    """What a test's report says of the arm.
+    """Properties of a test's report about the arm.
 
     Raises:
         InputError: The case cannot be read, or has no arm to be checked.
@@ -327,7 +327,7 @@ def unique_names(wanted: Iterable[str]) -> list[str]:
 
 
 def plan_finding(path: Path, context: CaseContext) -> Finding:
-    """Whether a plan holds: same inputs, its direction safe, its motion free of contact, its numbers those of the case.
+    """Differences of a plan: inputs, its direction's verdict, contacts of its motion, its numbers.
 
     Args:
         path: The plan's file.

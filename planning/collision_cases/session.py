@@ -26,7 +26,7 @@ from puncture_twin.planning.search.context import CaseContext, prepare
 
 @dataclass
 class Session:
-    """Cases are read once: meshes and trees cost more than any check.
+    """Cases and searches of one run, read once: meshes and trees cost more than any check.
 
     Attributes:
         changes: File to what it held when it was read, and the numbers that changed.
@@ -39,7 +39,7 @@ class Session:
     _searches: dict[tuple[Path, bool], Candidates] = field(default_factory=dict)
 
     def context(self, path: Path, *, arm: bool) -> CaseContext:
-        """A case.
+        """The prepared context of a case.
 
         Raises:
             InputError: It cannot be read, or the arm is to be checked in a case that does not say where its base is.
@@ -65,7 +65,7 @@ SESSION = pytest.StashKey[Session]()
 
 
 def session_of(config: pytest.Config) -> Session:
-    """What this run keeps."""
+    """The session of this run of pytest."""
     return config.stash.setdefault(SESSION, Session())
 
 
@@ -111,7 +111,7 @@ def arm_notes(reports: Iterable[object]) -> list[str]:
 
 
 def add_flag(parser: pytest.Parser) -> None:
-    """Tell pytest of it."""
+    """Register the flag with pytest."""
     text = "rewrite the numbers that *.collision.toml files expect; never a verdict"
     parser.getgroup("collision").addoption(UPDATE, action="store_true", help=text)
 
@@ -130,7 +130,7 @@ def updating(config: pytest.Config) -> bool:
 
 @dataclass(frozen=True)
 class Change:
-    """A number of one table.
+    """A number of one table to be rewritten.
 
     Attributes:
         kind: The array of the table, such as ``check``.
@@ -192,7 +192,7 @@ def _at(document: Any, keys: Sequence[str | int]) -> Any:
 
 
 MOST_DECIMALS = 17
-"""More than a double has."""
+"""Decimals of a written number: more than a double has."""
 
 MOST_LINES, MOST_DIFFERENCES, MOST_CHARACTERS = 15, 6, 300
 """Of a failure: more is not read. Of its lines that say what differs; and of a line."""
@@ -200,7 +200,7 @@ MOST_LINES, MOST_DIFFERENCES, MOST_CHARACTERS = 15, 6, 300
 
 @dataclass(frozen=True)
 class NewNumber:
-    """What was found for a key.
+    """The found number of a key that expects another.
 
     Attributes:
         keys: From the table inward.
@@ -231,7 +231,7 @@ class NewNumber:
 
 @dataclass(frozen=True)
 class Difference:
-    """One thing that is not as expected.
+    """One difference from an expectation.
 
     Attributes:
         line: What a person reads.
@@ -244,7 +244,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one test.
+    """Result of one test: its differences.
 
     Attributes:
         differences: None where everything is as expected.

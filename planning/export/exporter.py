@@ -45,7 +45,7 @@ SAMPLES = 400
 
 
 def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
-    """A radius for each waypoint between the ends; 0 where no corner may be cut.
+    """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut.
 
     Args:
         checker: Judges contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
@@ -116,7 +116,7 @@ NOTES = (
 
 
 def csv_text(plan: Plan, *, case_checked: bool) -> str:
-    """The table, with comment lines (#) above its header."""
+    """The plan as CSV, with comment lines (#) above its header."""
     lines = [*heading(plan, NOTES, case_checked=case_checked), ",".join(COLUMNS)]
     for phase in SampledMotion._fields:
         trajectory = getattr(plan, phase)
@@ -126,7 +126,7 @@ def csv_text(plan: Plan, *, case_checked: bool) -> str:
 
 
 def read_csv(text: str, *, where: Path) -> SampledMotion:
-    """Read the table back.
+    """Read such a CSV back.
 
     Raises:
         InputError: Another header, another phase, or rows that are no motion.
@@ -167,7 +167,7 @@ class Exported:
 
 
 class _Draft(NamedTuple):
-    """A text that was read back and found to be the plan, with its notes."""
+    """A text that was read back and equals the plan, with its notes."""
 
     text: str
     notes: tuple[str, ...] = ()
@@ -201,7 +201,7 @@ def export_plan(
 
 
 def export_name(source: Path, format_name: str) -> str:
-    """The file's name: that of the plan's file, with the format's end.
+    """Name of an export: that of the plan's file, with the format's ending.
 
     Raises:
         InputError: Another format.

@@ -55,7 +55,7 @@ class JointMove(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A URScript program's numbers: mm, rad, s, the controller's base frame.
+    """A URScript program as numbers: mm, rad, s, the controller's base frame.
 
     Attributes:
         tcp_mm: Needle tip in the flange frame, along z.
@@ -189,7 +189,7 @@ def _ramp(travelled: Floats, times: Floats) -> _Ramp:
 
 
 def stream_times(steps: int) -> Floats:
-    """Shape (steps + 1,), from 0, s."""
+    """Times of a stream from 0, shape (steps + 1,), s."""
     return np.asarray(STREAM_S * np.arange(steps + 1), dtype=np.float64)
 
 
@@ -363,7 +363,7 @@ REST_SLACK = 1e-6
 
 
 def corner_rows(q: Floats) -> NDArray[np.intp]:
-    """Rows at which a path turns or turns back, with both ends: every other row lies between two of them.
+    """Rows of the corners and reversals of a path, with both ends; every other row lies between two of them.
 
     Splits at the row farthest from the chord until none is off (Douglas and Peucker 1973, in six dimensions). For a
     path of straight segments that row is always one of its waypoints.
@@ -400,7 +400,7 @@ def _turning_row(rows: Floats) -> int | None:
 
 
 def rests_at(model: UrModel, trajectory: Trajectory, rows: NDArray[np.intp]) -> bool:
-    """Whether the arm can be at rest at each of the rows: beside it no joint is faster than one step of braking allows.
+    """Whether the arm can be at rest at each row: next to it no joint is faster than one step of braking allows.
 
     Args:
         model: The arm: its acceleration limit.
@@ -450,7 +450,7 @@ def warning_lines(warnings: Sequence[str] | None) -> list[str]:
 
 
 def counted(warnings: Sequence[str]) -> str:
-    """How many there are, in words that can be read aloud."""
+    """A number of warnings in words that can be read aloud."""
     return f"{len(warnings)} warning{'s' if len(warnings) > 1 else ''}"
 
 

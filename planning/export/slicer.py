@@ -52,7 +52,7 @@ _SHOWN = {
 
 @dataclass(frozen=True)
 class SceneNode:
-    """What a scene shows.
+    """One node of a scene.
 
     Attributes:
         kind: Of the node, by Slicer's name.
@@ -66,7 +66,7 @@ class SceneNode:
 
 
 def scene_text(nodes: Sequence[SceneNode]) -> str:
-    """The scene's file."""
+    """The scene as MRML text."""
     root = ElementTree.Element("MRML", version="Slicer4.4.0", userTags="")
     count: Counter[str] = Counter()
 
@@ -111,7 +111,7 @@ _AXES = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """What is to be shown.
+    """Content of the files for Slicer.
 
     Attributes:
         name: Of the path, as Slicer lists it.
@@ -128,7 +128,7 @@ class Drawn:
 
 @dataclass(frozen=True, eq=False)
 class SlicerFiles:
-    """The files by their names, and what whoever opens them should know."""
+    """The files by their names, and notes for whoever opens them."""
 
     texts: Mapping[str, str]
     notes: tuple[str, ...]
@@ -199,7 +199,7 @@ def _same(read: object, written: object, name: str) -> None:
 
 
 def markups_text(kind: Literal["Fiducial", "Line"], name: str, labels: Sequence[str], points_ct: Floats) -> str:
-    """The file of one markup.
+    """One markup as JSON text.
 
     Args:
         kind: ``Line`` has two points.

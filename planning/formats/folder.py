@@ -42,10 +42,10 @@ STRUCTURE_LIKE = re.compile(
 """Names of what may be a structure: of volumes and meshes, also those that are not read, packed, cut or renamed."""
 
 BESIDE = (".dvc", ".json")
-"""Endings of files about a file that lies beside them, whose name they have with or without its own ending."""
+"""Endings of files about a file next to them, whose name they have with or without its own ending."""
 
 PROBABILITIES, VOLUMES = (".npz", ".pkl"), (".nii.gz", ".nii", ".nrrd")
-"""Endings of what nnU-Net writes about each mask, and of the mask beside it."""
+"""Endings of what nnU-Net writes about each mask, and of the mask next to it."""
 
 THUMBNAILS = "@eaDir"
 """The folder in which a file server keeps previews, each named like the file that it shows."""
@@ -70,7 +70,7 @@ class Entry(NamedTuple):
 
     @property
     def said(self) -> str:
-        """Its name, and why it is not read."""
+        """Name of the entry, and why it is not read."""
         return f"{self.name} ({self.what or NOT_READ})"
 
 
@@ -139,7 +139,7 @@ def is_harmless(name: str, names: Collection[str]) -> bool:
 
 
 def is_passed_over(folder: Path) -> bool:
-    """Whether a folder is this program's output, or holds previews or versions: nothing in it is a patient's."""
+    """Whether a folder contains nothing of a patient: this program's output, previews or versions."""
     versions = folder.name.startswith(".") and is_harmless(folder.name, ())
     return versions or folder.name == THUMBNAILS or is_output_folder(folder)
 
@@ -153,7 +153,7 @@ def _holds_known(folder: Path, known: Callable[[Path], bool], depth: int) -> boo
 
 
 def structure_below(folder: Path) -> str:
-    """What is named like a volume or mesh below a folder, at any depth; "" if nothing is, and all of it was seen."""
+    """Path of something named like a volume or mesh below a folder; "" if there is none and all was seen."""
     seen, closed = 0, list[OSError]()
     for top, folders, files in os.walk(folder, onerror=closed.append, followlinks=True):
         folders[:] = [one for one in folders if not is_passed_over(Path(top, one))]

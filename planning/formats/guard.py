@@ -30,7 +30,7 @@ _TRANSFORM_ALLOWED = (
 
 
 def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
-    """A rigid motion that may be trusted, or an error.
+    """A rigid motion that passed the guard: finite, a rotation, near the origin.
 
     Args:
         T: Shape (4, 4), maps coordinates between two frames, mm.
@@ -58,7 +58,7 @@ def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
 
 
 def guard_points(points: ArrayLike, names: Sequence[str], *, where: str | Path) -> NDArray[np.float64]:
-    """Named points that may be trusted, or an error.
+    """Named points that passed the guard: finite, near the origin, each name once.
 
     Args:
         points: Shape (n, 3), mm, any frame.

@@ -45,7 +45,7 @@ def most_bytes(name: str) -> int:
 
 
 def parse_transform(data: bytes, path: Path) -> Floats:
-    """The rigid motion of a file: what it does to a point, shape (4, 4), mm.
+    """The rigid motion of points that a file states, shape (4, 4), mm.
 
     Args:
         data: The whole file.
@@ -97,7 +97,7 @@ def _numbers(stated: dict[str, str], key: str, where: str) -> Floats:
 
 
 def transform_text(T: Floats) -> str:
-    """The file of a motion that does this to a point, shape (4, 4), mm; it reads back to the same numbers.
+    """The text file of a motion of points, shape (4, 4), mm; it reads back to the same numbers.
 
     >>> print(transform_text(np.eye(4)).splitlines()[2])
     Transform: AffineTransform_double_3_3
@@ -143,7 +143,7 @@ class StatedTransform(NamedTuple):
 
 
 def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
-    """What the transforms of one file do to a point, shape (4, 4), mm; whether it is rigid is not looked at.
+    """The motion of points by the transforms of one file, shape (4, 4), mm; whether it is rigid is not checked.
 
     Raises:
         InputError: None, several that are no composite, or one of another kind or with other parameters.
@@ -170,7 +170,7 @@ def _check_kind(kind: str, where: str) -> None:
 
 
 def _motion(stated: StatedTransform, where: str) -> Floats:
-    """Of one part, shape (4, 4)."""
+    """The motion of points by one part, shape (4, 4)."""
     name = stated.kind.partition("_")[0]
     count, fixed_counts = _SIZES.get(name, _MATRIX_SIZES)
     _check_count(stated.parameters, (count,), "Parameters", where)
@@ -191,7 +191,7 @@ def _check_count(numbers: Floats, counts: tuple[int, ...], key: str, where: str)
 
 
 def _euler(angles: Floats, *, zyx: bool) -> Floats:
-    """Rotation of the angles about x, y and z, rad."""
+    """Rotation by the angles about x, y and z, rad."""
     x, y, z = (_about(axis, angle) for axis, angle in enumerate(angles))
     product: Floats = z @ y @ x if zyx else z @ x @ y
     return product

@@ -316,7 +316,7 @@ def parse_points(
     default_space: Space | None = None,
     default_unit: Unit | None = None,
 ) -> NamedPoints:
-    """The same of a file that has been read; it is not opened again.
+    """As `read_points`, of a file that has been read; it is not opened again.
 
     Args:
         data: The whole file.
@@ -438,10 +438,10 @@ _ALLOWED_JOINTS = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actu
 
 
 class JointRecording(NamedTuple):
-    """Rows of a recording."""
+    """Rows of a recording of joints."""
 
     names: tuple[str, ...]
-    """What their ``name`` says, or their numbers."""
+    """Names of the rows, or their numbers."""
     q: Floats
     """Shape (n, 6), rad."""
     time_s: Floats | None

@@ -32,7 +32,7 @@ class RawMesh(NamedTuple):
 
 
 def refuse(what: str, where: str, allowed: str) -> NoReturn:
-    """Raise the InputError that a reader ends with."""
+    """Raise a reader's InputError."""
     raise InputError(what, where=where, allowed=allowed)
 
 

@@ -28,7 +28,7 @@ RAYS, SEED = 5, 3
 
 
 class Side(Enum):
-    """Where a point lies."""
+    """Side of a surface on which a point lies."""
 
     INSIDE = "inside"
     OUTSIDE = "outside"
@@ -65,7 +65,7 @@ def contains(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
 
 
 def inside_each(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of many points (n, 3) lie inside a closed surface, shape (n,); those on an open one are not told apart.
+    """Which of many points (n, 3) lie inside a closed surface, shape (n,); points on the surface fall to either side.
 
     Raises:
         ValueError: The surface is open.
@@ -137,7 +137,7 @@ def _solid_angles(vertices, faces, points, found):  # type: ignore[no-untyped-de
 
 
 def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
-    """Of all directions from a point, the part in which a ray crosses the surface an odd number of times.
+    """Fraction of all directions from a point in which a ray crosses the surface an odd number of times.
 
     0 outside of a closed surface, 1 inside, in between for an open one; a triangle that is given twice counts once.
 
@@ -150,7 +150,7 @@ def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
 
 
 def hit_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
-    """Of all directions from a point, the part in which a ray meets the surface at all.
+    """Fraction of all directions from a point in which a ray hits the surface.
 
     1 inside a closed surface, and also in a hollow of it, of which `winding_number` is 0.
 
@@ -249,7 +249,7 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
 
 
 def _ways(way: Ints, fresh: Bools) -> Ints:
-    """Of crossings that are one, from one that is fresh to the next: the way that all have, 0 if they differ."""
+    """Direction in which merged crossings pass the surface, 0 if they differ, from each first one to the next."""
     starts = np.flatnonzero(fresh)
     if len(starts) == 0:
         return way
@@ -375,7 +375,7 @@ def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # n
 
 @allocation_free()
 def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
-    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; and its way."""
+    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; and its direction."""
     p, q, r = _beside(a, u), _beside(b, u), _beside(c, u)
     wa, wb, wc = _turn(q, r), _turn(r, p), _turn(p, q)
     if not ((wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)):
@@ -432,7 +432,7 @@ def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
 
 
 def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
-    """Crossings, and of which rays they add up: as those of a ray from inside a closed surface must.
+    """Crossings, and which rays they are consistent for: as those of a ray from inside a closed surface.
 
     Such a ray leaves an odd number of times. Where triangles are wound alike it comes out and goes in by turns: if not,
     one shell lies within another, or two share a wall, and the first crossing need not be the way out.
@@ -450,7 +450,7 @@ def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) ->
 
 
 def _adds_up(mesh: TriangleMesh, found: Crossings) -> Bools:
-    """Of which rays the crossings are odd and, on a closed surface wound alike, out and in by turns."""
+    """Which rays have an odd number of crossings and, on a closed surface wound alike, alternate out and in."""
     odd = found.count % 2 == 1
     if not (mesh.closed and mesh.wound_alike):
         return odd

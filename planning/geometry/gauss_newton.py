@@ -20,7 +20,7 @@ from scipy.special import fdtrc
 from puncture_twin.planning.base.arrays import Floats
 
 X = TypeVar("X")
-"""What is estimated."""
+"""Type of the estimate."""
 
 NO_PIVOT = 1e-15
 """An eigenvalue of the normal equations below this fraction of the largest is rounding: no step is made along it."""
@@ -58,7 +58,7 @@ class System(NamedTuple, Generic[X]):
 
 
 class Fit(NamedTuple, Generic[X]):
-    """Where Gauss-Newton ended."""
+    """Result of Gauss-Newton."""
 
     estimate: X
     system: System[X]
@@ -146,7 +146,7 @@ def _descend(
 
 
 class Lacking(NamedTuple):
-    """What k unknowns that a linear model lacks would explain of its residuals."""
+    """Explanation of a linear model's residuals by k unknowns that it lacks."""
 
     found: Floats
     """Shape (k,): their values."""

@@ -112,7 +112,7 @@ def _expected(records, sample, low, high, middle, axis):  # type: ignore[no-unty
 
 @nb.njit(cache=True, nogil=True)
 def _part(records, rows, low, high, axis, pivot, equal):  # type: ignore[no-untyped-def]  # numba infers
-    """Bring what lies below a pivot, or equals it, to the front of a range; where the rest begins.
+    """Move what lies below a pivot, or equals it, to the front of a range; returns where the rest begins.
 
     Every record changes its place with the first of the rest, and only the border's step depends on it: no branch is
     guessed wrong. Rows are the records as integers, whose bits a copy keeps; unsigned numbers count from the front.

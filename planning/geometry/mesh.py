@@ -119,7 +119,7 @@ class TriangleMesh:
 
     @property
     def nbytes(self) -> int:
-        """What vertices and faces hold."""
+        """Bytes of vertices and faces."""
         return self.vertices.nbytes + self.faces.nbytes
 
     @cached_property
@@ -131,13 +131,13 @@ class TriangleMesh:
 
     @cached_property
     def area(self) -> float:
-        """Of all triangles, mm^2."""
+        """Area of all triangles, mm^2."""
         a, b, c = np.moveaxis(self.triangles, 1, 0)
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
 
     @property
     def volume(self) -> float:
-        """What it encloses where it is closed, mm^3; negative where its triangles face inward."""
+        """Enclosed volume where the mesh is closed, mm^3; negative where its triangles face inward."""
         a, b, c = np.moveaxis(self.triangles - self.bounds.mean(axis=0), 1, 0)
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
@@ -175,7 +175,7 @@ def spread_on(mesh: TriangleMesh, count: int) -> Spread:
 
 
 def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Several surfaces of one frame as one; of one alone that itself."""
+    """Several surfaces of one frame as one mesh; a single one is returned itself."""
     if len(meshes) == 1:
         return meshes[0]
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]], dtype=np.int32)

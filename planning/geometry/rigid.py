@@ -44,7 +44,7 @@ def apply(T_b_a: NDArray[np.floating[Any]], points_a: NDArray[np.floating[Any]])
 
 
 def rotated_about(T: Floats, center: Floats, change: Floats) -> Floats:
-    """A pose (4, 4) turned about a point (3,) of the frame that it leads to, then shifted.
+    """A pose (4, 4) rotated about a point (3,) of the frame that it leads to, then shifted.
 
     Args:
         T: Shape (4, 4), mm.

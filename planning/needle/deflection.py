@@ -45,7 +45,7 @@ MOST_SLENDER = 150.0
 
 @dataclass(frozen=True, eq=False)
 class DeflectionBound:
-    """The greatest deflection over depth.
+    """Greatest deflection over path length, to any side.
 
     Attributes:
         depth_mm: Shape (m,), of the tip in the tissue, from 0, ascending.
@@ -58,7 +58,7 @@ class DeflectionBound:
     sag_mm: float
 
     def at(self, path_length: Floats | float) -> Floats:
-        """For paths of these lengths, mm; that of the next depth of the table, and infinite beyond its end.
+        """Bound for paths of these lengths, mm: that of the table's next depth; infinite beyond its end.
 
         Args:
             path_length: Any shape, mm; NaN where there is none, which stays NaN.
@@ -110,7 +110,7 @@ class Bending:
     tissues: ByName[Tissue]
 
     def bound(self, longest_mm: float) -> DeflectionBound:
-        """How far it may bend, on paths up to a length, mm."""
+        """Bound of the deflection on paths up to a length, mm."""
         return deflection_bound(self.shaft, self.alpha, self.tissues.of_pattern.values(), longest_mm)
 
 
@@ -119,7 +119,7 @@ BANDS = 4
 
 
 class Shape(NamedTuple):
-    """Of n nodes: deflection (mm) and slope (rad), shape (n,), and forces, N and N mm.
+    """Bent shape of n nodes: deflection (mm) and slope (rad), shape (n,), and forces, N and N mm.
 
     The tip's is what held it; the clamp's are what it bears of all that presses on the shaft, a moment about itself.
     """
@@ -203,7 +203,7 @@ class Beam:
         return bands
 
     def _load(self, foundation: Floats, rest: Floats) -> Floats:
-        """What the foundation pulls with, shape (2 (elements + 1),): the integral of k c N over each element."""
+        """Load by the foundation, shape (2 (elements + 1),): the integral of k c N over each element."""
         h, first, second = self.step, rest[:-1], rest[1:]
         load = np.zeros(2 * (self.elements + 1))
         load[0:-2:2] += foundation * h / 20 * (7 * first + 3 * second)
@@ -214,7 +214,7 @@ class Beam:
 
 
 def _shape(found: Floats, force: float, system: tuple[Floats, Floats]) -> Shape:
-    """With the clamped node in front, whose two rows of the system say what the clamp must hold against."""
+    """The shape with the clamped node in front, whose two rows give the clamp's reaction."""
     bands, load = system
     bears = load[0] - bands[2, 0] * found[0] - bands[3, 0] * found[1]
     moment = load[1] - bands[1, 1] * found[0] - bands[2, 1] * found[1]
@@ -232,7 +232,7 @@ samples what a case may declare. With steps of 1 mm alone it was 11 % in thin ne
 
 
 def step_for(shaft: Shaft, stiffest: float) -> float:
-    """The step in which an insertion is followed, mm.
+    """Step of an insertion's simulation, mm.
 
     Args:
         shaft: The needle's.
@@ -367,18 +367,18 @@ class Shaft:
 
     @property
     def sag_mm(self) -> float:
-        """Of the free tip of a horizontal steel shaft: q L^4 / 8 EI, q its weight by length."""
+        """Sag of the free tip of a horizontal steel shaft, mm: q L^4 / 8 EI, q its weight by length."""
         weight = STEEL_N_MM3 * np.pi * (self.outer_mm**2 - self.inner_mm**2) / 4
         return weight * self.length_mm**4 / (8 * self.bending_stiffness)
 
     def buckling_n(self, *, pinned: bool) -> float:
-        """Axial load at which the shaft gives way: Euler's, its tip free, or pinned in the skin."""
+        """Axial load at which the shaft buckles, N: Euler's, its tip free, or pinned in the skin."""
         return (PINNED_TIP if pinned else FREE_TIP) * self.bending_stiffness / self.length_mm**2
 
 
 @dataclass(frozen=True)
 class Tissue:
-    """One tissue, as a needle feels it.
+    """Mechanical properties of one tissue.
 
     Attributes:
         stiffness_n_mm2: k, by which it holds the shaft: force by length of shaft and by deflection.

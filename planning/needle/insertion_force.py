@@ -54,17 +54,17 @@ class InsertionForce:
 
     @property
     def total_n(self) -> Floats:
-        """Shape (n,)."""
+        """Total force at each depth, shape (n,), N."""
         return np.asarray(self.capsule_n + self.cutting_n + self.friction_n)
 
     @property
     def peak_n(self) -> float:
-        """The greatest force."""
+        """The greatest force, N."""
         return float(self.total_n.max(initial=0.0))
 
     @property
     def work_n_mm(self) -> float:
-        """Of the arm: the force integrated over the samples."""
+        """Work of the arm, N mm: the force integrated over the samples."""
         return float(np.trapezoid(self.total_n, self.depth_mm))
 
 
@@ -107,7 +107,7 @@ def _spring(push: Push, layers: Sequence[Layer], depth: Floats) -> Floats:
 
 
 def _friction(layer: Layer, inside: Floats) -> Floats:
-    """Of the shaft's length inside one layer."""
+    """Friction over the shaft's length inside one layer, N."""
     length = np.clip(inside, layer.start_mm, layer.end_mm) - layer.start_mm
     return np.asarray(layer.tissue.friction_n_mm * length)
 

@@ -30,7 +30,7 @@ FLANGE = 6
 
 @dataclass(frozen=True, eq=False)
 class ArmSpheres:
-    """Spheres that enclose the links, the needle's holder and the tool, in bodies; not the needle.
+    """Bounding spheres of the links, the needle's holder and the tool, by body; not the needle.
 
     Attributes:
         centres: Shape (n, 3), mm, each in its body's frame.
@@ -68,7 +68,7 @@ class ArmSpheres:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What the arm must not touch.
+    """Patient and boxes that the arm must not touch.
 
     Attributes:
         skin: The patient, CT frame.
@@ -176,7 +176,7 @@ def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
 
 @nb.njit(cache=True)
 def _is_clear(arm, surroundings, T_ct_base, frames, last):
-    """One state: first the sphere ``last`` (body, sphere) that touched last; then the far bodies before the near."""
+    """Whether one state is clear: first the sphere ``last`` (body, sphere), then far bodies before near ones."""
     centres, radii, starts, body_frames = arm
     body, sphere = last
     if sphere >= 0:

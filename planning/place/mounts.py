@@ -120,7 +120,7 @@ class Site:
 
 
 def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
-    """Where the case lets a base stand.
+    """Regions of the case in which a base may be placed.
 
     Raises:
         InputError: A rail is wanted, and there is no table to which it belongs.
@@ -150,7 +150,7 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
 
 
 def default_reach_mm(model: UrModel, needle_length_mm: float) -> float:
-    """How far from the target a base may stand where the case says nothing."""
+    """Default distance of a base from the target, mm."""
     span = abs(model.a2) + abs(model.a3) + needle_length_mm + FREE_MM
     return ROUNDS_MM * math.ceil(span / ROUNDS_MM)
 
@@ -170,7 +170,7 @@ def _side(facing: str, axis: tuple[int, int, int], bounds: MountBounds, reach: f
 
 
 def _rails(case: Case, table: Obstacle, T_ct_bed: Floats, reach: float) -> list[Region]:
-    """An upright base beside either long edge of the table, at about the height of its top."""
+    """Regions of an upright base along either long edge of the table, at about the height of its top."""
     half = np.abs(T_ct_bed[:3, :3].T) @ np.asarray(table.size_mm) / 2
     centre = T_ct_bed[:3, :3].T @ (np.asarray(table.center_mm) - T_ct_bed[:3, 3])
     bounds = case.place.rail
@@ -218,7 +218,7 @@ SAME_RING_DIGITS = 7
 
 @dataclass(frozen=True, eq=False)
 class WantedDirections:
-    """n directions.
+    """n directions to be reached, each with the solid angle that it represents.
 
     Attributes:
         outward_ct: Shape (n, 3), unit, from the target outward.

@@ -42,7 +42,7 @@ SWEEP_SPEED_MM_S = 30.0
 
 
 class _SweepPath(NamedTuple):
-    """Directions that are passed one after the other, and why no more."""
+    """Directions that are passed one after the other, and why it ends."""
 
     angles: Floats
     """Shape (k, 2), rad."""
@@ -112,7 +112,7 @@ def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:
 
 
 def _allowed(context: CaseContext, angles: Floats, progress: Count) -> _SweepPath:
-    """As far as the search calls every direction safe, with the arm."""
+    """Directions up to the first that the search, with the arm, does not call safe."""
     standoff, passed, stopped = 0.0, 0, ""
     for row, (theta, beta) in enumerate(angles.tolist()):
         candidates = context.check(theta, beta % (2 * np.pi))

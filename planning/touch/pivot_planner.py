@@ -101,7 +101,7 @@ def spread_poses(R_base_flange: Floats, count: int) -> list[int]:
 
 
 def _places(context: CaseContext) -> Iterator[Floats]:
-    """Places about the base, base frame, mm: those across from the patient first."""
+    """Places about the base, base frame, mm: those opposite the patient first."""
     assert context.reach is not None
     model, up = context.case.robot.model, _up_base(context)
     reach = abs(model.a2) + abs(model.a3)
@@ -117,7 +117,7 @@ def _places(context: CaseContext) -> Iterator[Floats]:
 
 
 def _up_base(context: CaseContext) -> Floats:
-    """Against gravity, unit."""
+    """Unit direction against gravity, base frame."""
     assert context.reach is not None
     return np.asarray(context.reach.T_base_ct[:3, :3] @ bed_frame(context.case)[:3, 2])
 

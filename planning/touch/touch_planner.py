@@ -84,7 +84,7 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """Some markers of a case, and what they are touched for.
+    """Some markers of a case, and the insertion that they are touched for.
 
     Attributes:
         context: The case.
@@ -109,7 +109,7 @@ class _Task:
         return self.context.case.needle.length_mm
 
     def of(self, rows: Sequence[int]) -> _Task:
-        """The same of some of its markers."""
+        """The task with some of its markers."""
         at, names = list(rows), self.markers.names
         points_ct, points_base = self.markers.points_ct[at], self.markers.points_base[at]
         return replace(self, markers=MarkerPairs(tuple(names[row] for row in at), points_ct, points_base))
@@ -128,13 +128,13 @@ class _Task:
         return PoseError(self.model, self.tip_mm, target, case.errors, fitted.uncertainty)
 
     def _aimed(self, fitted: Registration) -> Registration:
-        """Corrected for the insertion, where the case's pose is corrected."""
+        """The pose error corrected for the insertion, where the case's pose is corrected."""
         if self.method != "joint":
             return fitted
         return aimed(fitted, aim_at(self.model, self.tip_mm, self.context.case.target_ct, self.q_insertion))
 
     def expected_mm(self, q_touch: Floats) -> float:
-        """Of the tip at the target (rms)."""
+        """Expected (rms) error of the tip at the target, mm."""
         return expected_error_mm(self.error(q_touch), self.q_insertion)
 
 
@@ -146,14 +146,14 @@ class _Open(NamedTuple):
     left_out: dict[str, str]
 
     def without(self, place: int, name: str, why: str) -> _Open:
-        """The same but for the marker at a place of ``rows``."""
+        """The open markers without the one at a place of ``rows``."""
         rows, kept = list(self.rows), list(self.candidates)
         del rows[place], kept[place]
         return _Open(tuple(rows), tuple(kept), {**self.left_out, name: why})
 
 
 def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
-    """After touches as in the insertion.
+    """The pose error after touches in the insertion's orientation.
 
     Raises:
         NoAnswerError: The markers that are left do not suffice.
@@ -169,7 +169,7 @@ def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
 
 
 def expected_of_touches(context: CaseContext, q_insertion: Floats, read: NamedPoints) -> float:
-    """Of the tip at the target (rms), mm, when these touches are all that there are.
+    """Expected (rms) error of the tip at the target, mm, with these touches alone.
 
     Args:
         context: Of the case.
@@ -190,7 +190,7 @@ def _in_order(context: CaseContext, read: NamedPoints) -> NamedPoints:
 
 
 def registered(context: CaseContext, read: NamedPoints) -> Registration:
-    """The registration of what was touched.
+    """The registration by touched markers.
 
     Args:
         context: For which markers were touched, and what is declared of them.
@@ -221,7 +221,7 @@ def _task(context: CaseContext, q_insertion: Floats) -> _Task:
 
 
 def approach_checkers(context: CaseContext, needle_padding_mm: float) -> ApproachCheckers:
-    """The workcell with the case's needle, and with one whose tip is taken off and that is so much fuller."""
+    """Two checkers of the workcell: with the case's needle, and with one without tip and with more padding."""
     assert context.reach is not None
     tool = case_tool(context.case)
     short = replace(tool, needle_length_mm=tool.needle_length_mm - TIP_MM, shaft_mm=tool.shaft_mm - TIP_MM)
@@ -240,7 +240,7 @@ def approach_checkers(context: CaseContext, needle_padding_mm: float) -> Approac
 
 
 def _open(task: _Task) -> _Open:
-    """Of each marker the poses that reach it and that nothing is in the way of."""
+    """Poses of each marker that reach it and are clear."""
     checkers = approach_checkers(task.context, PLANNED_PADDING_MM)
     rows, kept, left_out = [], [], {}
     for row, (name, point) in enumerate(zip(task.markers.names, task.markers.points_base, strict=True)):
@@ -254,7 +254,7 @@ def _open(task: _Task) -> _Open:
 
 
 def _free(checkers: ApproachCheckers, tip_mm: float, candidates: Candidates) -> tuple[Floats, str]:
-    """Of the insertion's own branch those that are free, else of the others; and what most often is in the way."""
+    """Free poses of the insertion's own branch, else of the others; and what blocks most often."""
     reasons: list[str] = []
     for q in (candidates.alike, candidates.others):
         said = [why_not(checkers, tip_mm, one) for one in q]

@@ -42,7 +42,7 @@ from puncture_twin.planning.search.context import CaseContext
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """One marker.
+    """The touch of one marker.
 
     Attributes:
         name: The marker's.
@@ -76,7 +76,7 @@ class TouchTour:
 
 @dataclass(frozen=True, eq=False)
 class TouchPlan(TouchTour):
-    """A tour of the markers for a puncture.
+    """A planned tour of the markers for a puncture.
 
     Attributes:
         left_out: Marker to why it is not touched, in words.
@@ -102,7 +102,7 @@ class NoMotionError(NoAnswerError):
 
 
 class Stops(NamedTuple):
-    """Where the tip is to be set: names, points (n, 3), mm, base frame, and joints (n, 6), rad."""
+    """Stops of a tour: names, points (n, 3), mm, base frame, and joints (n, 6), rad."""
 
     names: tuple[str, ...]
     points_base: Floats
@@ -110,7 +110,7 @@ class Stops(NamedTuple):
 
 
 def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Count) -> TouchTour:
-    """Plan the motions.
+    """Plan the motions of a tour through stops.
 
     Args:
         context: Of a case with an arm.
@@ -269,7 +269,7 @@ def _dense(checker: CellChecker, line: Floats) -> Floats:
 def registered_joints(
     model: UrModel, tip_mm: float, q_insertion: Floats, target_ct: Floats, T_base_ct: tuple[Floats, Floats]
 ) -> Floats:
-    """The joints that put the needle as planned in the CT, patient and all where a new registration puts them.
+    """Joints that put the needle as planned in the CT, by a new registration.
 
     Args:
         model: The arm.

@@ -29,25 +29,25 @@ OFF_MM = 0.05
 """The same for an axis' place and the flange's: what a UR repeats. Rounded angles leave 0.005 mm at a metre."""
 
 DIGITS_MM = 6
-"""To which lengths are rounded: a URDF's right angles are rounded, so that its chain gives 89.15899999999999."""
+"""Decimals of a length: a URDF's right angles are rounded, so that its chain gives 89.15899999999999."""
 
 DIGITS_TURN = 9
-"""To which the base's rotation is rounded, for the same reason."""
+"""Decimals of the base's rotation, for the same reason."""
 
 BASE = "base"
 """The link that ROS has for the controller's base frame."""
 
 DIRECTIONS = np.array([[0, 0, 1], [0, -1, 0], [0, -1, 0], [0, -1, 0], [0, 0, -1], [0, -1, 0]], dtype=np.float64)
-"""Of a UR's six axes at the angle zero, base frame."""
+"""Directions of a UR's six axes at the angle zero, base frame."""
 
 R_BASE_FLANGE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Of a UR's flange at the angle zero."""
+"""Orientation of a UR's flange at the angle zero, base frame."""
 
 AS_UR = "six axes as a UR's, zero and sense of rotation included (docs/how-to/own-arm.md)"
 
 
 class UrLengths(NamedTuple):
-    """What a chain gives where it is a UR's."""
+    """Denavit-Hartenberg lengths of a chain that is a UR's, and its root in the controller's base frame."""
 
     lengths_mm: tuple[float, ...]
     """d1, a2, a3, d4, d5, d6."""
@@ -66,7 +66,7 @@ class _Axes(NamedTuple):
     """Shape (4, 4), mm."""
 
     def moved(self, T: Floats) -> _Axes:
-        """The same in another frame."""
+        """The axes in another frame."""
         return _Axes(apply(T, self.points), self.directions @ T[:3, :3].T, T @ self.T_flange)
 
 
@@ -98,7 +98,7 @@ def ur_lengths(chain: ArmChain, document: UrdfDocument, T_base_root: Floats | No
 
 
 def _axes(chain: ArmChain) -> _Axes:
-    """In the root's frame."""
+    """The six axes and the flange at the angle zero, in the root's frame."""
     poses = chain.body_poses(np.eye(4), np.zeros(len(chain.joints)))
     directions = np.stack([T[:3, :3] @ joint.axis for T, joint in zip(poses[1:], chain.joints, strict=True)])
     return _Axes(poses[1:, :3, 3], directions, poses[-1] @ chain.T_body_flange)
@@ -181,7 +181,7 @@ ROUNDING_RAD = 1e-4
 
 
 class JointLimits(NamedTuple):
-    """What six joints can do."""
+    """Angle, speed and torque limits of six joints."""
 
     angles: Floats
     """Shape (6, 2), rad."""

@@ -46,7 +46,7 @@ class MaskVolume:
 
 @dataclass(frozen=True, eq=False)
 class NamedMasks:
-    """The structures of one file.
+    """Named structures of one file as masks.
 
     Attributes:
         masks: Name to mask.

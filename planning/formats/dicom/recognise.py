@@ -110,7 +110,7 @@ def recognise(path: Path) -> DicomFile | None:
 
 
 def _big_endian(meta: FileMetaDataset, path: Path) -> DicomFile:
-    """What is none of what this project reads, as its meta information says.
+    """Description of a big-endian file, which this project does not read, by its meta information.
 
     Raises:
         InputError: It may be: no value of such a file is read.
@@ -122,7 +122,7 @@ def _big_endian(meta: FileMetaDataset, path: Path) -> DicomFile:
 
 
 def described(data: Dataset, path: Path) -> DicomFile:
-    """What a data set that was read says that it is.
+    """Description of a data set by its own header.
 
     Raises:
         InputError: Its header is damaged.
@@ -148,7 +148,7 @@ def described(data: Dataset, path: Path) -> DicomFile:
 
 
 def _date(data: Dataset, where: str) -> str:
-    """Of the acquisition, else of its series or study: eight digits, all else is none."""
+    """Date of the acquisition, else of its series or study: eight digits, or none."""
     stated = (text(data, keyword, where=where) for keyword in ("AcquisitionDate", "SeriesDate", "StudyDate"))
     plain = next((one for one in stated if len(one) == DATE_DIGITS and one.isascii() and one.isdigit()), "")
     return plain and f"{plain[:4]}-{plain[4:6]}-{plain[6:]}"
@@ -233,14 +233,14 @@ def choose_series(path: Path) -> SeriesFiles:
 
 
 def _may_be_slice(one: Entry, names: Sequence[str]) -> bool:
-    """What can be read by nobody, and files with the ending of the slices, or that of a part of one behind it."""
+    """Whether an unreadable file may be a slice: by its ending, or that of a part of one."""
     endings = {Path(name).suffix.lower() for name in names} | {".dcm", ".ima"}
     named = {end for end in map(str.lower, Path(one.name).suffixes) if not end[1:].isdigit()} & endings
     return one.what != FOLDER and bool(one.what not in (FILE, HIDDEN) or named)
 
 
 def _holds_dicom(folder: Path) -> bool:
-    """Whether slices may lie in a folder beside the series: its first files tell."""
+    """Whether slices may lie in a folder next to the series, by its first files."""
     return any(is_dicom_file(folder / one.name) for one in entries(folder, most=MAX_FILES)[:LOOKED_AT])
 
 

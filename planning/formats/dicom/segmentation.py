@@ -162,7 +162,7 @@ def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
 
 
 def _stated_step(groups: Groups, where: str, ct: CtSeries | None) -> float | None:
-    """The distance of slices that header or CT state, mm. How thick a slice is says less: it may be thinner."""
+    """Distance of slices by header or CT, mm; not the slice thickness, which may be thinner."""
     measures = groups.holder("PixelMeasuresSequence", where)
     if has(measures, "SpacingBetweenSlices"):
         step = number(measures, "SpacingBetweenSlices", where=where)
@@ -226,7 +226,7 @@ def _keep_to(gaps: Floats, step: float) -> bool:
 
 
 def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
-    """On the CT's own slices where the frames lie on them, else on a grid of their own."""
+    """The masks' grid: the CT's own slices where the frames lie on them, else a grid of their own."""
     own = (frames.columns, frames.rows, int(frames.slices.max()) + 1)
     if ct is not None:
         T_ct_slices, shape = ct.stack.T_ct_index, (*ct.slice_shape, len(ct.stack.slices))

@@ -35,7 +35,7 @@ WITH_RESCALE = (
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Where an image lies.
+    """Position and orientation of an image.
 
     Attributes:
         origin_ct: Shape (3,), the centre of its first pixel, LPS mm.
@@ -139,7 +139,7 @@ def frame_groups(data: Dataset, frames: int, *, where: str) -> list[Groups]:
 
 
 def plane_of(groups: Groups, label: str) -> Plane:
-    """Where a frame lies.
+    """Position and orientation of a frame.
 
     Raises:
         InputError: Position, orientation or spacing is missing or wrong.
@@ -202,7 +202,7 @@ SPACING_TOLERANCE = 1e-4
 ONE_PLACE_MM = 1e-3
 """No two slices of any scanner are so near."""
 SHOWN = 4
-"""Slices that a message names."""
+"""Slices that a message names at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +272,7 @@ def _check_alike(first: Slice, other: Slice, where: Path) -> None:
 
 
 def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> None:
-    """Two slices nearer than a tenth of the usual step lie at one place; a gap makes others no nearer."""
+    """Refuse slices at one place: nearer than a tenth of the usual step; a gap makes others no nearer."""
     apart = steps[steps >= ONE_PLACE_MM]
     near = steps < (max(ONE_PLACE_MM, PLACE_TOLERANCE * float(np.quantile(apart, 0.75))) if len(apart) else np.inf)
     if not near.any():
@@ -355,7 +355,7 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
 
 
 def moved(image: NDArray[np.float32], shift: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """An image in a larger one, NaN where it says nothing.
+    """An image placed in a larger one, NaN outside of it.
 
     Args:
         image: Shape (columns, rows), NaN where nothing was measured.

@@ -16,7 +16,7 @@ META_START = PREAMBLE_BYTES + len(MAGIC)
 
 
 class Kind(StrEnum):
-    """What this project makes of a DICOM file."""
+    """How this project treats a DICOM file."""
 
     CT = "CT"
     SEGMENTATION = "SEG"
@@ -46,7 +46,7 @@ PLAIN = (IMPLICIT, EXPLICIT, DEFLATED)
 
 
 def kind_of(sop_class: str) -> Kind:
-    """What a file of this SOP class is."""
+    """How a file of this SOP class is treated."""
     return _KINDS.get(sop_class, Kind.OTHER)
 
 

@@ -181,7 +181,7 @@ def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> Mask:
 
 
 def _between(below: Bools, above: Bools, contours: tuple[Contour, ...]) -> Bools:
-    """What lies in slices that were left out: what either neighbour encloses, where the two overlap.
+    """Masks of left-out slices: where the contours of both neighbours overlap.
 
     What is drawn in every so-many slices goes on between them too where it leans too much to overlap: within the
     convex hull of both.
@@ -229,7 +229,7 @@ def _narrow_parts(points: Floats, filled: Bools) -> Bools:
 
 
 def grown(pixels: Bools) -> Bools:
-    """The same pixels and their eight neighbours."""
+    """Pixels and their eight neighbours."""
     return np.asarray(scipy.ndimage.maximum_filter(pixels.view(np.uint8), 3, mode="constant").view(bool))
 
 

@@ -95,7 +95,7 @@ MAX_CSV_BYTES = 10_000_000
 
 
 class RuleKind(StrEnum):
-    """What a case wants of the labels that a pattern names."""
+    """Treatment of the labels that a pattern names."""
 
     AVOID = "avoid"
     UNKNOWN = "unknown"
@@ -110,7 +110,7 @@ DEMANDING = frozenset((RuleKind.AVOID, RuleKind.UNKNOWN))
 
 @dataclass(frozen=True)
 class LabelRule:
-    """What holds for one label that is present.
+    """Rule of one label that is present.
 
     Attributes:
         label: Its number in the map.
@@ -129,7 +129,7 @@ class LabelRule:
 
 @dataclass(frozen=True)
 class Selection:
-    """What the patterns of a case say about the labels of a map.
+    """Rules of a case's patterns for the labels of a map.
 
     Attributes:
         rules: One per label present, by rising label, those to ignore included.
@@ -141,7 +141,7 @@ class Selection:
 
 
 class OwnNames(Protocol):
-    """Whatever may hold names of its own: a label map."""
+    """A label map that may bring names of its own."""
 
     @property
     def path(self) -> Path:
@@ -196,7 +196,7 @@ def select(
     all_named: bool = True,
     where: str | Path,
 ) -> Selection:
-    """Gives every label present its rule.
+    """The rule of every label present, by the case's patterns.
 
     Patterns are shell patterns (``*``, ``?``, ``[...]``), capitals count. Of several that name one label the most
     specific holds: the label's own name, else the one with most characters that are no wildcards; ``"*"`` is the rest.
@@ -315,7 +315,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ByName(Generic[T]):
-    """Patterns of names, and what each stands for.
+    """Values by patterns of names.
 
     Attributes:
         of_pattern: Shell patterns; the most specific that matches a name holds.
@@ -324,7 +324,7 @@ class ByName(Generic[T]):
     of_pattern: Mapping[str, T]
 
     def of(self, name: str) -> T | None:
-        """What stands for one name; None where no pattern matches it.
+        """The value of one name; None where no pattern matches it.
 
         >>> ByName({"*": 0.0, "rib*": 0.5}).of("rib_1"), ByName({"rib*": 0.5}).of("liver")
         (0.5, None)
@@ -359,7 +359,7 @@ class ByName(Generic[T]):
 
 
 def _refuse_contradiction(of_pattern: Mapping[str, T], name: str, key: str, where: str | Path) -> None:
-    """Two equally specific patterns that give one name two meanings."""
+    """Refuse two equally specific patterns that give one name two meanings."""
     matching = [pattern for pattern in of_pattern if fnmatchcase(name, pattern)]
     best = max((specificity(pattern, name) for pattern in matching), default=0.0)
     equal = [pattern for pattern in matching if specificity(pattern, name) == best]

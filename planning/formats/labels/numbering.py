@@ -62,12 +62,12 @@ class Plausibility(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether organs lie where they do in a body."""
+        """Whether organs lie in the order of a body."""
         return self.nameless == 0 and self.rules >= LEAST_RULES and self.broken <= MOST_BROKEN * self.rules
 
     @property
     def fails(self) -> bool:
-        """Whether they surely do not."""
+        """Whether organs certainly lie in another order."""
         return self.nameless > 0 or self.broken >= max(LEAST_WRONG, LEAST_BROKEN * self.rules)
 
 

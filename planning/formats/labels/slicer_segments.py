@@ -29,7 +29,7 @@ ALLOWED = "a .seg.nrrd as Slicer saves it, with names, label values and layers o
 
 
 class Segment(NamedTuple):
-    """Where the voxels of a segment are.
+    """Layer and label of a segment.
 
     Attributes:
         layer: From 0.

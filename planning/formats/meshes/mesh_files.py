@@ -91,7 +91,7 @@ def parse_mesh(
     up: Up | None = None,
     stretch: NDArray[np.float64] | None = None,
 ) -> TriangleMesh:
-    """The same of a file that has been read; it is not opened again.
+    """As `read_mesh`, of a file that has been read; it is not opened again.
 
     Args:
         data: The whole file.
@@ -117,7 +117,7 @@ def parse_mesh(
 
 
 def _z_up(vertices: NDArray[np.float64], up: Up | None, path: Path) -> NDArray[np.float64]:
-    """Points (n, 3) of a file, turned by a quarter about x where its y is up."""
+    """Points (n, 3) of a file, rotated by a quarter about x where its y is up."""
     if up is None and path.suffix.lower() == ".glb":
         allowed = 'up = "y" (turned to z up) or up = "z" (kept as it is), or another format'
         raise InputError(UP_NOT_STATED, where=path, allowed=allowed, code="up_not_stated")
@@ -140,7 +140,7 @@ def _actual_space(stated: Space, space: Space, *, default: bool, where: str) -> 
 
 
 class MeshExtent(NamedTuple):
-    """What is told of a mesh file before its unit is known.
+    """Box and space of a mesh file before its unit is known.
 
     Attributes:
         box: Its lowest and highest corner in its own unit, whatever that is, shape (2, 3).
@@ -175,7 +175,7 @@ def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
 
 
 def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
-    """What can no longer be known about a structure, or looks unusual, one sentence each.
+    """Warnings about a structure's mesh, one sentence each.
 
     Args:
         mesh: The structure's surface, mm.
@@ -198,7 +198,7 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
 
 
 def cached_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tuple[str, ...]:
-    """As `mesh_warnings` of each mesh, by name; what was found of the same meshes before is not found again.
+    """`mesh_warnings` of each mesh, by name, from the cache for meshes seen before.
 
     The meshes know then whether they are closed and wound alike, see `TriangleMesh.known`.
     """

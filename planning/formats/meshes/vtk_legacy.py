@@ -183,7 +183,7 @@ class _Cursor:
         return line.rstrip(b"\r")
 
     def words(self) -> list[str]:
-        """Those of the next line that is not empty; none at the end of the file."""
+        """Words of the next line that is not empty; none at the end of the file."""
         while self._at < len(self._data):
             line = self.line().strip()
             if line:

@@ -64,7 +64,7 @@ def read_vtp(data: bytes, where: str) -> RawMesh:
 
 
 def _space(root: ElementTree.Element, encoding: Encoding, where: str) -> Space | None:
-    """What Slicer writes of the axes: a field named SPACE with the letters LPS or RAS and the zero that ends them."""
+    """The space that Slicer states: a field named SPACE with the letters LPS or RAS and a closing zero."""
     fields = root.findall("PolyData/FieldData/Array[@Name='SPACE']")
     if not fields:
         return None
