@@ -73,7 +73,7 @@ READ: Floats = np.array(list(TABLE_1.values()), dtype=np.float64)
 READ.setflags(write=False)
 
 SETUPS: tuple[Mapping[str, Point], ...] = (TABLE_2, TABLE_4)
-"""What was touched in either setup."""
+"""Points that were touched in either setup."""
 
 TRIADS = ((0, "ABC", "L"), (0, "ABC", "M"), (0, "ABC", "H"), (1, "ABC", "M"), (1, "ABE", "M"), (1, "ACD", "M"))
 """Setup, markers and lesion of Tables 3 and 5."""
@@ -88,7 +88,7 @@ def rows_of(names: str) -> list[int]:
 
 
 def measured() -> tuple[Floats, ...]:
-    """What the paper touched in each setup, shape (1, 8, 3), mm, base frame; NaN where a point was not touched."""
+    """Touches of the paper in each setup, shape (1, 8, 3), mm, base frame; NaN where a point was not touched."""
     return tuple(
         np.array([[touched.get(name, (np.nan, np.nan, np.nan)) for name in NAMES]], dtype=np.float64)
         for touched in SETUPS
@@ -207,7 +207,7 @@ JOINT = (2.5, 97.5)
 
 @dataclass(frozen=True)
 class DrawnRank:
-    """A number of the paper among as many draws of it.
+    """Percentile of a number of the paper among draws of it.
 
     Attributes:
         name: Of the number.
@@ -226,7 +226,7 @@ class DrawnRank:
     high: float
 
     def within(self, bounds: tuple[float, float]) -> bool:
-        """Whether it is as usual as that."""
+        """Whether the percentile lies within bounds."""
         return bool(bounds[0] <= self.percentile <= bounds[1])
 
 
@@ -310,7 +310,7 @@ WIDEST = 0.3
 
 @dataclass(frozen=True)
 class LesionErrors:
-    """What the paper's triads miss a lesion by, mm.
+    """Errors of the paper's triads at a lesion, mm.
 
     Attributes:
         name: Lesion, markers and setup.
@@ -325,7 +325,7 @@ class LesionErrors:
 
 @dataclass(frozen=True)
 class SkewFinding:
-    """The skew, and what it does.
+    """The skew, and its effect on lesions.
 
     Attributes:
         angle: rad, of y against z.
@@ -386,7 +386,7 @@ PLANES = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True)
 class Declaration:
-    """Errors of one experiment.
+    """Declared errors of one experiment.
 
     Attributes:
         name: What it is called in a table.
@@ -405,7 +405,7 @@ class Declaration:
     touch_mm: float = 0.0
 
     def draw_carton(self, read: Floats, count: int, rng: np.random.Generator) -> Floats:
-        """Where points (p, 3) that were read truly are, shape (count, p, 3)."""
+        """Draw true points (count, p, 3) of points (p, 3) that were read."""
         cells = rng.uniform(-0.5, 0.5, (count, *read.shape)) * self._cell()
         found = read + cells + rng.normal(0.0, 1.0, (count, *read.shape)) * self.reading_mm
         for first, second in PLANES:

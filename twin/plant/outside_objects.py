@@ -21,7 +21,7 @@ SHEATH_HU, WATER_HU, CORE_HU = 100.0, 0.0, 3000.0
 
 
 class OutsideObjects(NamedTuple):
-    """What shall lie beside the patient.
+    """Choice of objects outside of the patient.
 
     Attributes:
         arms: Where both arms lie; ``none``: over the head, outside of the image.
@@ -37,7 +37,7 @@ class OutsideObjects(NamedTuple):
 def place_outside_objects(
     skin: TriangleMesh, at_mm: float, wanted: OutsideObjects, rng: np.random.Generator
 ) -> tuple[Part, ...]:
-    """Draw it about a skin: the bed first, then arms, then lines.
+    """Objects about a skin: the bed first, then arms, then lines.
 
     Args:
         skin: In the scanner's frame, LPS mm: y to the back, z to the head.
@@ -86,7 +86,7 @@ SIDES = (("left", 1.0), ("right", -1.0))
 
 
 def arms(outline: Outline, kind: Arms, at_mm: float, rng: np.random.Generator) -> Iterator[Part]:
-    """Both arms: flesh with skin, and bones.
+    """Both arms of a patient: flesh with skin, and bones.
 
     Args:
         outline: Of the trunk.
@@ -119,7 +119,7 @@ class _Line(NamedTuple):
 def _beside(
     outline: Outline, side: float, at_mm: float, radii: Floats, pressed: bool, rng: np.random.Generator
 ) -> _Line:
-    """Along the bed; straight with a gap, or following the flank where it is pressed against it."""
+    """An arm along the bed: straight with a gap, or following the flank where it is pressed against it."""
     elbow = at_mm + rng.uniform(-150.0, 200.0)
     z = np.arange(elbow + UPPER_MM, elbow - FORE_MM - HAND_MM - 1e-9, -STEP_MM)
     along = elbow + UPPER_MM - z
@@ -138,7 +138,7 @@ def _beside(
 
 
 def _across(outline: Outline, side: float, at_mm: float, radii: Floats, rng: np.random.Generator) -> _Line:
-    """The upper arm beside the trunk, the forearm straight over flank and belly, the hand upon it."""
+    """An arm across the body: upper arm along the trunk, forearm over flank and belly, the hand upon it."""
     sink = rng.uniform(0.05, 0.6)
     turn = np.radians([rng.uniform(-10.0, 30.0), rng.uniform(60.0, 110.0)])
     height = at_mm + rng.uniform([-40.0, -60.0], [110.0, 60.0])
@@ -171,7 +171,7 @@ def _on(outline: Outline, z: float, spoke: Floats, off_mm: float) -> Floats:
 
 
 def _lack(outline: Outline, point: Floats, off_mm: float) -> float:
-    """By how much a point is nearer to the skin, along its own spoke, than wanted."""
+    """How much nearer to the skin than wanted a point is, along its own spoke, mm."""
     away = point[:2] - outline.middle(point[2])
     radius = float(np.linalg.norm(away))
     return outline.reach(float(point[2]), away / radius) + off_mm - radius
@@ -292,7 +292,7 @@ END_RINGS = 4
 
 
 class Part(NamedTuple):
-    """One body beside a patient; a later one fills the place of an earlier one.
+    """One body outside of a patient; a later one fills the place of an earlier one.
 
     Attributes:
         name: What it is.
@@ -334,7 +334,7 @@ def tube(points: Floats, radii: Floats, wide: Floats | None = None) -> TriangleM
 
 
 def drawn(section: Floats, low_mm: float, high_mm: float) -> TriangleMesh:
-    """A section along the bed.
+    """A section extruded along the bed.
 
     Args:
         section: Shape (n, 2), the corners in x and y around it, mm: two rows that face each other, so that
@@ -414,7 +414,7 @@ class Outline:
     skin: TriangleMesh
 
     def section(self, z: float) -> Floats:
-        """Where a plane across the bed cuts it: segments, shape (m, 2, 2), x and y, mm."""
+        """Section of the skin by a plane across the bed: segments (m, 2, 2), x and y, mm."""
         low, high = self.skin.bounds[:, 2]
         at = float(np.clip(z, min(low + END_MM, (low + high) / 2), max(high - END_MM, (low + high) / 2)))
         corners = self.skin.triangles
@@ -427,12 +427,12 @@ class Outline:
         return np.stack([_crossing(tip, first, at), _crossing(tip, second, at)], axis=1)
 
     def middle(self, z: float) -> Floats:
-        """Of the section's box, shape (2,), mm."""
+        """Middle of the section's box, shape (2,), mm."""
         points = self.section(z).reshape(-1, 2)
         return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
     def reach(self, z: float, direction: Floats) -> float:
-        """From the section's middle to its farthest point along a unit direction (2,), mm."""
+        """Distance from the section's middle to its farthest point along a unit direction (2,), mm."""
         segments = self.section(z) - self.middle(z)
         across = np.array([-direction[1], direction[0]])
         off, along = segments @ across, segments @ direction

@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Floats
 
 
 class ArmErrors(NamedTuple):
-    """How far an arm of a kind is from its nominal model: standard deviations, normal, and the width of the play."""
+    """Deviations of an arm from its nominal model: standard deviations, normal, and the width of the play."""
 
     link_mm: float = 0.0
     """Of every Denavit-Hartenberg length a_i and d_i."""
@@ -52,7 +52,7 @@ class TrueArm(NamedTuple):
         return np.ascontiguousarray(self.link_poses(q_true)[..., 6, :, :])
 
     def settle(self, q_command: Floats, q_before: Floats, rng: np.random.Generator) -> Floats:
-        """Where the joints come to rest, shape (6,), rad.
+        """Joints at rest, shape (6,), rad.
 
         The play operator: a joint moves only when the motor has crossed the play, q = clip(q_before, q_command - b/2,
         q_command + b/2); then its repeatability adds a normal error, which the next arrival draws anew.

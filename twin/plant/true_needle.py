@@ -77,14 +77,14 @@ SHIFT_MM = 0.1
 
 
 class StraightPath(NamedTuple):
-    """Along which a needle is pushed in: its entry (3,), mm, and its unit direction inward (3,), base frame."""
+    """The line of an insertion: its entry (3,), mm, and its unit direction inward (3,), base frame."""
 
     entry_base: Floats
     into_base: Floats
 
 
 class TrueTissue:
-    """Presses on a needle while it goes in; it keeps how deep the tip has been, and where friction holds it.
+    """Tissue that presses on a needle: keeps how deep the tip has been, and where friction holds it.
 
     Along the shaft: capsules, cutting and friction over depth (`planning.needle.insertion_force`). A capsule pushes out
     whatever the tip does; friction and cutting work against the motion. At rest friction resists the
@@ -108,11 +108,11 @@ class TrueTissue:
 
     @property
     def felt(self) -> TissueForce:
-        """The greatest so far."""
+        """The greatest force so far."""
         return self._felt
 
     def __call__(self, tip: Tip) -> tuple[Push, ...]:
-        """What presses on the needle now."""
+        """Forces of the tissue on the needle now."""
         R, at_m = tip.R_base_tip[0], tip.position_m[0]
         depth = float((to_mm(at_m) - self._path.entry_base) @ self._path.into_base)
         along = self._along(depth)
@@ -123,7 +123,7 @@ class TrueTissue:
         return Push(at_tip * side - along * self._path.into_base, at_m), Push(at_holder * side, holder_m)
 
     def _along(self, depth: float) -> float:
-        """N, against the way in."""
+        """Force along the shaft, N, against the insertion."""
         if depth <= 0.0:
             self._held = 0.0
             return 0.0
@@ -137,7 +137,7 @@ class TrueTissue:
         return capsule + friction * stretch / SHIFT_MM + cutting * max(stretch, 0.0) / SHIFT_MM
 
     def _across(self, depth: float) -> tuple[float, float]:
-        """N, to the bevel's side, at the tip and at the holder: together the force and the moment of the beam."""
+        """Forces to the bevel's side at tip and holder, N: together the force and the moment of the beam."""
         force, moment = (
             float(np.interp(max(depth, 0.0), self._bent.depth_mm, term))
             for term in (self._bent.holder_n, self._bent.holder_n_mm)
@@ -166,7 +166,7 @@ NO_TISSUE_FORCE = "no force of tissue: the case declares none ([tissue])"
 
 @dataclass(frozen=True, eq=False)
 class TouchTruth:
-    """One draw of the declared errors.
+    """Ground truth of touches, one draw of the declared errors: patient, markers, and the arm's errors.
 
     Attributes:
         seed: Of it.
@@ -183,7 +183,7 @@ class TouchTruth:
     arrival: dict[str, Floats]
 
     def q_contact(self, model: UrModel, tip_mm: float, touch: Touch) -> Floats:
-        """What the encoders say, shape (6,), rad, when the true tip is on the marker, the needle as planned."""
+        """Encoder angles, shape (6,), rad, when the true tip is on the marker, the needle as planned."""
         there = apply(self.T_base_ct, self.aim_ct[touch.name])
         q_true = joints_at_points(model, there[None], touch.q_touch[None], self.eta[None], tip_mm)[0]
         return np.asarray(q_true - self.arrival[touch.name])
@@ -192,7 +192,7 @@ class TouchTruth:
 def draw_touch_truth(
     T_base_ct: Floats, names: tuple[str, ...], points_ct: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw where everything truly is.
+    """Draw the true patient, markers and arm of touches.
 
     Args:
         T_base_ct: Shape (4, 4), mm: where the patient lies.
@@ -213,7 +213,7 @@ def draw_touch_truth(
 def draw_pivot_truth(
     T_base_ct: Floats, names: tuple[str, ...], place_base: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw what is wrong with an arm that sets its tip onto one place n times; the patient lies as believed.
+    """Draw the errors of an arm that sets its tip onto one place n times; the patient lies as believed.
 
     Args:
         T_base_ct: Shape (4, 4), mm.
@@ -231,14 +231,14 @@ def draw_pivot_truth(
 
 
 class AtTarget(NamedTuple):
-    """What is true when the needle arrives: joints minus encoders, (6,), rad; and where the target is, (3,), mm."""
+    """Truth at the needle's arrival: joints minus encoders, (6,), rad; and the target, (3,), mm."""
 
     arrival: Floats
     target_ct: Floats
 
 
 def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget:
-    """The joints drifted since the touches and arrive with their own error; the target was read with one.
+    """Draw the arrival: joints drifted since the touches with an error of their own; the target's reading error.
 
     Args:
         target_ct: Shape (3,), mm, as read.
@@ -252,6 +252,6 @@ def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget
 
 
 def nominal_tip(model: UrModel, tip_mm: float, q: Floats) -> Floats:
-    """Where the controller says that the tip is, shape (3,), mm, at encoders (6,), rad."""
+    """The tip by the controller, shape (3,), mm, at encoders (6,), rad."""
     T = flange_pose(model, q)
     return np.asarray(T[:3, 3] + tip_mm * T[:3, 2])

@@ -29,14 +29,14 @@ from puncture_twin.planning.uncertainty.sources import not_modelled
 from puncture_twin.twin.rehearsal.trials import Puncture, Trials, draw_trials
 
 CONTACT_MM = 1e-6
-"""Of an axis from a surface that it meets."""
+"""Distance of an axis from a surface that counts as contact."""
 
 ALLOWED = "a case with [errors] and markers, which say what a room may differ by"
 
 
 @dataclass(frozen=True, eq=False)
 class PhysicsTrials:
-    """What the simulator said of some rooms.
+    """Results of some trials in the simulator.
 
     Attributes:
         apart_mm: Shape (n,), its tip from that of the kinematics, in the patient.
@@ -58,7 +58,7 @@ class PhysicsTrials:
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """n rooms of one puncture in which the arm reached the pose; mm.
+    """n trials of one puncture in which the arm reached the pose; mm.
 
     Attributes:
         seed: Of all draws.
@@ -106,17 +106,17 @@ class Distribution:
 
     @property
     def tip_error_mm(self) -> Floats:
-        """Shape (n,)."""
+        """Distance of true tip and true target, shape (n,), mm."""
         return np.asarray(np.linalg.norm(self.error_ct, axis=1))
 
     @property
     def realised_rms_mm(self) -> float:
-        """Of the tip's error."""
+        """Realised rms of the tip's error, mm."""
         return float(np.sqrt(np.mean(self.tip_error_mm**2))) if len(self) else float("nan")
 
     @property
     def predicted_rms_mm(self) -> float:
-        """Of the tip's error."""
+        """Predicted rms of the tip's error, mm."""
         return float(np.sqrt(np.trace(self.cov_ct)))
 
     def summary(self) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def _fraction(rooms: Bools) -> float | None:
 def rehearse_trials(
     context: CaseContext, outward_ct: Floats, q_insertion: Floats, count: int, seed: int
 ) -> Distribution:
-    """Rehearse one direction in many rooms, each with a truth of its own.
+    """Rehearse one direction in many trials, each with a truth of its own.
 
     Args:
         context: Of a case with declared errors and markers.
@@ -183,7 +183,7 @@ def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
 
 
 class _Query(NamedTuple):
-    """What rooms are drawn of."""
+    """Belief and truth that trials are drawn of."""
 
     believed: PoseError
     puncture: Puncture
@@ -210,7 +210,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
 
 
 def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
-    """How far the bevel takes the needle off along one direction, if it never turns; None for a straight one.
+    """Deflection along one direction, if the bevel never rotates; None for a straight needle.
 
     Args:
         context: Of a case.
@@ -221,7 +221,7 @@ def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
 
 
 def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
-    """The pose error of rooms: touches as there, and errors of the size that the markers say, taken for declared."""
+    """The pose error of trials: touches as there, and errors of the estimated size taken as declared."""
     errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
     noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
     test = NoiseTest(fit.test.count, float(fit.test.freedom))
@@ -229,7 +229,7 @@ def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
 
 
 def _measured(context: CaseContext, query: _Query, rooms: Trials, off: Floats, seed: int) -> Distribution:
-    """What happened; ``off`` has a normal number for the surface of each structure in each room that is reached."""
+    """The distribution of trials; ``off`` has a normal number for each structure's surface in each trial."""
     case, believed, puncture = context.case, query.believed, query.puncture
     q = puncture.q_insertion[None]
     unreached = int((~rooms.reached).sum())
@@ -261,7 +261,7 @@ def _measured(context: CaseContext, query: _Query, rooms: Trials, off: Floats, s
 
 
 def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:
-    """By what each structure's surface may lie off as a whole where the needle passes it; the target's anywhere; mm."""
+    """Deviation of each structure's surface as a whole where the needle passes it; of the target's anywhere; mm."""
     checked, outward_ct = model.anatomy.checked, puncture.outward_ct[None]
     axes = model.engine.measure(puncture.target_ct, outward_ct, own_lengths(model.case, model.anatomy, outward_ct))
     normals = normals_of(model.engine.triangles, puncture.target_ct, outward_ct, axes)[0]
@@ -273,7 +273,7 @@ def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floa
 
 
 def _hits(context: CaseContext, rooms: Trials, off_mm: Floats) -> Bools:
-    """Within the radius of the true target, or in the mesh, which comes from the target's own scan and may lie off."""
+    """Which trials hit: within the radius of the true target, or in the mesh of the target's own scan."""
     case = context.case
     if case.hit_radius_mm is not None:
         return np.asarray(np.linalg.norm(rooms.tip_ct - rooms.target_ct, axis=1) < case.hit_radius_mm)
@@ -291,7 +291,7 @@ def _target_column(anatomy: Anatomy, case: Case) -> int:
 
 
 def _touches(context: CaseContext, puncture: Puncture, rooms: Trials, off_mm: Floats) -> Bools:
-    """Which structures each room's needle touches, shape (n, k), by FCL's capsule where a bound does not exclude it.
+    """Structures that each trial's needle touches, shape (n, k), by FCL's capsule where no bound excludes it.
 
     A surface that lies farther out is touched from farther; one that lies deeper than the needle is thick is touched
     where the axis meets it as it was drawn, as in `line_chance`.

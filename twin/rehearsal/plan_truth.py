@@ -32,11 +32,11 @@ from puncture_twin.twin.rehearsal.result import PredictedScale, Rehearsal, Scale
 from puncture_twin.twin.rehearsal.trials import Puncture, Trials, bent
 
 TRIED = 16
-"""Rooms that are drawn for one: the arm may not reach the pose that a room's registration asks for."""
+"""Trials that are drawn for one: the arm may not reach the pose that a trial's registration demands."""
 
 
 def drawn_truth(puncture: Puncture, rooms: Trials, row: int, seed: int, source: str) -> Truth:
-    """The truth whose execution ends as one of the rooms did.
+    """The truth whose execution ends as one of the trials did.
 
     Args:
         puncture: What the rooms repeat.
@@ -54,7 +54,7 @@ def drawn_truth(puncture: Puncture, rooms: Trials, row: int, seed: int, source: 
 
 
 def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Truth:
-    """What one rehearsal meets: a room of the declared errors, unless the case names true positions or declares none.
+    """The truth of one rehearsal: a trial of the declared errors, unless the case states true positions or none.
 
     Args:
         context: The plan's case.
@@ -75,7 +75,7 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
 
 
 def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
-    """The same truth with a needle that bends to a drawn side: the patient moved by what a straight one misses.
+    """A truth with a needle that bends to a drawn side: the patient moved by what a straight one misses.
 
     Args:
         context: The plan's case; where it declares no tissue, nothing bends.
@@ -95,7 +95,7 @@ def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
 
 
 def median_truth(found: Distribution) -> Truth:
-    """The truth of the median room by tip error.
+    """The truth of the median trial by tip error.
 
     Raises:
         NoAnswerError: As `plan_truth`.
@@ -106,7 +106,7 @@ def median_truth(found: Distribution) -> Truth:
 
 
 def spread_rows(found: Distribution, count: int) -> Ints:
-    """Rooms spread evenly over the order of their tip errors, shape (count,) at most; the median where it is one."""
+    """Trials spread evenly over the order of their tip errors, shape (count,) at most; the median where it is one."""
     order = np.argsort(found.tip_error_mm, kind="stable")
     places = ((np.arange(count) + 0.5) / count * len(order) - 0.5).round(9)
     return np.asarray(np.unique(order[np.floor(places).clip(0).astype(np.int64)]))
@@ -125,7 +125,7 @@ def _declared(found: Distribution) -> str:
 
 
 def error_scale(context: CaseContext, q_insertion: Floats, found: Distribution | None) -> Scale | None:
-    """What a tip error is held against: the rooms, or without rooms the prediction; None without declared errors."""
+    """Scale of a tip error: the trials', or without trials the prediction's; None without declared errors."""
     if found is not None:
         return TrialScale(found.tip_error_mm, len(found) + found.unreached)
     registration = None if context.placement is None else context.placement.registration
@@ -138,7 +138,7 @@ def error_scale(context: CaseContext, q_insertion: Floats, found: Distribution |
 
 
 def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Rehearsal:
-    """Execute the puncture of touches where everything truly is. The same arguments give the same numbers.
+    """Execute the puncture of touches in their ground truth. The same arguments give the same numbers.
 
     Args:
         context: The case.
@@ -162,7 +162,7 @@ def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
 
 
 def physics_trials(context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count) -> PhysicsTrials:
-    """Run some of the rooms, spread evenly over the order of their tip errors, in the simulator.
+    """Run some of the trials, spread evenly over the order of their tip errors, in the simulator.
 
     Args:
         context: The plan's case.

@@ -42,7 +42,7 @@ CLEARANCE_SAMPLES = 48
 
 @dataclass(frozen=True)
 class TipError:
-    """Where a needle ended, seen from the target; mm. total^2 = lateral^2 + depth^2."""
+    """Error of a needle's tip from the target; mm. total^2 = lateral^2 + depth^2."""
 
     total_mm: float
     lateral_mm: float
@@ -114,7 +114,7 @@ def split_error(tip: Floats, forward: Floats, target: Floats) -> TipError:
 
 
 def _clearance_samples(phase: NDArray[np.str_]) -> NDArray[np.int64]:
-    """Records spread over the insertion, and the last of all."""
+    """Rows of records spread over the insertion, and the last of all."""
     candidates = np.append(np.flatnonzero(phase == "insertion"), len(phase) - 1)
     spread = np.round(np.linspace(0, len(candidates) - 1, CLEARANCE_SAMPLES)).astype(np.int64)
     return np.unique(candidates[spread])
@@ -143,7 +143,7 @@ def _clearances(
 def _contacts(
     case: Case, anatomy: Anatomy, truth: Truth, done: Execution, times_s: Floats, phase: NDArray[np.str_]
 ) -> tuple[RehearsalContact, ...]:
-    """What the physics felt at every step, and what FCL finds at every record, arm and patient where they truly were.
+    """Contacts by the physics at every step, and by FCL at every record, arm and patient at their true places.
 
     The physics lets the needle pass the skin and the arm pass itself, and rounds large skins; FCL says the first
     contact of a record only.
@@ -181,7 +181,7 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Executed:
-    """What the simulator measured.
+    """Measurements of the simulator.
 
     Attributes:
         execution: Its records.
@@ -197,7 +197,7 @@ class Executed:
 
 
 def executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executed:
-    """Execute a plan; arguments and errors as of `rehearse`."""
+    """Execute a plan in the simulator; arguments and errors as of `rehearse`."""
     T_base_ct, tissue = truth.T_base_ct_true, true_tissue(plan, case, anatomy, truth)
     model, tool, boxes = plan.model, case_tool(case), case_boxes(case, T_base_ct)
     down_ct = -bed_frame(case)[:3, 2]
@@ -224,7 +224,7 @@ def steps(trajectory: Trajectory) -> Floats:
 
 
 def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueTissue | None:
-    """The declared tissue on the axis that the plan's needle truly takes; None without tissue, or where it meets none.
+    """The declared tissue on the true axis of the plan's needle; None without tissue, or where it passes none.
 
     Args:
         plan: What is executed.
@@ -250,7 +250,7 @@ def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueT
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """What was measured of the sweep, its approach left out; m records.
+    """Measurements of a sweep without its approach; m records.
 
     Attributes:
         times_s: Shape (m,).
@@ -264,7 +264,7 @@ class Swept:
 
 
 def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floats) -> Swept:
-    """Sweep in the workcell as it is believed: what is measured is control, by `[rehearsal] control` of the case.
+    """Execute a sweep in the believed workcell: what is measured is control, by `[rehearsal] control` of the case.
 
     Args:
         plan: The motion.

@@ -17,7 +17,7 @@ from puncture_twin.twin.plant.true_needle import NO_TISSUE_FORCE, TissueForce
 
 @dataclass(frozen=True)
 class ErrorRank:
-    """The place of a rehearsal's tip error among those of rooms, or in the predicted distribution.
+    """Percentile of a rehearsal's tip error among trials, or in the predicted distribution.
 
     Attributes:
         percentile: 0 to 100; so many of 100 rooms end nearer to the target.
@@ -34,7 +34,7 @@ class ErrorRank:
 
     @property
     def text(self) -> str:
-        """For headlines and text."""
+        """The rank for headlines and text."""
         if self.rooms == 0:
             return f"{self.place} of the tip errors that are predicted"
         return (
@@ -43,7 +43,7 @@ class ErrorRank:
 
     @property
     def short(self) -> str:
-        """For a frame of the film."""
+        """The rank for a frame of the film."""
         if self.rooms == 0:
             return f"{self.place} by prediction"
         return f"median of {self.rooms:,} rooms" if self.rooms > 1 else "the only room"
@@ -55,7 +55,7 @@ class ErrorRank:
 
 @dataclass(frozen=True, eq=False)
 class TrialScale:
-    """The tip errors of rooms, of which one is rehearsed.
+    """Tip errors of trials, of which one is rehearsed.
 
     Attributes:
         errors_mm: Shape (n,), of those in which the arm reached the pose.
@@ -66,7 +66,7 @@ class TrialScale:
     rooms: int
 
     def of(self, tip_error_mm: float) -> ErrorRank:
-        """Where an error stands among them."""
+        """Rank of an error among them."""
         below = np.mean(self.errors_mm < tip_error_mm) + np.mean(self.errors_mm <= tip_error_mm)
         return ErrorRank(float(50 * below), self.rooms)
 
@@ -84,16 +84,16 @@ class PredictedScale:
     freedom: int | None
 
     def of(self, tip_error_mm: float) -> ErrorRank:
-        """Where an error stands in it."""
+        """Rank of an error in it."""
         return ErrorRank(100 * float(hit_in_ball(self.cov, tip_error_mm, self.freedom)[0]))
 
 
 Scale = TrialScale | PredictedScale
-"""What a tip error is held against."""
+"""The distribution that a tip error is ranked in."""
 
 
 def ordinal(number: int) -> str:
-    """1st, 2nd, 3rd, 4th ... 11th ... 21st."""
+    """A number as 1st, 2nd, 3rd, 4th ... 11th ... 21st."""
     last = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
     return f"{number}{last}"
 
@@ -127,7 +127,7 @@ class RehearsalContact:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
-    """What was measured; m records in time, k samples of clearance. Angles in rad, lengths in mm.
+    """Measurements of a rehearsal; m records in time, k samples of clearance. Angles in rad, lengths in mm.
 
     Attributes:
         seed: What the truth was drawn from.
@@ -193,7 +193,7 @@ class Rehearsal:
 
     @property
     def force_text(self) -> str:
-        """What the tissue did, for a person."""
+        """Forces of the tissue, for a person."""
         return NO_TISSUE_FORCE if self.felt is None else self.felt.text
 
     def __post_init__(self) -> None:

@@ -60,7 +60,7 @@ NEAR_SPEED_MM_S = 25.0
 """Of the straight line before them, and back."""
 
 CONTACT_N = 0.5
-"""A force along the needle above which the marker is felt."""
+"""Force along the needle, N, that counts as contact."""
 
 CONTACT_STEPS = 3
 """In a row: a sensor's noise alone does not reach it so often."""
@@ -87,7 +87,7 @@ PAUSE_S = 0.25
 
 
 class TouchReading(NamedTuple):
-    """One executed touch."""
+    """Reading of one executed touch."""
 
     name: str
     point_base: Floats
@@ -101,25 +101,25 @@ class TouchReading(NamedTuple):
     bias_mm: float
     """How deep in the marker the tip was when the joints were read."""
     speed_mm_s: float
-    """Of the tip when it was felt."""
+    """Tip speed at contact."""
     aside_mm: float
     """By how much the line was moved at the standoff."""
 
 
 class FailedTouch(NamedTuple):
-    """A marker that was not read, the arm back at its standoff: why, and what it took."""
+    """A marker that was not read, the arm back at its standoff: the reason, and the time."""
 
     why: str
     seconds: float
 
 
 class StoppedError(Exception):
-    """The arm stopped where no plan led it on: something is not where it is believed to be."""
+    """The arm stopped where it had no planned path: something is not where it is believed to be."""
 
 
 @dataclass(frozen=True, eq=False)
 class TouchingCell:
-    """What every touch uses.
+    """Workcell, tool and generators of every touch.
 
     Attributes:
         room: The simulated workcell.
@@ -141,7 +141,7 @@ class TouchingCell:
 
 
 class _Line(NamedTuple):
-    """The straight line to a marker as it was set at the standoff."""
+    """The straight line to a marker, set at the standoff."""
 
     far: Floats
     """Shape (m, 6), rad: from the standoff to where the slow part begins."""
@@ -219,14 +219,14 @@ def _felt_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchReadin
 
 
 def _back(cell: TouchingCell, touch: Touch, line: _Line, q: Floats) -> Trajectory:
-    """From a configuration (6,), rad, on the line, along it, to the standoff."""
+    """Move from a configuration (6,), rad, on the line, along it, to the standoff."""
     rows = np.vstack([line.far, line.near])
     passed = _tip_mm(cell, rows) @ line.axis_base < _tip_mm(cell, q[None])[0] @ line.axis_base - PASSED_MM
     return _slow(cell, np.vstack([q[None], rows[passed][::-1], touch.come.q[-1:]]))
 
 
 PASSED_MM = 0.1
-"""Rows of the line nearer to the tip than this are not gone back to: where it stands, it stands."""
+"""Rows of the line nearer to the tip than this are not returned to."""
 
 
 def _pad(cell: TouchingCell, line: _Line) -> int:
@@ -238,7 +238,7 @@ def _pad(cell: TouchingCell, line: _Line) -> int:
 
 
 def _felt(cell: TouchingCell, line: _Line, arrival: Floats) -> Run:
-    """The last millimetres under a spring at the tip, until contact is felt or the line ends."""
+    """Move the last millimetres under a spring at the tip, until contact is measured or the line ends."""
     J = tips(cell.tour.model, cell.rigid.tip_m, line.near[:1]).J[0]
     dt = allowed_step(SPRING, J, cell.rigid.mass_matrix(line.near[0]))
     controller = Impedance(cell.rigid, SPRING, dt)
@@ -247,7 +247,7 @@ def _felt(cell: TouchingCell, line: _Line, arrival: Floats) -> Run:
 
 
 class _Contact:
-    """Says when the marker is felt: a force along the needle, some readings in a row."""
+    """Detects contact with the marker: a force along the needle, some readings in a row."""
 
     def __init__(self, cell: TouchingCell, line: _Line) -> None:
         self._rng, self._axis, self._in_a_row = cell.rng, line.axis_base, 0
@@ -275,7 +275,7 @@ def _tip_mm(cell: TouchingCell, q: Floats) -> Floats:
 
 
 def _moved(cell: TouchingCell, trajectory: Trajectory, arrival: Floats) -> Run:
-    """A motion by the position motors."""
+    """Execute a motion by the position motors."""
     return _run(cell, Motors(), trajectory, arrival, None)
 
 
@@ -323,13 +323,13 @@ def _refuse_contacts(cell: TouchingCell) -> None:
 
 
 def seconds_of(done: Run) -> float:
-    """How long a motion took."""
+    """Duration of a motion, s."""
     return done.dt * len(done.q)
 
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """All of them, in their order.
+    """Readings of all touches, in their order.
 
     Attributes:
         readings: One a marker that was felt.
@@ -345,7 +345,7 @@ class Touched:
 def execute_touches(
     tour: TouchTour, case: Case, anatomy: Anatomy, checkers: ApproachCheckers, truth: TouchTruth, progress: Count
 ) -> Touched:
-    """Touch the markers where they truly are. The same tour and truth give the same numbers.
+    """Touch the markers at their true places. The same tour and truth give the same numbers.
 
     A marker that is not felt where it should be is given up with its reason, and the arm goes on from its standoff.
     Where the arm or needle touched something else it stops, and what was not read by then stays unread.
@@ -371,7 +371,7 @@ def execute_touches(
 
 
 def _tour(cell: TouchingCell, progress: Count) -> Touched:
-    """Every marker, and home."""
+    """Touch every marker, and go home."""
     readings: list[TouchReading] = []
     failed: dict[str, str] = {}
     touches, seconds = cell.tour.touches, 0.0

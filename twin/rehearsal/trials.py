@@ -36,7 +36,7 @@ from puncture_twin.twin.plant.true_needle import TrueNeedle, joints_at_points, t
 
 @dataclass(frozen=True, eq=False)
 class Puncture:
-    """What every room repeats: the belief, and the commands that follow from it.
+    """Common part of all trials: the belief, and the commands that follow from it.
 
     Attributes:
         model: The arm.
@@ -68,7 +68,7 @@ class Puncture:
 
 
 class Trials(NamedTuple):
-    """What happened in n rooms; CT frame, mm.
+    """Results of n trials; CT frame, mm.
 
     Attributes:
         tip_ct: Shape (n, 3), where the tip ended.
@@ -91,16 +91,16 @@ class Trials(NamedTuple):
     bevel_side: Floats
 
     def of(self, rows: Bools | Ints) -> Trials:
-        """Some of the rooms."""
+        """The results of some trials."""
         return Trials._make(column[rows] for column in self)
 
     def reached_alone(self) -> Trials:
-        """Without the rooms in which the arm did not reach the pose."""
+        """The trials in which the arm reached the pose."""
         return self.of(self.reached)
 
 
 def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Trials:
-    """Draw rooms from declared errors and rehearse the puncture in each.
+    """Draw trials from declared errors and rehearse the puncture in each.
 
     Args:
         puncture: What every room repeats.
@@ -126,7 +126,7 @@ def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rand
 
 
 def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
-    """Needles whose bevel took them off, each turned about where it is held so that its straight line ends at the tip.
+    """Bent needles, each rotated about its clamp so that its straight line ends at the tip.
 
     Args:
         needle: n straight needles.
@@ -140,7 +140,7 @@ def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
 
 
 def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:
-    """Of residuals (n, 3 N) in base axes, by the nominal registration's weights, as `noise_test` computes it."""
+    """Chi-squared of residuals (n, 3 N) in base axes, by the nominal registration's weights."""
     R, points = puncture.T_base_ct[:3, :3], apply(puncture.T_base_ct, puncture.points_ct)
     A = design(points, points.mean(axis=0))
     weights = np.asarray(np.linalg.inv(puncture.noise.covariance(R).whole), dtype=np.float64)
@@ -149,7 +149,7 @@ def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:
 
 
 def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """T_base_ct of every room, shape (n, 4, 4), and its residuals, shape (n, 3 N), mm, base axes.
+    """T_base_ct of every trial, shape (n, 4, 4), and its residuals, shape (n, 3 N), mm, base axes.
 
     Markers are read with errors, and touched by an arm that errs.
     """

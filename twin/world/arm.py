@@ -27,7 +27,7 @@ VELOCITY_GAIN = 1.0
 
 
 class JointState(NamedTuple):
-    """What the joints do now."""
+    """Angles and speeds of the joints."""
 
     q: Floats
     """Shape (6,), rad."""

@@ -74,7 +74,7 @@ class Insertion:
 
 
 class Inserted(NamedTuple):
-    """What happened, and how far the tip was from where it should be, as the encoders say, at most, mm."""
+    """Records of an insertion, and the tip's largest deviation from the reference by the encoders, mm."""
 
     execution: Execution
     off_path_mm: float
@@ -114,7 +114,7 @@ def insert(
 
 
 def _controller(rigid: RigidModel, control: TipControl, q_path: Floats) -> Controller:
-    """The controller with the longest step that the whole path allows."""
+    """The controller with the longest step that is stable on the whole path."""
     if control == "position":
         return Motors()
     if control == "admittance":
@@ -131,7 +131,7 @@ MOST_DECAY = 2.0
 
 @dataclass(frozen=True)
 class VirtualMass:
-    """What the tip pretends to be: M x'' + D x' + K x = F."""
+    """Virtual mass of the tip: M x'' + D x' + K x = F."""
 
     mass_kg: float = 1.0
     damping_ns_m: float = 63.0
@@ -346,7 +346,7 @@ class Reference:
 
 
 def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float, hold_s: float = 0.0) -> Reference:
-    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then held.
+    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then constant.
 
     Args:
         model: The arm.
@@ -405,7 +405,7 @@ TIP_LINK = "needle"
 
 
 class Measured(NamedTuple):
-    """What a controller is told at one step."""
+    """Measurements that a controller gets at one step."""
 
     q: Floats
     """Shape (6,), rad, what the encoders say."""
@@ -416,14 +416,14 @@ class Measured(NamedTuple):
 
 
 class Torques(NamedTuple):
-    """For the next step, the motors off."""
+    """Joint torques for the next step, the motors off."""
 
     torque_nm: Floats
     """Shape (6,)."""
 
 
 class Goals(NamedTuple):
-    """Of the position motors."""
+    """Goals of the position motors."""
 
     q: Floats
     """Shape (6,), rad, encoders."""
@@ -437,7 +437,7 @@ class Controller(Protocol):
     dt: float
 
     def act(self, measured: Measured, reference: Reference, row: int) -> Torques | Goals:
-        """What the joints shall do in the next step."""
+        """Torques or goals for the next step."""
 
 
 class Push(NamedTuple):
@@ -450,12 +450,12 @@ class Push(NamedTuple):
 
 
 Resistance = Callable[[Tip], Sequence[Push]]
-"""What tissue presses on the needle with, now that its tip is there (one row). It may remember where the tip was."""
+"""Forces of tissue on the needle for the present tip (one row). It may remember where the tip was."""
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One row a step: at its start, and the force of the step before.
+    """Records of a run, one row a step: at its start, and the force of the step before.
 
     Attributes:
         dt: Between rows, s.
@@ -477,7 +477,7 @@ Stop = Callable[[Measured], bool]
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What acts on the arm besides its controller.
+    """Forces on the arm besides its controller.
 
     Attributes:
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
@@ -535,7 +535,7 @@ def _give(arm: Arm, action: Torques | Goals, joint_offsets: Floats) -> None:
 
 
 class Motors:
-    """The reference's joints are the motors' goals, whatever is measured."""
+    """A controller that passes the reference's joints to the motors, whatever is measured."""
 
     dt = TIME_STEP_S
 
@@ -547,7 +547,7 @@ class Motors:
 
 @dataclass(frozen=True)
 class RigidModel:
-    """What the controller knows of the arm's masses; it never moves.
+    """The controller's model of the arm's masses; it never moves.
 
     PyBullet evaluates inverse dynamics as if the body's base were not rotated in the world: gravity enters in world
     axes and leaves in base axes. The model therefore has a world of its own, its URDF base unrotated, under a gravity

@@ -27,7 +27,7 @@ class TouchAt(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """What was measured, one row for each of m records.
+    """Records of an execution, one row for each of m.
 
     Attributes:
         times_s: Shape (m,), of each record, from the first command.
@@ -47,7 +47,7 @@ class Execution:
 
 
 class Recorder:
-    """Looks at the arm after every physics step, and keeps a record `RECORD_S` apart and at the end.
+    """Records the arm after physics steps: `RECORD_S` apart, and at the end.
 
     Args:
         workcell: An open room.
@@ -69,7 +69,7 @@ class Recorder:
         self._max_speed = np.zeros(6)
 
     def see(self, row: int) -> None:
-        """Look after the step of a row."""
+        """Record after the step of a row."""
         arm, state = self._room.arm, self._room.arm.state()
         self._max_speed = np.maximum(self._max_speed, np.abs(state.speed))
         time = self._time(row)
@@ -80,7 +80,7 @@ class Recorder:
             self._poses.append(arm.flange_pose())
 
     def execution(self) -> Execution:
-        """What was seen so far."""
+        """The records so far."""
         times = np.array([self._time(row) for row in self._rows])
         found = np.array(self._q), np.array(self._poses), tuple(self._touches), self._max_speed
         return Execution(times, self._q_command[self._rows], *found)

@@ -42,7 +42,7 @@ Box = tuple[slice, slice, slice]
 
 
 class Metal(NamedTuple):
-    """One connected piece.
+    """One connected piece of metal.
 
     Attributes:
         box: Its voxels' box with `AROUND_MM` about it.
@@ -95,7 +95,7 @@ def metal_pieces(volume: Volume, level_hu: float = METAL_HU, without: Bools | No
 
 
 def metal_parts(volume: Volume, metal: Metal) -> Floats:
-    """How much of each voxel of a piece's box is metal, 0 to 1, as far as a clipped range tells.
+    """Part of each voxel of a piece's box that is metal, 0 to 1, as far as a clipped range allows.
 
     What a voxel would show without metal is what the nearest voxel shows that is too far away to be blurred by it:
     air on one side of a marker and skin on the other. Without that, air would hide the outer edge of a marker.
@@ -116,12 +116,12 @@ def metal_parts(volume: Volume, metal: Metal) -> Floats:
 
 
 def full_part(volume: Volume) -> float:
-    """From which part of metal on a voxel is clipped, in soft tissue."""
+    """Part of metal from which a voxel is clipped, in soft tissue."""
     return float(volume.values.max()) / SOLID_HU
 
 
 def metal_weights(volume: Volume, metal: Metal) -> Floats:
-    """The same, counted as full from where it may be clipped: in air and in tissue alike."""
+    """Weights of metal, counted as full from where a voxel may be clipped: in air and in tissue alike."""
     full = full_part(volume)
     return np.asarray(np.minimum(metal_parts(volume, metal), full) / full)
 
@@ -145,7 +145,7 @@ def _others(axis: int) -> tuple[int, int]:
 
 
 READING_MM = 1.0
-"""To what a person reads a place in a slice."""
+"""mm to which a person reads a place in a slice."""
 FARTHEST_MM = 15.0
 """A marker lies no farther from where it is expected."""
 LARGEST_MM = 25.0
@@ -153,7 +153,7 @@ LARGEST_MM = 25.0
 
 
 class Markers(NamedTuple):
-    """What was found, in the order of what was expected.
+    """Markers that were found, in the order of those expected.
 
     Attributes:
         fine: By the middle of the metal.
@@ -198,7 +198,7 @@ def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[M
 
 
 def _by_rule(weights: Floats, piece: Metal, volume: Volume) -> Floats:
-    """The slice with most of the metal, and there its middle to a millimetre."""
+    """The place by the paper's rule: the slice with most of the metal, and there its middle to a millimetre."""
     k = int(np.argmax(weights.sum(axis=(0, 1))))
     i, j = (float(line @ np.arange(len(line)) / line.sum()) for line in _sides(weights[:, :, k]))
     spacing = spacing_mm(volume)

@@ -63,7 +63,7 @@ class _Line(NamedTuple):
 
 
 class FoundNeedle(NamedTuple):
-    """What was found, LPS mm.
+    """A needle that was found, LPS mm.
 
     Attributes:
         tip_ct: Shape (3,).
@@ -108,7 +108,7 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
 
 
 def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bools) -> None:
-    """Refuse a tip at other metal: what is found there is where that begins, not where the needle ends.
+    """Refuse a tip at other metal: there the other metal begins, and the needle's end is not seen.
 
     Raises:
         InputError: It is.
@@ -125,7 +125,7 @@ def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bo
 
 
 def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats, hidden: Bools) -> tuple[Metal, _Line]:
-    """All of a needle of which thick slices, between which it is diluted, show only pieces at first."""
+    """All of a needle that thick slices, between which it is diluted, show only in pieces at first."""
     for _ in range(GROWTHS):
         at = np.argwhere((volume.values > LEVELS_HU[-1]) & ~hidden)
         points = apply(volume.T_ct_index, at.astype(float)) - line.middle
@@ -260,7 +260,7 @@ def _blur(volume: Volume) -> Floats:
 
 
 class NeedleError(NamedTuple):
-    """Where a needle ended, seen from the target, mm: total² = lateral² + depth², depth positive when too deep."""
+    """A needle's error seen from the target, mm: total² = lateral² + depth², depth positive when too deep."""
 
     tip_to_target_mm: float
     lateral_mm: float

@@ -137,7 +137,7 @@ def pivot_calibration(
 
 
 def arm_covariance(errors: ErrorModel, model: UrModel, tip_mm: float, q: Floats) -> Floats:
-    """Of n touches of one place, all that is declared but touch noise and the tip itself.
+    """Covariance of n touches of one place by all that is declared but touch noise and the tip itself.
 
     Args:
         errors: As declared.

@@ -22,14 +22,14 @@ from puncture_twin.twin.guidance.stereo.servo_loop import Lost
 from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell
 
 DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
-"""Fraction of the light that comes from everywhere; the rest is a lamp's."""
+"""Fraction of diffuse light; the rest is from one direction."""
 
 WINDOW_MARGIN_PX = 24
 """A picture, and the rod in it, are drawn this far beyond the region that is searched: the rest is never looked at."""
 
 
 class LocatedPair(NamedTuple):
-    """A ball as it truly stands, C, mm."""
+    """The true ball, C, mm."""
 
     center_c: Floats
     """Shape (3,)."""
@@ -50,7 +50,7 @@ class Detection(NamedTuple):
 
 
 class Search(NamedTuple):
-    """Where to look for a ball."""
+    """Search region of a ball."""
 
     camera: Camera
     """As it is believed."""
@@ -60,7 +60,7 @@ class Search(NamedTuple):
 
 
 Detector = Callable[[int, LocatedPair, Search], Detection | Lost]
-"""Takes the camera's number, the ball as it truly is, and where to look."""
+"""Takes the camera's number, the true ball, and the search region."""
 
 
 class Detections(NamedTuple):
@@ -98,7 +98,7 @@ def picture_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Dete
 
 
 def ball_scene(plan: CamerasSection, ball: LocatedPair, hidden: float, rng: np.random.Generator) -> BallScene:
-    """The ball for the picture; an occluder that the case asks for comes from any side."""
+    """The scene of a ball; an occluder that the case demands comes from any side."""
     fraction = min(max(plan.occlusion if ball.rod_c is not None else 0.0, hidden), 0.99)
     return BallScene(
         ball.center_c,
@@ -112,7 +112,7 @@ def ball_scene(plan: CamerasSection, ball: LocatedPair, hidden: float, rng: np.r
 
 
 def look_at(detector: Detector, ball: LocatedPair, searches: tuple[Search, ...], frames: int = 1) -> Detections | Lost:
-    """One ball in every camera, several pictures each; all must show it.
+    """One ball in every camera, several images each; all must show it.
 
     Pictures of one camera are averaged by their inverse covariances.
     """
@@ -132,5 +132,5 @@ def look_at(detector: Detector, ball: LocatedPair, searches: tuple[Search, ...],
 
 
 def in_space(cameras: tuple[Camera, ...], detections: Detections) -> Points:
-    """One ball's place in C from its pixels."""
+    """Position of one ball in C from its pixels."""
     return triangulate(cameras, detections.pixels[:, None], detections.covariances[:, None])

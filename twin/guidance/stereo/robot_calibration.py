@@ -33,7 +33,7 @@ FIRST_SEARCH_PX = 80.0
 
 @dataclass(frozen=True, eq=False)
 class RobotCalibration:
-    """The calibration, k points.
+    """Result of a calibration with k points.
 
     Attributes:
         cameras: The calibrated cameras.
@@ -61,20 +61,20 @@ class RobotCalibration:
 
 
 def carried_rod(case: ServoCase, workcell: StereoWorkcell) -> CarriedRod:
-    """The nominal arm with the case's rod, as it is held at the targets."""
+    """The nominal arm with the case's rod, in the orientation of the targets."""
     tool = case.file.tool
     return CarriedRod(workcell.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
 
 
 def calibrating_rod(case: ServoCase, workcell: StereoWorkcell) -> CarriedRod:
-    """The same, as it is held during the calibration."""
+    """The nominal arm with the case's rod, in the orientation of the calibration."""
     tilt = case.file.calibration.tilt_deg
     rod = carried_rod(case, workcell)
     return rod if tilt is None else rod._replace(R_base_flange=rod_orientation(float(np.radians(tilt))))
 
 
 def grid_points(case: ServoCase) -> Floats:
-    """The calibration's points, base frame, shape (12, 3), mm: neighbours in the order of the arm's way."""
+    """The calibration's points, base frame, shape (12, 3), mm: neighbours in the order of the arm's path."""
     cal = case.file.calibration
     steps = np.array(list(product(*(np.linspace(-0.5, 0.5, count) for count in GRID))))
     return np.asarray(cal.center_mm + steps * cal.size_mm)
@@ -83,7 +83,7 @@ def grid_points(case: ServoCase) -> Floats:
 def calibrate_by_robot(
     workcell: StereoWorkcell, detector: Detector, checker: StateChecker, rng: np.random.Generator
 ) -> RobotCalibration:
-    """Drive to the points, look, measure, and fit.
+    """Move to the points, detect, measure, and fit.
 
     Args:
         workcell: The true room.

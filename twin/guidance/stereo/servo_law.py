@@ -71,7 +71,7 @@ class ServoStop(StrEnum):
 
 
 class StepLimits(NamedTuple):
-    """What one step may do."""
+    """Limits of one step."""
 
     step_mm: float = 10.0
     joint_step_rad: float = math.radians(10.0)
@@ -81,7 +81,7 @@ class StepLimits(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A step's way."""
+    """The joint path of one step."""
 
     q_path: Floats
     """Shape (m, 6), rad: from where the arm stands; one row where it may not go anywhere."""
@@ -92,7 +92,7 @@ class Step(NamedTuple):
 
 
 class CarriedRod(NamedTuple):
-    """What the arm carries and how it is to be held."""
+    """The rod on the arm, and the orientation to keep."""
 
     model: UrModel
     rod_mm: float
@@ -101,7 +101,7 @@ class CarriedRod(NamedTuple):
 
 
 def ball_base(rod: CarriedRod, q: Floats) -> Floats:
-    """Where the nominal arm has its ball, shape (..., 3), mm, base frame."""
+    """Position of the nominal arm's ball, shape (..., 3), mm, base frame."""
     flange = flange_pose(rod.model, q)
     return np.asarray(flange[..., :3, 3] + rod.rod_mm * flange[..., :3, 2])
 
@@ -115,7 +115,7 @@ def ball_jacobian(rod: CarriedRod, q: Floats) -> Floats:
 
 
 def orientation_error(rod: CarriedRod, q: Floats) -> Floats:
-    """The turn (3,), rad, base frame, that brings the flange back to the orientation to keep."""
+    """The rotation (3,), rad, base frame, that brings the flange back to the orientation to keep."""
     R = flange_pose(rod.model, q)[:3, :3]
     return log_rotation(rod.R_base_flange @ R.T)
 
@@ -126,7 +126,7 @@ def smallest_sigma(J: Floats) -> float:
 
 
 def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits) -> Step:
-    """The way that moves the ball by a vector and keeps the needle's orientation.
+    """The joint path that moves the ball by a vector and keeps the needle's orientation.
 
     Args:
         rod: The arm and its rod.
@@ -155,7 +155,7 @@ def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits
 
 
 def _piece(rod: CarriedRod, q: Floats, move: Floats) -> tuple[Floats, bool]:
-    """Joint turns (6,) of one piece, and whether the orientation was given up."""
+    """Joint rotations (6,) of one piece, and whether the orientation was given up."""
     J = ball_jacobian(rod, q)
     goal = np.concatenate([move / CHARACTERISTIC_MM, orientation_error(rod, q)])
     if smallest_sigma(J) >= MIN_SIGMA:
@@ -193,7 +193,7 @@ CONVERGED = 1e-12
 
 
 class SeenMarkers(NamedTuple):
-    """Markers as the cameras have them."""
+    """Markers as triangulated by the cameras."""
 
     points_c: Floats
     """Shape (n, 3), mm."""
@@ -203,7 +203,7 @@ class SeenMarkers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Mapping:
-    """c_T_m and what is known of its error.
+    """c_T_m with its covariance.
 
     Attributes:
         T_c_m: Shape (4, 4), rigid, mm.
@@ -253,7 +253,7 @@ def map_head(
     *,
     where: str | Path = "mapping",
 ) -> Mapping:
-    """Fit c_T_m.
+    """Fit c_T_m to markers in the image and in C, weighted by both covariances.
 
     Args:
         names: The markers, n at least 3.
@@ -317,7 +317,7 @@ def flange_poses(rod: CarriedRod, points_base: Floats) -> Floats:
 
 
 class Posture(NamedTuple):
-    """How the arm holds a set of points."""
+    """Joint angles that reach a set of points on one branch."""
 
     q: Floats
     """Shape (n, 6), rad."""
@@ -327,7 +327,7 @@ class Posture(NamedTuple):
 
 
 def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
-    """Joint angles that hold the ball on every point, all on one branch, free of contacts.
+    """Joint angles that put the ball on every point, all on one branch, free of contacts.
 
     Of the branches the one that stays farthest from every singularity is taken; of equals, which mirrored ones are, the
     one whose elbow is on the rod's side.

@@ -30,7 +30,7 @@ NOISE_TOLERANCES = 3.0
 
 
 class Seen(NamedTuple):
-    """One look, in C."""
+    """Ball and target of one image, in C."""
 
     ball_c: Floats
     """Shape (3,), mm."""
@@ -47,7 +47,7 @@ class Lost(NamedTuple):
 
 
 Look = Callable[[Floats, Floats], Seen | Lost]
-"""Takes where the arm was sent and where it truly is, each (6,), rad; the truth is for the pictures alone."""
+"""Takes commanded and true joints, each (6,), rad; the truth is for the images alone."""
 
 Move = Callable[[Floats], Floats]
 """Takes the commanded configuration (6,) and returns the true one, rad."""
@@ -55,7 +55,7 @@ Move = Callable[[Floats], Floats]
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What the servo is to do.
+    """Target, limits and devices of one servo.
 
     Attributes:
         rod: The arm, its rod and the orientation to keep.
@@ -77,7 +77,7 @@ class Task:
 
 
 class Visit(NamedTuple):
-    """One stay of the arm: what was commanded, what came of it, what was seen."""
+    """One stay of the arm: commanded joints, true joints, and what was seen."""
 
     q_command: Floats
     q_true: Floats
@@ -88,7 +88,7 @@ class Visit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Servoed:
-    """How a servo went.
+    """Result of a servo.
 
     Attributes:
         stop: Why it ended.
@@ -154,12 +154,12 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, move: Move)
 
 
 def path_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
-    """The first contact on the way through waypoints (m, 6), rad, checked as finely as any motion; None if free."""
+    """First contact along waypoints (m, 6), rad, checked as finely as any motion; None if free."""
     return first_contact(checker, dense_states(checker, q_path, RESOLUTION_RAD / FINER))
 
 
 def _look(task: Task, q_command: Floats, q_true: Floats, look: Look) -> Seen | Lost:
-    """Look, and look again where the ball was not found: the arm stands still meanwhile."""
+    """Look, and look again where the ball was not found, without moving the arm."""
     found = look(q_command, q_true)
     for _ in range(task.looks - 1):
         if isinstance(found, Seen):

@@ -43,17 +43,17 @@ from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, p
 from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, draw_workcell, workcell_checker
 
 POINTED_MM = 3.0
-"""How well an operator points at a marker in the pictures, per axis: where the search for it begins."""
+"""Deviation of an operator's pointing at a marker in the images, per axis: where the search begins."""
 
 TEST_POINTS = 10
 """Points at which the stereo is tried, as in the paper's Table 1."""
 
 DetectorOf = Callable[[StereoWorkcell, np.random.Generator], Detector]
-"""Makes a sight of a room."""
+"""Makes the detector of a workcell."""
 
 
 class Reached(NamedTuple):
-    """One target, measured in truth; mm."""
+    """Errors at one target, measured in truth; mm."""
 
     target: str
     servoed: Servoed
@@ -80,7 +80,7 @@ class Reached(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What came of a session.
+    """Result of a session.
 
     Attributes:
         seed: What it was drawn from.
@@ -119,7 +119,7 @@ def run_session(
     detector_of: DetectorOf = picture_detector,
     empty: StateChecker | None = None,
 ) -> Session:
-    """Everything, in a room drawn from a seed.
+    """Run a whole session in a workcell drawn from a seed.
 
     Args:
         case: The case.
@@ -151,7 +151,7 @@ def run_session(
 def see_markers(
     workcell: StereoWorkcell, calibration: RobotCalibration, detector: Detector, rng: np.random.Generator
 ) -> list[Detections]:
-    """Every marker in every camera.
+    """Pixels of every marker in every camera.
 
     Raises:
         NoAnswerError: A marker is not found.
@@ -251,7 +251,7 @@ def _reach(
     aim: _Aim,
     rng: np.random.Generator,
 ) -> Reached:
-    """From where the arm hovers onto the target by the robot alone, then by the servo."""
+    """Move from the hovering point onto the target by the robot alone, then by the servo."""
     contact, unseen, seen = path_contact(task.checker, np.stack([q_hover, q_aim])), None, None
     if contact is None:
         q_true = workcell.arm.settle(q_aim, q_true, rng)

@@ -48,7 +48,7 @@ REASONS = (TIP_OUTSIDE, PROBE_REACH, NEEDLE_REACH, *(reason.value for reason in 
 
 
 class ImageGeometry(NamedTuple):
-    """n draws: where the probe is to be, and how the needle is to stand in its image."""
+    """n drawn geometries: pose of the probe, and the needle in its image."""
 
     T_base1_image: Floats
     """Shape (n, 4, 4), mm."""
@@ -61,7 +61,7 @@ class ImageGeometry(NamedTuple):
 
 
 class CandidatePoses(NamedTuple):
-    """Poses that can be recorded, by the drawing, and what became of the other draws."""
+    """Poses that can be recorded, by the drawing, and the reasons of the other draws."""
 
     q_probe: Floats
     """Shape (n, 6), rad."""
@@ -76,7 +76,7 @@ class CandidatePoses(NamedTuple):
 
 
 def drawing(case: SelfcalCase) -> Estimate:
-    """What is believed before anything is calibrated."""
+    """The nominal drawing, believed before anything is calibrated."""
     X, Y = case.T_end1_image, case.T_base1_base2
     V = case.tip_end2 / np.linalg.norm(case.tip_end2)
     return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], case.tip_end2, np.ones(2), V)
@@ -115,7 +115,7 @@ def _lowest_corner(case: SelfcalCase, T_base1_image: Floats) -> Floats:
 
 
 def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generator) -> CandidatePoses:
-    """Draw, solve, check.
+    """Draw geometries, solve for both arms, check contacts.
 
     Args:
         case: The room.
@@ -156,7 +156,7 @@ def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generat
 
 
 def _flange_goals(case: SelfcalCase, belief: Estimate, seen: ImageGeometry) -> tuple[Floats, Floats]:
-    """T_base1_end1 and T_base2_end2 that make the picture, by the drawing; each (n, 4, 4)."""
+    """T_base1_end1 and T_base2_end2 that make the image, by the drawing; each (n, 4, 4)."""
     A = seen.T_base1_image @ np.linalg.inv(case.T_end1_image)
     T_base2_image = np.linalg.inv(case.T_base1_base2) @ seen.T_base1_image
     along = np.column_stack([seen.direction_image, np.zeros(len(seen.roll))])
@@ -185,7 +185,7 @@ def needle_flange(
 
 
 def configurations(model: UrModel, T_base_flange: Floats, q_home: Floats) -> list[Floats]:
-    """All configurations within the limits that hold each flange pose, the nearest to home first; each (k, 6), rad."""
+    """Configurations within the limits that reach each flange pose, nearest to home first; each (k, 6), rad."""
     q = nearest_within_limits(model, inverse(model, T_base_flange), q_home)
     away = np.linalg.norm(q - q_home, axis=-1)
     order = np.argsort(np.where(np.isnan(away), np.inf, away), axis=1)
@@ -193,7 +193,7 @@ def configurations(model: UrModel, T_base_flange: Floats, q_home: Floats) -> lis
 
 
 def _checked_pose(workcell: TwoArms, inside: bool, probe: Floats, needle: Floats) -> str | tuple[Floats, Floats]:
-    """The first pair of configurations that stands free, or the reason why none does."""
+    """The first pair of configurations that is free, or the reason why none is."""
     if not inside:
         return TIP_OUTSIDE
     if len(probe) == 0:
@@ -226,11 +226,11 @@ MAX_SWEEPS = 20
 """How often all chosen poses are looked at for a better exchange."""
 
 WORTH = 1e-4
-"""An exchange must lower the mean squared error by this share."""
+"""An exchange must lower the mean squared error by this fraction."""
 
 
 class _Design(NamedTuple):
-    """What every candidate tells, and what is to be known."""
+    """Information of every candidate, and the quantity to be known."""
 
     rows: Floats
     """Jacobian of each candidate over its residuals' spread, shape (n, 3, p), p of parameters and arms' errors: its
@@ -283,7 +283,7 @@ def choose_poses(
 
 
 class _Belief(NamedTuple):
-    """What is believed before anything is recorded."""
+    """The belief before anything is recorded."""
 
     noise: Noise
     prior: Estimate
@@ -308,7 +308,7 @@ def expected_tre_mm(
 
 
 def _with_prior(H: Floats) -> Floats:
-    """Information with what is known of the arms' errors beforehand: their deviation is 1."""
+    """Information with the prior of the arms' errors: their deviation is 1."""
     return H + np.diag((np.arange(len(H)) >= N_FREE).astype(float))
 
 

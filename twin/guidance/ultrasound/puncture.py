@@ -25,13 +25,13 @@ LESION_MM = 4.0
 
 
 class Puncture(NamedTuple):
-    """One target."""
+    """Prediction and ground truth of one puncture."""
 
     candidate: int
     target_image: Floats
     """True target in the true image, shape (3,), mm; it lies in the plane, for it is seen."""
     needle: NeedleInImage
-    """Where the needle truly ended, in the true image."""
+    """The true needle at its end, in the true image."""
     predicted_mm: float
     """Expected (rms) error from the calibration and the arms."""
     click_mm: float
@@ -54,12 +54,12 @@ class Puncture(NamedTuple):
 
     @property
     def depth_mm(self) -> float:
-        """Its part along the true needle: + is too deep."""
+        """Error along the true needle, mm: + is too deep."""
         return float(self.error_image @ self.needle.direction_image)
 
     @property
     def lateral_mm(self) -> float:
-        """Its part across the needle."""
+        """Error across the needle, mm."""
         return float(np.sqrt(max(self.error_mm**2 - self.depth_mm**2, 0.0)))
 
 
@@ -72,7 +72,7 @@ def punctures(
     calibration: Calibration,
     rng: np.random.Generator,
 ) -> tuple[Puncture, ...]:
-    """Send the needle to the middle of the picture's tip, one held-out candidate after the other.
+    """Send the needle to the middle of the image's tip, one held-out candidate after the other.
 
     Args:
         case: The room.
@@ -112,7 +112,7 @@ def _puncture(
 def aim(
     candidates: CandidatePoses, row: int, target_mm: Floats, calibration: Calibration, truth: WorkcellTruth
 ) -> Floats:
-    """What the needle's arm is told: by its nominal kinematics and the calibration; (6,), rad, NaN if out of reach.
+    """Commanded joints of the needle's arm by its nominal kinematics and the calibration: (6,), rad; NaN out of reach.
 
     Args:
         candidates: Where probe and needle can stand.
@@ -183,6 +183,6 @@ def unseen_errors_mm(
 
 
 def puncture_picture(case: SelfcalCase, puncture: Puncture, rng: np.random.Generator) -> Pixels:
-    """The picture after the puncture: a lesion about the target, and the needle."""
+    """The image after the puncture: a lesion about the target, and the needle."""
     lesion = Lesion(puncture.target_image, LESION_MM)
     return render(case.content.image.imager(), puncture.needle, rng, echo=case.content.image.echo(), lesion=lesion)

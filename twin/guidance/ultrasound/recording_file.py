@@ -22,7 +22,7 @@ from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 FILE_NAME = "recording.csv"
-"""What a folder is searched for."""
+"""Name of the file that a folder is searched for."""
 
 MAX_BYTES = 50_000_000
 """More than 50,000 poses: no calibration needs so many, and a larger file is likely something else."""
@@ -50,7 +50,7 @@ def read_recording(path: Path) -> Recording:
 
 
 def parse_recording(content: bytes, file: Path) -> Recording:
-    """The same of a file that has been read; it is not opened again.
+    """As `read_recording`, of a file that has been read; it is not opened again.
 
     Raises:
         InputError: As `read_recording`, but for reading.

@@ -44,7 +44,7 @@ class PoseRanges(NamedTuple):
 
 
 class SimulatedTruth(NamedTuple):
-    """What a calibration is to find."""
+    """The truth that a calibration is to find."""
 
     X: Floats
     """T_end1_image, shape (4, 4), mm."""

@@ -37,7 +37,7 @@ FAR_LINKS = 5
 
 
 class Touching(StrEnum):
-    """Why a pair of configurations is refused."""
+    """Contact because of which a pair of configurations is refused."""
 
     PROBE_ARM = "probe_arm_collision"
     NEEDLE_ARM = "needle_arm_collision"
@@ -68,7 +68,7 @@ class BetweenArms:
             body.place(poses)
 
     def apart(self, q_probe: Floats, q_needle: Floats) -> bool:
-        """Whether they keep their clearance."""
+        """Whether the two arms keep their clearance."""
         self.place_probe(q_probe)
         moved = self.T_base1_base2 @ link_poses(self._models[1], q_needle)
         for body in self.needle_bodies:
@@ -121,7 +121,7 @@ class TwoArms:
         return self._between.apart(q_probe, q_needle)
 
     def verdict(self, q_probe: Floats, q_needle: Floats) -> Touching | None:
-        """What touches, or None."""
+        """The contact, or None."""
         if not self.probe_free(q_probe):
             return Touching.PROBE_ARM
         if not self.needle_free(q_needle):
@@ -130,7 +130,7 @@ class TwoArms:
 
 
 def _meet(first: Body, second: Body) -> bool:
-    """Whether ``first``, with its clearance, touches ``second``; balls first."""
+    """Whether ``first``, with its clearance, touches ``second``; bounding spheres first."""
     apart = np.linalg.norm(first.full.surface.pose.getTranslation() - second.bare.surface.pose.getTranslation())
     reach = max(float(np.linalg.norm(hull, axis=1).max()) for hull in first.full.hulls)
     if apart > reach + second.radius_mm:

@@ -97,7 +97,7 @@ MarkerKind = Literal["disc", "ball", "none"]
 
 @dataclass(frozen=True, eq=False)
 class TrueRod:
-    """A needle where it truly is, in the CT's frame of the case: tip (3,), mm, and direction to the tip (3,), unit."""
+    """A true needle in the CT's frame of the case: tip (3,), mm, and direction to the tip (3,), unit."""
 
     tip_ct: Floats
     forward_ct: Floats
@@ -105,7 +105,7 @@ class TrueRod:
 
 @dataclass(frozen=True, eq=False)
 class CaseScene:
-    """What lies in the scanner, in its frame (LPS of the scan, mm).
+    """Content of the scanner, in its frame (LPS of the scan, mm).
 
     Attributes:
         solids: In the order in which they fill each other's place.
@@ -140,7 +140,7 @@ def case_scene(
     needle: TrueRod | None = None,
     outside_objects: OutsideObjects | None = None,
 ) -> CaseScene:
-    """Lay a case into the scanner.
+    """Place a case in the scanner.
 
     Args:
         case: The case.
@@ -257,7 +257,7 @@ def _tables(case: Case) -> list[Solid]:
 
 
 def _laid(parts: Sequence[Part], place: str) -> list[Solid]:
-    """What lies in one place; no segmentation names it."""
+    """Solids of the outside objects; no segmentation names them."""
     return [Solid(one.name, one.mesh, one.hu) for one in parts if one.place == place]
 
 
@@ -301,7 +301,7 @@ def _moved(points: NamedPoints | None, T_scan_ct: Floats) -> NamedPoints | None:
 
 
 def _bounds(meshes: Sequence[TriangleMesh]) -> Floats:
-    """Lowest and highest corner of all, shape (2, 3), mm."""
+    """Lowest and highest corner of all solids, shape (2, 3), mm."""
     if not meshes:
         return np.array([np.full(3, np.inf), np.full(3, -np.inf)])
     bounds = np.stack([mesh.bounds for mesh in meshes])

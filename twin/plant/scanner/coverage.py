@@ -23,7 +23,7 @@ LEAST_LINES = 3
 
 
 class Cut(NamedTuple):
-    """What the lines have met.
+    """Mean value and label of each voxel by the lines through it.
 
     Attributes:
         values: Shape (nx, ny, nz), float32, the mean over each voxel.

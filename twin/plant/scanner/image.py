@@ -32,7 +32,7 @@ BLUR_ENDS = 3.0
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """How a scan is made.
+    """Settings of a scan.
 
     Attributes:
         spacing_mm: Of the slices, which are as thick.
@@ -57,7 +57,7 @@ class ScanSettings:
 
 @dataclass(frozen=True, eq=False)
 class CtImage:
-    """A scan, and the truth beside it.
+    """A scan, with its ground truth.
 
     Attributes:
         hu: Shape (nx, ny, nz), int16.
@@ -154,7 +154,7 @@ def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
 
 
 def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bools) -> Ints:
-    """The voxels that a structure passes while neither they nor those beside have its label, shape (m, 3).
+    """Voxels that a structure passes while neither they nor their neighbours have its label, shape (m, 3).
 
     Args:
         labels: Shape (nx, ny, nz), what is labelled at each centre.
@@ -211,7 +211,7 @@ class Solid(NamedTuple):
 
 
 def check_closed(solid: Solid, where: str) -> Solid:
-    """The solid, if it has an inside.
+    """The solid; one without an inside is refused.
 
     Raises:
         InputError: Its surface is open.

@@ -31,7 +31,7 @@ EDGE_WIDTH_PX = 0.8
 """Blur and pixel together; turns the steepest slope into the step's height."""
 
 SAME_GREY = 0.4
-"""In parts of the contrast: a lamp's share of 0.4 shades the ball by less, what hides it differs by more."""
+"""In parts of the contrast: a light of fraction 0.4 shades the ball by less, what hides it differs by more."""
 DISC_RINGS = 0.85 * np.sqrt((np.arange(6) + 0.5) / 6)
 """Radii at which the disc is read, in parts of the outline's: each ring stands for the same area."""
 
@@ -62,7 +62,7 @@ class Edges(NamedTuple):
 
 
 class Spokes(NamedTuple):
-    """Where to look: all round a direction, about a half angle."""
+    """Spokes all around a direction, about a half angle."""
 
     direction: Floats
     """Shape (3,), unit."""

@@ -31,7 +31,7 @@ OCCLUDER_SIZE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class BallScene:
-    """What a camera may see of the tool. Directions need not be of unit length; greys are levels from 0 to 255.
+    """A ball on its rod as a camera may see it. Directions need not be unit; greys are levels from 0 to 255.
 
     Attributes:
         center_c: The ball's centre, shape (3,), mm, frame C.
@@ -100,7 +100,7 @@ def render(
     blur_px: float = 0.7,
     half_px: int | None = None,
 ) -> Picture:
-    """What the camera takes of a scene.
+    """The camera's image of a scene.
 
     Args:
         camera: The true camera.
@@ -133,7 +133,7 @@ def _window(camera: Camera, scene: BallScene, half_px: int | None) -> tuple[NDAr
 
 
 def _paint(grey: Floats, low: NDArray[np.int64], camera: Camera, scene: BallScene, blur_px: float) -> None:
-    """Lay the bodies over a part of the picture that starts at ``low``; changes ``grey``."""
+    """Add the bodies to a part of the image that starts at ``low``; changes ``grey``."""
     pad = int(np.ceil(BLUR_REACH * blur_px)) + 1
     size = np.array(grey.shape[::-1])
     box_low, box_high = (box - low for box in _bounds(camera, scene, pad))
@@ -233,7 +233,7 @@ def _rod(rays: Floats, start: Floats, rod: Floats, scene: BallScene, light: Floa
 
 
 def _occluder(rays: Floats, center: Floats, camera: Camera, scene: BallScene) -> _Layer:
-    """A flat disc just before the ball, so far over it that it hides the share wanted."""
+    """A flat disc just before the ball, so far over it that it hides the wanted fraction."""
     distance = float(np.linalg.norm(center))
     axes = tangent_axes(center / distance)
     flat = (rays @ axes) / (rays @ (center / distance))[..., None]
@@ -257,7 +257,7 @@ def disc_distance(fraction: float) -> float:
 
 
 def _cover(gap: Floats) -> Floats:
-    """Covered share of each cell from a function that is above 0 inside a body and 0 on its outline."""
+    """Covered fraction of each cell by a function that is above 0 inside a body and 0 on its outline."""
     down, right = np.gradient(gap)
     cells = gap / np.clip(np.hypot(down, right), 1e-30, None)
     return np.clip(cells + 0.5, 0.0, 1.0)

@@ -44,7 +44,7 @@ KEPT_AWAY = 2
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """How the ball is measured and when it is believed.
+    """Settings of the ball's measurement, and of when it is believed.
 
     Attributes:
         spokes: Edges wanted, evenly around the outline.
@@ -90,7 +90,7 @@ class DetectedBall(NamedTuple):
 
 
 class LostBall(NamedTuple):
-    """No ball that can be believed."""
+    """A failed search for the ball, with its reason."""
 
     reason: Reason
     inliers: int = 0
@@ -158,7 +158,7 @@ def _threshold(grey: Grey, settings: TrackerSettings) -> float:
 def _best(
     grey: Grey, camera: Camera, found: FoundCircle, radius: float, settings: TrackerSettings
 ) -> DetectedBall | LostBall:
-    """The first circle that stands the test, or why the one with most inliers did not."""
+    """The first circle that passes the test, or the reason of the one with most inliers."""
     lost = []
     for center in found.centers:
         ball = _measure(grey, camera, center, radius, settings)

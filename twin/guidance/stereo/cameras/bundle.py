@@ -32,7 +32,7 @@ TOLERANCE = 1e-12
 
 
 class Observations(NamedTuple):
-    """What was seen, a row each."""
+    """Observed pixels, a row each."""
 
     camera: Ints
     """Shape (n,): which camera."""
@@ -47,7 +47,7 @@ class Observations(NamedTuple):
 
 
 class PixelSpreads(NamedTuple):
-    """Standard deviations of the parameters around their start: 0 holds, infinity frees."""
+    """Standard deviations of the parameters around their start: 0 fixes, infinity frees."""
 
     cameras: Floats
     """Shape (cameras, 14), in the order of ``CAMERA_PARAMETERS``."""
@@ -59,7 +59,7 @@ class PixelSpreads(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """The optimum.
+    """The optimum of a bundle adjustment.
 
     Attributes:
         cameras: Refined.
@@ -93,7 +93,7 @@ class Bundle:
 def adjust(
     cameras: Sequence[Camera], T_c_bodies: Floats, points: Floats, seen: Observations, spreads: PixelSpreads
 ) -> Bundle:
-    """Adjust everything that is not held.
+    """Adjust everything that is not fixed.
 
     Args:
         cameras: Where to start.
@@ -133,7 +133,7 @@ def _inverse(information: Floats) -> Floats:
 
 
 class _Iterate(NamedTuple):
-    """Cameras, bodies and points somewhere on the way."""
+    """Cameras, bodies and points at one iteration."""
 
     cameras: tuple[Camera, ...]
     T_c_bodies: Floats

@@ -37,7 +37,7 @@ CRITICAL = 1e6
 LENS_PRIOR = (0.3, 0.3, 0.002, 0.002)
 """Standard deviations of k1, k2, p1, p2: lenses of industrial cameras rarely have more."""
 IDENTIFIED = 0.5
-"""Posterior over prior standard deviation up to which a coefficient counts as told by the points."""
+"""Posterior over prior standard deviation up to which a coefficient counts as identified by the points."""
 MAX_RESIDUAL_PX = 15.0
 """A point that misses by more was swapped with another or found wrongly: Hough alone misses by about one pixel."""
 SMALLEST_SIGMA_PX = 1e-3

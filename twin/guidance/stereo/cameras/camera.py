@@ -27,7 +27,7 @@ ROTATION_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One camera.
+    """A calibrated camera in the calibration frame C.
 
     Attributes:
         width: Pixels.
@@ -127,7 +127,7 @@ class Camera:
         return float(np.sqrt(abs(np.linalg.det(self.angle_slope(direction_c)))))
 
     def angle_slope(self, direction_c: Floats) -> Floats:
-        """Derivative of the pixel by a turn of the ray about a unit direction, shape (2, 2), px/rad.
+        """Derivative of the pixel by a rotation of the ray about a unit direction, shape (2, 2), px/rad.
 
         Its columns belong to the two axes of ``tangent_axes``.
         """
@@ -159,7 +159,7 @@ def looking_at(
     *,
     distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> Camera:
-    """A camera at a place in C that has a point in the middle of its picture.
+    """A camera at a place in C with a point in the middle of its image.
 
     Args:
         eye_c: Shape (3,), mm.
@@ -185,7 +185,7 @@ def stereo_pair(
     distance_mm: float,
     distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> tuple[Camera, Camera]:
-    """Left and right camera, side by side, both looking at the room's centre.
+    """Left and right camera, side by side, both looking at the workcell's centre.
 
     The centre is C's origin; x runs from the left camera to the right one, y down, z away from them. The cameras stand
     at (-+ baseline / 2, 0, -distance). Use ``Camera.moved`` to know them in a frame that lies otherwise.
@@ -217,7 +217,7 @@ MAX_STEPS = 30
 
 
 def distort(points: Floats, coefficients: Floats) -> Floats:
-    """Where the lens puts normalised points, shape (..., 2)."""
+    """Distorted normalised points, shape (..., 2)."""
     k1, k2, p1, p2 = coefficients
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
@@ -275,7 +275,7 @@ def undistort(points: Floats, coefficients: Floats) -> Floats:
 
 
 def fold(coefficients: Floats) -> float:
-    """Radius (a tangent) at which the picture turns back on itself: beyond it the model means nothing.
+    """Radius (a tangent) at which the image folds back on itself: beyond it the model is meaningless.
 
     It is the first zero of d(r + k1 r^3 + k2 r^5)/dr; infinite where there is none.
     """

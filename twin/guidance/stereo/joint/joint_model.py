@@ -33,12 +33,12 @@ PER_CAMERA = 13
 """Focal length, principal point, four of the lens, turn, shift: square pixels are known."""
 
 FLOOR_MM = 1e-3
-"""Nothing is known better than this."""
+"""mm: no standard deviation is taken to be less."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What was measured; n markers, s stays of the arm of which the first k were also measured by the measuring arm.
+    """Measurements; n markers, s stays of the arm of which the first k were also read by the measuring arm.
 
     Attributes:
         planned: The cameras as they were planned.
@@ -66,7 +66,7 @@ class Observed:
 
 
 class Guess(NamedTuple):
-    """Where the adjustment starts; C, mm."""
+    """Start of the adjustment; C, mm."""
 
     T_c_base: Floats
     """Shape (4, 4): counted from here."""
@@ -93,24 +93,24 @@ class Unknowns(NamedTuple):
     """Shape (s, 3), mm."""
 
     def vector(self) -> Floats:
-        """All of them, shape (N,)."""
+        """All unknowns as one vector, shape (N,)."""
         return np.concatenate([np.ravel(part) for part in self])
 
     def moved(self, step: Floats) -> Unknowns:
-        """With a step (N,) added."""
+        """The unknowns with a step (N,) added."""
         ends = np.cumsum([part.size for part in self])[:-1]
         parts = np.split(self.vector() + step, ends)
         return Unknowns(*(new.reshape(old.shape) for new, old in zip(parts, self, strict=True)))
 
     def span(self, name: str) -> slice:
-        """Where a part stands in the vector."""
+        """Slice of a part in the vector."""
         sizes = [part.size for part in self]
         at = self._fields.index(name)
         return slice(sum(sizes[:at]), sum(sizes[: at + 1]))
 
 
 def first_unknowns(observed: Observed, guess: Guess) -> Unknowns:
-    """All errors 0."""
+    """The unknowns with all errors 0."""
     cameras = np.zeros((len(observed.planned), PER_CAMERA))
     return Unknowns(cameras, np.zeros(6), np.zeros(N_ROD), np.zeros(6), observed.markers_m.copy(), guess.balls_c.copy())
 
@@ -176,7 +176,7 @@ class JointModel:
         return System(np.concatenate([r for r, _ in rows]), np.concatenate([J for _, J in rows]))
 
     def _seen(self, x: Unknowns) -> list[tuple[Floats, Floats]]:
-        """Ball and marker pixels of each camera."""
+        """Rows of the ball and marker pixels of each camera."""
         o, T_c_m = self.observed, self.pose_of_head(x)
         markers_c = apply(T_c_m, x.markers_m)
         points = np.concatenate([x.balls_c, markers_c])
@@ -198,7 +198,7 @@ class JointModel:
         return rows
 
     def _measured(self, x: Unknowns) -> tuple[Floats, Floats]:
-        """The measuring arm's readings."""
+        """Rows of the measuring arm's readings."""
         k, sigma = len(self.observed.measured_c), max(self.observed.errors.measuring_mm, FLOOR_MM)
         J = np.zeros((k, 3, x.vector().size))
         _diagonal(J, 0, x.span("balls_c").start, np.tile(np.eye(3), (k, 1, 1)))
@@ -206,13 +206,13 @@ class JointModel:
         return _whitened(x.balls_c[:k] - self.observed.measured_c, J, roots)
 
     def _commanded(self, x: Unknowns) -> tuple[Floats, Floats]:
-        """Where the arm, with its errors, should have the ball; its play and repeatability let it stray."""
+        """The commanded ball: the arm, with its errors, play and repeatability, against the ball's place."""
         q = self.observed.q_command
         missed, J = self.ball_deviations(x, np.arange(len(q)))
         return _whitened(missed, J, self._offset_roots)
 
     def ball_deviations(self, x: Unknowns, stays: Ints) -> tuple[Floats, Floats]:
-        """How far the ball is from where its arm should have it at k stays: (k, 3), mm, C, and slopes (k, 3, N)."""
+        """Deviation of the ball from its arm's prediction at k stays: (k, 3), mm, C, and slopes (k, 3, N)."""
         T, rod = self.pose_of_base(x), self.rod_at(x, self.observed.q_command[stays])
         measured = apply(T, rod.ball)
         J = np.zeros((len(measured), 3, x.vector().size))
@@ -231,14 +231,14 @@ class JointModel:
         return _roots(o.errors.arrival**2 * slopes @ slopes.transpose(0, 2, 1) + FLOOR_MM**2 * np.eye(3))
 
     def _imaged(self, x: Unknowns) -> tuple[Floats, Floats]:
-        """The markers in the image."""
+        """Rows of the markers in the image."""
         n, sigma = len(x.markers_m), max(self.observed.errors.marker_mm, FLOOR_MM)
         J = np.zeros((n, 3, x.vector().size))
         _diagonal(J, 0, x.span("markers_m").start, np.tile(np.eye(3), (n, 1, 1)))
         return _whitened(x.markers_m - self.observed.markers_m, J, np.tile(np.eye(3) / sigma, (n, 1, 1)))
 
     def _drawn(self, x: Unknowns) -> tuple[Floats, Floats]:
-        """What has a declared deviation from its nominal value."""
+        """Rows of the unknowns with a declared deviation from their nominal value."""
         J = np.eye(x.vector().size)
         drawn = np.r_[x.span("cameras"), x.span("arm")]
         return x.vector()[drawn], J[drawn]
@@ -406,7 +406,7 @@ N_ROD = PARAMETERS["tip_offset"].stop
 
 
 class RodPoses(NamedTuple):
-    """How an arm that errs holds its rod, base frame."""
+    """Ball and flange of an arm that errs, base frame."""
 
     ball: Floats
     """Shape (s, 3), mm."""

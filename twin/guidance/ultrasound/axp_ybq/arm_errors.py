@@ -51,7 +51,7 @@ class DeclaredArm(NamedTuple):
     """Half the width of every joint's play: how far it stops short of where it was sent; no deviation."""
 
     def deviations(self) -> Floats:
-        """Of the 23 parameters, shape (23,)."""
+        """Deviations of the 23 parameters, shape (23,), mm and rad."""
         sigma = np.zeros(N_ARM)
         for kind, value in (("link", self.link_mm), ("twist", self.twist_rad), ("joint", self.joint_rad)):
             sigma[PARAMETERS[kind]] = value
@@ -76,19 +76,19 @@ class DeclaredArm(NamedTuple):
         return np.asarray(self._play_slopes(q, turn).sum(axis=2))
 
     def _play_slopes(self, q: Floats, turn: Floats) -> Floats:
-        """Of each joint: its play leaves it short of where it was sent, -half the width times the way it turned."""
+        """Slopes of each joint's play: -half the width times the direction in which it rotated."""
         J = error_jacobian(self.model, q, 0.0)[..., PARAMETERS["joint"]]
         return np.asarray(-self.play_rad * J * turn[:, None, :])
 
     def arrival_covariance(self, q: Floats, turn: Floats) -> Floats:
-        """Of the flange's shift and turn between arrivals at one pose, shape (n, 6, 6); arguments as above."""
+        """Covariance of the flange between arrivals at one pose, shape (n, 6, 6), mm and rad; arguments as above."""
         J = error_jacobian(self.model, q, 0.0)[..., PARAMETERS["joint"]]
         variance = self.arrival_rad**2 + self.play_rad**2 * (turn == 0.0)
         return np.asarray((J * variance[:, None, :]) @ np.swapaxes(J, -1, -2))
 
 
 class DeclaredArms(NamedTuple):
-    """Both arms."""
+    """Both declared arms."""
 
     probe: DeclaredArm
     needle: DeclaredArm

@@ -113,7 +113,7 @@ class Calibration:
         return float(chi2.sf(self.chi_squared_ratio * self.freedom, self.freedom))
 
     def doubts(self) -> tuple[str, ...]:
-        """A sentence a warning, and one where the residuals are larger than the stated noise and arms let expect."""
+        """Warnings, and one where the residuals exceed what the stated noise and arms lead to expect."""
         said = tuple(one.sentence for one in self.findings if one.severity is Severity.WARNING)
         ratio = self.chi_squared_ratio
         if not isinstance(self.noise, Noise) or ratio <= LARGEST_RATIO:
@@ -127,11 +127,11 @@ class Calibration:
 
     @property
     def covariance_counts(self) -> Floats:
-        """What a region is drawn with: the covariance, with the doubt of a noise that was found in it."""
+        """Covariance of the regions, with the uncertainty of an estimated noise in it."""
         return self.covariance if self.small_sample is None else self.small_sample.covariance
 
     def corrected(self, poses: Recording) -> tuple[Floats, Floats]:
-        """Both flanges as the arms' errors that were found move them: A and B, each (n, 4, 4), mm.
+        """Both flanges moved by the estimated errors of the arms: A and B, each (n, 4, 4), mm.
 
         Args:
             poses: Nominal flanges, with joints where arms are declared.
@@ -209,7 +209,7 @@ class Calibration:
 
     @property
     def estimate(self) -> Estimate:
-        """The same values, as the solvers take them."""
+        """The values as an `Estimate` for the solvers."""
         X, Y = self.X, self.Y
         tip, V = self.tip_end2, self.needle_direction_end2
         return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], tip, self.scale, V)
@@ -252,7 +252,7 @@ def calibration_of(
     cannot_show: tuple[str, ...],
     arms: DeclaredArms | None,
 ) -> Calibration:
-    """What is known at a fit, under the noise that was found or declared; its arrays are read-only.
+    """The calibration at a fit, under the estimated or declared noise; its arrays are read-only.
 
     Args:
         problem: As it was solved.

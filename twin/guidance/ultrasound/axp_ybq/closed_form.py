@@ -42,14 +42,14 @@ LENGTH_MM = 100.0
 
 
 def active_columns(*, tip: bool, scale: bool, direction: bool) -> NDArray[np.int_]:
-    """Which of the 19 parameters are estimated."""
+    """Columns of the 19 parameters that are estimated."""
     wanted = np.ones(N_PARAMETERS, dtype=bool)
     wanted[T_Q], wanted[SCALE], wanted[DIRECTION] = tip, scale, direction
     return np.flatnonzero(wanted)
 
 
 def parameter_units(active: NDArray[np.int_], scale: Floats) -> Floats:
-    """How large a step of each free parameter is "one": 1 rad, 100 mm, the scale itself."""
+    """Unit of each free parameter: 1 rad, 100 mm, the scale itself."""
     units = np.ones(N_PARAMETERS)
     for part in (T_X, T_Y, T_Q):
         units[part] = LENGTH_MM
@@ -89,7 +89,7 @@ class Estimate(NamedTuple):
         )
 
     def moved_by(self, active: NDArray[np.int_], step: Floats) -> Estimate:
-        """After a step (p,) of the free parameters, in `parameter_units`."""
+        """The estimate after a step (p,) of the free parameters, in `parameter_units`."""
         full = np.zeros(N_PARAMETERS)
         full[active] = parameter_units(active, self.scale) * step
         return self.moved(full)

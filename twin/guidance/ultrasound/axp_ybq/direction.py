@@ -61,7 +61,7 @@ ALONG = 0.5
 is: a straight needle on a flange has .9 and more, one that a holder turns aside by 60 deg has this."""
 
 FEW = 0.1
-"""Share of the directions that may be set aside without a warning: single ones are, in one true recording in twenty."""
+"""Fraction of the directions that may be set aside without a warning: single ones are, in one true recording of 20."""
 
 REVERSED = "v points from the tip to the hub"
 
@@ -167,7 +167,7 @@ def _common_axis(seen: Floats, kept: NDArray[np.bool_]) -> tuple[Floats, Floats]
 
 
 def _refuse_scattered(estimate: Estimate, recording: Recording, kept: NDArray[np.bool_], middle: float) -> None:
-    """Say that the directions have no common axis, and by which slip they would have one."""
+    """Refuse directions without a common axis, naming the slip with which they would have one."""
     assert recording.v is not None
     said = f"the directions have no common axis in the needle's flange: they scatter by {np.degrees(middle):.0f} deg"
     for slip, undo in SLIPS.items():
@@ -180,7 +180,7 @@ def _refuse_scattered(estimate: Estimate, recording: Recording, kept: NDArray[np
 
 
 def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection) -> tuple[Finding, ...]:
-    """Which directions were set aside (n,), which of them are reversed, and whether their sign is anyone's word.
+    """Directions set aside (n,), those of them that are reversed, and whether their sign is known.
 
     Args:
         names: Of the poses.
@@ -319,6 +319,6 @@ def across(v: Floats) -> Floats:
 
 
 def facing(estimate: Estimate, recording: Recording) -> Bools:
-    """Whether a pose's measured direction points the way of V at all, shape (n,): one turned round has no residual."""
+    """Whether a pose's measured direction points along V at all, shape (n,): a reversed one has no residual."""
     m = needle_in_image(estimate, recording) @ estimate.V
     return np.asarray(np.einsum("ni,ni->n", m, directions_image(recording, estimate)) > 0)

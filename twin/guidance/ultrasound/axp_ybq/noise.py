@@ -29,7 +29,7 @@ WIDEST_RATIO = 30.0
 
 
 class ResidualSpreads(NamedTuple):
-    """What the residuals show."""
+    """Noise as the residuals show it."""
 
     spread: Spread
     lean_rad: float
@@ -75,7 +75,7 @@ def by_likelihood(problem: Problem, fit: RobustFit) -> ResidualSpreads:
 
 
 def _step(problem: Problem, fit: RobustFit, at_fit: Fitted, found: ResidualSpreads) -> ResidualSpreads:
-    """Each part times the root of what its residuals are over what is expected of them."""
+    """Each part times the root of its residuals over their expectation."""
     W = at_fit.whitener
     own = W.transpose(0, 2, 1) @ W
     q = own @ at_fit.residuals[:, :, None]
@@ -194,7 +194,7 @@ class SmallSample(NamedTuple):
     """The confidence region of all p parameters where parts of the noise were found."""
 
     covariance: Floats
-    """Shape (p, p), with the doubt of the noise in it."""
+    """Shape (p, p), with the uncertainty of the noise in it."""
     freedom: float
     """Of Fisher's F's denominator."""
     factor: float

@@ -43,14 +43,14 @@ LEAST_RATIO = 9e-3
 45 +- 2 deg up to 8.8e-3; usual poses 3.6e-2 and more."""
 
 IN_PLANE = 0.9
-"""Fraction of a weak direction that must lie in the image (or across it) to be called so."""
+"""Fraction of an ill-conditioned direction that must lie in the image (or across it) to be called so."""
 
 NAMED_WITHIN = 1.5
-"""A family whose own ratio is up to this much larger than the limit still is the name of a weak motion."""
+"""A family whose own ratio is up to this much larger than the limit still names an ill-conditioned motion."""
 
 
 class WeakMotion(NamedTuple):
-    """One motion that the poses do not show."""
+    """One ill-conditioned motion of the unknowns."""
 
     cause: str
     """Short key, such as ``probe_orientation``, ``tip_position``, ``insertion_angle`` or ``needle_roll``."""
@@ -61,7 +61,7 @@ class WeakMotion(NamedTuple):
 
 
 class Observability(NamedTuple):
-    """How well the poses show the unknowns."""
+    """Conditioning of the unknowns by the poses."""
 
     ratio: float
     """Least over largest singular value."""
@@ -97,7 +97,7 @@ def tips_centre(estimate: Estimate, recording: Recording) -> Floats:
 
 
 def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Observability:
-    """Say what the poses show, and what not.
+    """The conditioning of a set of poses, with its ill-conditioned motions named.
 
     Args:
         estimate: Where the Jacobian is taken; any solution will do, also one of many.
@@ -117,7 +117,7 @@ def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
 
 
 class _Family(NamedTuple):
-    """The weak part of a three-dimensional family of motions."""
+    """The ill-conditioned part of a three-dimensional family of motions."""
 
     weak: int
     """How many of its three directions are weak."""
@@ -177,7 +177,7 @@ def _tip(
 def _relative(
     estimate: Estimate, recording: Recording, J: Floats, active: NDArray[np.int_], limit: float
 ) -> list[WeakMotion]:
-    """t_X += R_X a, t_Q += b with M_i b = a for every pose: what does not turn between needle and image."""
+    """t_X += R_X a, t_Q += b with M_i b = a for every pose: a shift that does not rotate between needle and image."""
     family = np.zeros((17, 3))
     family[T_X], family[T_Q] = estimate.R_X, nearest_rotation(needle_in_image(estimate, recording).mean(axis=0)).T
     weak, a = _weak_part(J, active, family, limit)
@@ -232,7 +232,7 @@ class PoseChange(NamedTuple):
 
 
 class SuggestedPoses(NamedTuple):
-    """Proposed poses."""
+    """Suggested poses, and the conditioning with them."""
 
     poses: tuple[PoseChange, ...]
     ratio_after: float
@@ -241,7 +241,7 @@ class SuggestedPoses(NamedTuple):
 
 
 class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
-    """The poses cannot show every unknown.
+    """Refusal: the poses cannot show every unknown.
 
     Attributes:
         motions: What can move without any residual showing it, in words and with its cause.
@@ -257,7 +257,7 @@ class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
 
 
 def require_observable(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Observability:
-    """How well the poses show the unknowns; the arguments are those of `observe`.
+    """The conditioning of the poses, or a refusal with suggested ones; the arguments are those of `observe`.
 
     Raises:
         Degenerate: They do not; with poses that would mend it.
@@ -269,7 +269,7 @@ def require_observable(estimate: Estimate, recording: Recording, active: NDArray
 
 
 def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> SuggestedPoses:
-    """Poses that would cure a recording.
+    """Suggested poses that would make a recording observable.
 
     Args:
         estimate: A solution, unique or not.
@@ -303,14 +303,14 @@ def _shifts() -> list[tuple[float, float]]:
 
 
 def _single_moves() -> list[_Move]:
-    """One thing changed at a time."""
+    """Moves that change one thing at a time."""
     moves = [_Move(turn=turn) for turn in _turns()] + [_Move(shift=shift) for shift in _shifts()]
     moves += [_Move(insertion=sign * TURN_RAD) for sign in (1, -1)]
     return moves + [_Move(roll=sign * ROLL_RAD) for sign in (1, -1)]
 
 
 def _all_moves() -> list[_Move]:
-    """Everything with everything."""
+    """Moves that combine every change with every other."""
     none = (0.0, 0.0, 0.0)
     angles, rolls = (0.0, TURN_RAD, -TURN_RAD), (0.0, ROLL_RAD, -ROLL_RAD)
     return [_Move(*row) for row in product([none, *_turns()], [(0.0, 0.0), *_shifts()], angles, rolls)]

@@ -40,7 +40,7 @@ class Block(NamedTuple):
     limit: float
     """Of the squared studentised residual, for a recording of this size."""
     least: float
-    """Variance over the expected one below which it is not believed: told noise is there; less than rounding is not."""
+    """Variance over the expected one, at least: stated noise is present; less than rounding is not."""
 
 
 def blocks(problem: Problem) -> list[Block]:
@@ -61,7 +61,7 @@ def _chi_squared(level: float, freedom: int) -> float:
 
 
 def scale(squared: Floats, block: Block, fraction: float = 1.0) -> float:
-    """Variance over the expected one, from the median."""
+    """Variance over the expected one, from the median of the squared sizes."""
     return max(fraction * float(np.median(squared)) / block.median, block.least)
 
 
@@ -81,7 +81,7 @@ ALARM_FRACTION = 0.6
 
 
 def agreeing(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bools, Bools]:
-    """Which tips and which directions agree with the fit, given how far each one pulled it.
+    """Tips and directions that agree with the fit, given how far each one pulled it.
 
     Args:
         problem: What was fitted.
@@ -110,7 +110,7 @@ LEAST_KEPT = 0.5
 
 
 def settled(problem: Problem, fit: RobustFit, *, recheck: bool = True) -> RobustFit:
-    """Fit the poses that were kept, check all poses against it, and so on until none changes sides.
+    """Fit the poses that are used, check all poses against the fit, and repeat until none changes sides.
 
     Args:
         problem: It may have grown since the fit (directions, another spread).

@@ -50,7 +50,7 @@ UNWEIGHTED = Spread(1.0, 1.0, 1.0)
 
 
 class Problem(NamedTuple):
-    """What is to be estimated, from what."""
+    """A least-squares problem: a recording, its free unknowns, and its declared errors."""
 
     recording: Recording
     noise: Noise | Spread
@@ -74,7 +74,7 @@ def residual_weights(problem: Problem, tip_weights: Weights, direction_weights: 
 
 
 class LinearModel(NamedTuple):
-    """A problem at an estimate: residuals, derivatives, and what is expected of the residuals."""
+    """A problem at an estimate: residuals, derivatives, and expected covariance."""
 
     residuals: Floats
     """Shape (n, k), k = 3, or 5 with directions."""
@@ -87,7 +87,7 @@ class LinearModel(NamedTuple):
 
 
 def linear_model(problem: Problem, estimate: Estimate) -> LinearModel:
-    """Everything that a fit or a test of it needs to know of a problem at one estimate."""
+    """The linearised problem at one estimate, for a fit or a test of it."""
     sigma, shared = _pose_covariances(problem, estimate), _shared_slopes(problem, estimate)
     r, J = linearise(problem, estimate)
     return LinearModel(r, J, sigma, shared)

@@ -19,7 +19,7 @@ from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOL
 from puncture_twin.planning.formats.points import joint_readings
 
 OPTIONAL = ("v", "shaft_mm", "q_probe", "q_needle", "turn_probe", "turn_needle")
-"""What a recording may hold beside both flanges and the tip: arrays with one row per pose."""
+"""Optional arrays of a recording besides both flanges and the tip, with one row per pose."""
 
 SHAFT_POWER = 1.5
 """A line's angle errs with the power -3/2 of its length: the variance of a least squares slope through n evenly spaced
@@ -29,11 +29,11 @@ LEAST_SHAFT_MM = 1.0
 """Nothing shorter shows a direction."""
 
 LEAST_IN_PLANE = 0.5
-"""Least share of a needle direction that must lie in the image: a needle that leans more does not show as a line."""
+"""Least fraction of a needle direction that must lie in the image: a needle that leans more does not show as a line."""
 
 
 class Noise(NamedTuple):
-    """Standard deviations per axis of what a recording holds, normal errors."""
+    """Standard deviations per axis of a recording's data, normal errors."""
 
     robot_mm: float
     """Position of each flange."""
@@ -131,7 +131,7 @@ class Recording:
         return len(self.names)
 
     def subset(self, rows: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Recording:
-        """The same recording with these poses only."""
+        """The recording with these poses only."""
         names = tuple(np.array(self.names)[rows].tolist())
         parts: dict[str, Any] = {
             key: None if getattr(self, key) is None else getattr(self, key)[rows] for key in OPTIONAL
@@ -139,7 +139,7 @@ class Recording:
         return Recording(self.A[rows], self.B[rows], self.P[rows], names=names, pixels=self.pixels, **parts)
 
     def joined(self, other: Recording) -> Recording:
-        """Both, one after the other, numbered anew.
+        """Two recordings, one after the other, numbered anew.
 
         Raises:
             InputError: One has directions or pixels and the other has not.

@@ -87,7 +87,7 @@ class Whitening(NamedTuple):
 
 
 class RobustFit(NamedTuple):
-    """A fit, and which poses made it."""
+    """A fit, and the poses that it used."""
 
     estimate: Estimate
     tip_kept: Bools
@@ -147,7 +147,7 @@ SMALL_STEP = 1e-7
 
 
 class Refined(NamedTuple):
-    """Where the refinement ended."""
+    """Result of the refinement."""
 
     estimate: Estimate
     iterations: int
@@ -218,11 +218,11 @@ class ImageErrors(NamedTuple):
 
     @property
     def doubted(self) -> bool:
-        """Whether the image is said to err."""
+        """Whether the test finds errors of the image."""
         return self.probability < DOUBTED
 
     def finding(self) -> Finding:
-        """Which errors, how large, how sure, and what they cost."""
+        """One sentence: which errors, how large, how sure, and their effect at the tips."""
         size = np.abs(self.found / self.sd)
         shown = [
             TEXT[NAMES.index(name)].format(1 + value if name in NAMES[:2] else np.degrees(value))

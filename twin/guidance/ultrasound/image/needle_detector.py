@@ -130,7 +130,7 @@ SHAFT_PERCENTILE = 70.0
 
 
 class Missed(StrEnum):
-    """Why there is no detection."""
+    """Reason why there is no detection."""
 
     NO_NEEDLE = "no line stands out from the speckle"
     TOO_SHORT = "too little of the needle shows"
@@ -140,7 +140,7 @@ class Missed(StrEnum):
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """What is believed, and the correction of the tip.
+    """Thresholds of the detection, and the correction of the tip.
 
     Attributes:
         least_score_mm: Sum along the segment, amplitude over background times mm, that makes a needle.
@@ -164,7 +164,7 @@ class DetectorSettings:
 
 
 class Detection(NamedTuple):
-    """A needle."""
+    """A detected needle."""
 
     tip_image: Floats
     """Shape (2,), mm: (u, v), corrected for the bias."""
@@ -179,7 +179,7 @@ class Detection(NamedTuple):
 
 
 def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
-    """Find the needle, or say why not.
+    """Detect the needle, or return why not.
 
     Args:
         picture: Grey levels, shape (rows, columns).
@@ -291,7 +291,7 @@ def _profile(relative: Floats, imager: Imager, line: _Line, s: Floats) -> Floats
 
 
 def _shaft_only(relative: Floats, imager: Imager, line: _Line) -> _Line:
-    """The same line, cut to where it is brighter than half way between background and shaft.
+    """The line cut to where it is brighter than half way between background and shaft.
 
     The search lengthens a segment through any speckle that is a little bright; the shaft's own level tells better.
     """

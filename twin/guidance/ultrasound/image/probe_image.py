@@ -143,7 +143,7 @@ class Imager:
         return self.slice_fwhm_mm / FWHM_PER_SIGMA
 
     def slice_gain(self, off_plane_mm: Floats) -> Floats:
-        """Amplitude of what lies off the plane, over the same in it; any shape."""
+        """Amplitude of an echo off the plane over that in it; any shape."""
         return np.asarray(np.exp(-0.5 * (off_plane_mm / self.slice_sigma) ** 2))
 
     def grey(self, amplitude: Floats) -> Pixels:
@@ -152,14 +152,14 @@ class Imager:
         return np.clip(np.round(WHITE * (1.0 + level / self.range_db)), 0, WHITE).astype(np.uint8)
 
     def amplitude(self, picture: NDArray[np.generic]) -> Floats:
-        """What :meth:`grey` was made from, where it was neither black nor white."""
+        """Amplitude from greys, the inverse of :meth:`grey` where a pixel is neither black nor white."""
         level = self.range_db * (np.asarray(picture, dtype=np.float64) / WHITE - 1.0)
         return np.asarray(10.0 ** ((level + self.speckle_db) / 20.0))
 
 
 @dataclass(frozen=True)
 class NeedleEcho:
-    """What the needle's steel sends back. Amplitudes against mean speckle.
+    """Echo of the needle's steel. Amplitudes against mean speckle.
 
     Attributes:
         contrast_db: Of the shaft in the plane and parallel to the face, at the middle depth.
@@ -186,7 +186,7 @@ class NeedleEcho:
 
 
 class NeedleInImage(NamedTuple):
-    """Where the needle is, in the frame ``image``."""
+    """The needle in the frame ``image``."""
 
     tip_image: Floats
     """Shape (3,), mm; z is how far the tip is off the plane."""
@@ -212,7 +212,7 @@ def render(
     echo: NeedleEcho | None = None,
     lesion: Lesion | None = None,
 ) -> Pixels:
-    """One B-mode picture.
+    """One B-mode image.
 
     Args:
         imager: Probe and machine.
@@ -298,7 +298,7 @@ def _shaft(imager: Imager, needle: NeedleInImage) -> tuple[Floats, Floats]:
 
 
 def _shadow(imager: Imager, needle: NeedleInImage, echo: NeedleEcho) -> Floats:
-    """What the needle leaves of the sound, shape (rows, columns)."""
+    """Fraction of the sound that the needle lets pass, shape (rows, columns)."""
     points, _ = _shaft(imager, needle)
     left = np.ones((imager.rows, imager.columns))
     if len(points) < 2:
