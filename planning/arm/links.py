@@ -116,7 +116,7 @@ def _packed(links: Sequence[Sequence[TriangleMesh]]) -> Arrays:
 
 @cache
 def visual_links(model: UrModel) -> tuple[Link, ...]:
-    """The links in full detail, for pictures: same frames as :func:`collision_links`.
+    """The links in full detail, for images: same frames as :func:`collision_links`.
 
     They are the collision shapes themselves (43,000 triangles for the UR3): reading coloured Collada files would need
     one more package.

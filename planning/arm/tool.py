@@ -74,7 +74,7 @@ class Tool:
         shaft_mm: Usable length: from the holder's end to the tip.
         needle_diameter_mm: Diameter of the needle.
         holder_diameter_mm: Diameter of the holder.
-        body: What the flange carries beside them, or None.
+        body: What the flange carries besides them, or None.
 
     Raises:
         InputError: If a length is not finite and positive, or the shaft is longer than the needle.

@@ -75,7 +75,7 @@ def _folder_cases(cohort: Path) -> list[CohortCase]:
     """Every case file below a folder, also behind links to folders, each folder once; none that cannot be looked into.
 
     Raises:
-        InputError: A folder that cannot be read, or a link to nothing beside folders: a patient would be lost.
+        InputError: A folder that cannot be read, or a link to nothing next to folders: a patient would be lost.
     """
     found, seen = [], set[str]()
     for folder, below, files in os.walk(cohort, followlinks=True, onerror=_refuse_unreadable):

@@ -87,7 +87,7 @@ def slurm_part(environment: Mapping[str, str]) -> Part | None:
     """The part of this task of a SLURM array; None outside of one.
 
     Raises:
-        InputError: An array from whose numbers the part cannot be told.
+        InputError: An array from whose numbers the part cannot be inferred.
     """
     if TASK not in environment:
         return None

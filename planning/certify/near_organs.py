@@ -24,7 +24,7 @@ SURELY_MIXED = np.radians(0.5)
 it is not safe, and at such a size another triangle rejects all of it in one case of a hundred."""
 
 HOPELESS = 0.6
-"""At a corner of a cell the axis is farther from a triangle beside it by about this part of the cone's radius at
+"""At a corner of a cell the axis is farther from a triangle next to it by about this part of the cone's radius at
 least: a triangle that is no witness by this estimate is not tried."""
 
 
@@ -284,7 +284,7 @@ def _apart(t, n, u, four, bulge, limit, length):  # type: ignore[no-untyped-def]
 def _before_own_plane(t, four, bulge, limit, length, ahead):  # type: ignore[no-untyped-def]  # numba infers
     """Whether every axis of a cell ends at the limit or farther before the plane of a triangle, or leads away from it.
 
-    A large triangle (a table, where the image ends) lies beside the axis as a ray and across it as a line: no plane
+    A large triangle (a table, where the image ends) lies next to the axis as a ray and across it as a line: no plane
     along the axis helps. ``ahead`` is the least cosine between the cell's middle and its corners.
     """
     ax, ay, az = t[3] - t[0], t[4] - t[1], t[5] - t[2]

@@ -65,7 +65,7 @@ class ClearanceEngine(Protocol):
         """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3).
 
         ``length`` is one number, shape (k,) or (n, k), mm: as long is an axis for each structure. The arrays are the
-        caller's to change. Without ``shown`` no progress is told: the same axes are tested again.
+        caller's to change. Without ``shown`` no progress is reported: the same axes are tested again.
         """
         ...
 

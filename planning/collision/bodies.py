@@ -189,10 +189,10 @@ class Solid:
 
     Args:
         make: Makes its geometry, mm.
-        pose: Where it stands at first.
+        pose: Its first pose.
 
     Attributes:
-        pose: Where it stands.
+        pose: Its new pose.
     """
 
     def __init__(self, make: Callable[[], fcl.CollisionGeometry], pose: fcl.Transform | None = None) -> None:

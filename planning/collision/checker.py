@@ -2,7 +2,7 @@
 
 FCL sees the surfaces of triangle meshes, not their insides. Links, holder, needle and boxes are therefore solid
 convex shapes here, and two of them never hide in one another. The skin is a triangle mesh, and the arm cannot hide in
-it either: neighbouring bodies of the chain overlap (a test holds this), the base stands outside (checked once), so if
+it either: neighbouring bodies of the chain overlap (a test holds this), the base is outside (checked once), so if
 no body touches a closed skin every body is on the base's side of it. For an open skin there is no inside, and only its
 surface counts (``patient_closed``). What is loose (a block of the table) could hide in a link: see `FclSkin`.
 """
@@ -152,7 +152,7 @@ class CellChecker:
 
     Raises:
         InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, the base
-            stands in the patient, a shape of an own arm hangs on nothing,
+            is in the patient, a shape of an own arm hangs on nothing,
             or an own tool does not hang on the flange.
     """
 

@@ -45,12 +45,12 @@ ROUNDING_MM = 1e-6
 class FclSkin:
     """A surface in parts, each with a tree of its own, which FCL builds when a body first comes near the part.
 
-    To build a tree takes longer than most questions, and the arm comes near to few parts of a patient. FCL judges a
-    triangle by itself, whichever tree it stands in, so the surface touches what one of its parts touches.
+    To build a tree takes longer than most questions, and the arm comes near to few parts of a patient. FCL tests a
+    triangle by itself, whichever tree it is in, so the surface touches what one of its parts touches.
 
     Args:
         mesh: The surface, mm.
-        name: Of it, for who is told of its fault.
+        name: Of it, for messages about it.
 
     Raises:
         InputError: FCL calls a NaN vertex free and dies of an index out of range: so that is looked for first.
@@ -65,7 +65,7 @@ class FclSkin:
         self._mesh = mesh
 
     def touches(self, solid: Solid, box: Floats) -> bool:
-        """Whether a body touches the surface where it stands.
+        """Whether a body touches the surface where it is.
 
         Args:
             solid: The body.
@@ -74,11 +74,11 @@ class FclSkin:
         return any(touch(self._tree(part), solid.made) for part in self._near(solid.pose, box))
 
     def collides_with(self, body: Body) -> bool:
-        """Whether a body touches the surface where it stands, or has a part of it within."""
+        """Whether a body touches the surface where it is, or has a part of it within."""
         return self.touches(body.full.surface, body.box) or self.has_part_within(body)
 
     def has_part_within(self, body: Body) -> bool:
-        """Whether a connected part of the surface lies within a link where it stands.
+        """Whether a connected part of the surface lies within a link where it is.
 
         Of a link FCL sees the surface, which such a part does not touch. Holder and needle are solid for it.
 
@@ -142,7 +142,7 @@ class FclPatient(NamedTuple):
 
 
 def _bounds_at(pose: fcl.Transform, box: Floats) -> tuple[Floats, Floats]:
-    """Lowest and highest corner (3,) of a box about a body's own box where the body stands."""
+    """Lowest and highest corner (3,) of a box about a body's own box where the body is."""
     R = pose.getRotation()
     centre = R @ (0.5 * (box[0] + box[1])) + pose.getTranslation()
     reach = np.abs(R) @ (0.5 * (box[1] - box[0])) + ROUNDING_MM
@@ -185,13 +185,13 @@ class Check(NamedTuple):
 
 
 class BaseInPatientError(InputError):
-    """The robot's base stands where the patient is, or their table."""
+    """The robot's base is where the patient is, or their table."""
 
 
 def refuse_base_in(
     model: UrModel, base: Body, placed: FclPatient, patient: TriangleMesh, surface: TriangleMesh
 ) -> None:
-    """Refuse a base that stands in the patient, or in what the CT shows outside of the body.
+    """Refuse a base that is in the patient, or in what the CT shows outside of the body.
 
     Args:
         model: The arm.
@@ -218,7 +218,7 @@ def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
     """Whether a point lies inside a surface; more than half around an open one counts too."""
     low, high = mesh.bounds
     if not np.all((point >= low) & (point <= high)) and abs(winding_number(mesh, point)) <= 0.5:
-        return False  # outside, or an open surface that goes less than half around: whether it is open need not be told
+        return False  # outside, or an open surface that goes less than half around: whether it is open does not matter
     side = side_of(mesh, point)
     return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
 

@@ -58,7 +58,7 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
     It depends on no target: of one patient and one arm it is made once where ``memory`` keeps it.
 
     Raises:
-        InputError: The robot's base stands in the patient, or the gantry's wall does.
+        InputError: The robot's base, or the gantry's wall, is in the patient.
     """
     check_gantry(case, anatomy.skin.mesh)
     skin, outside = anatomy.skin.mesh, outside_surface(anatomy)
@@ -120,7 +120,7 @@ def case_boxes(case: Case, T_base_ct: Floats) -> tuple[Box, ...]:
 
 
 def gantry_in_ct(gantry: Gantry) -> tuple[Box, ...]:
-    """The gantry's boxes in the CT frame, which stands in for their base frame."""
+    """The gantry's boxes in the CT frame, which takes the place of their base frame."""
     return _gantry_boxes(gantry, np.eye(4))
 
 
@@ -197,7 +197,7 @@ def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) ->
     """The anatomy with the case's obstacles and gantry as further structures outside of the body.
 
     Raises:
-        InputError: An obstacle has the name of a structure, or the gantry's wall stands in the patient.
+        InputError: An obstacle has the name of a structure, or the gantry's wall is in the patient.
     """
     check_gantry(case, anatomy.skin.mesh)
     solids = surroundings(case, T_base_ct)

@@ -167,7 +167,7 @@ TOKENS = re.compile(
     r"|^[ \t]*\[\[[ \t]*(?P<kind>[A-Za-z0-9_-]+)[ \t]*\]\]",
     re.MULTILINE | re.DOTALL,
 )
-"""Strings and comments, so that what stands in them is passed over, and the heads of tables in arrays."""
+"""Strings and comments, so that what is in them is passed over, and the heads of tables in arrays."""
 
 
 def line_of(text: str, place: Sequence[str | int]) -> int | None:

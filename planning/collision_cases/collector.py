@@ -254,7 +254,7 @@ class CollisionItem(pytest.Item):
         return super().repr_failure(excinfo, style)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
-        """Where the test stands."""
+        """Location of the test."""
         line = self._table.line
         return self.path, None if line is None else line - 1, f"{self.path.name}: {self.name}"
 

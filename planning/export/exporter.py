@@ -184,7 +184,7 @@ def export_plan(
         folder: Where the file goes, under the plan file's name.
         source: The plan's file, for its name and for errors.
         checker: Of the plan's own case, against which the plan has been checked (``plan_check``); without it nothing is
-            known beside the plan's way, so no corner is rounded, and the file says so.
+            known off the plan's path, so no corner is rounded, and the file says so.
 
     Raises:
         InputError: Another format, a plan that contradicts itself, or a number beyond the arm's limits; then nothing

@@ -208,7 +208,7 @@ class RosFrames(NamedTuple):
     """The links of an arm's URDF in which messages speak."""
 
     root: str
-    """The root, of a UR ``base_link``: the controller's base turned by 180 deg about z."""
+    """The root, of a UR ``base_link``: the controller's base rotated by 180 deg about z."""
     flange: str
     """The controller's flange, of a UR ``tool0``."""
     touching: tuple[str, ...]

@@ -59,7 +59,7 @@ class Program:
 
     Attributes:
         tcp_mm: Needle tip in the flange frame, along z.
-        start_q: Shape (6,), where the arm must stand.
+        start_q: Shape (6,), the arm's joints at the start.
         moves: The approach as moves from rest to rest, or empty.
         stream_q: Shape (n, 6), the approach as angles every ``STREAM_S``, or n = 0.
         T_base_standoff: Shape (4, 4), needle tip before the insertion.
@@ -414,7 +414,7 @@ def rests_at(model: UrModel, trajectory: Trajectory, rows: NDArray[np.intp]) -> 
 
 
 PLAIN = frozenset(string.ascii_letters + string.digits + " ._-+:/()")
-"""What may stand in a comment or a string of any of the formats: nothing that ends, escapes or nests one."""
+"""What may be in a comment or a string of any of the formats: nothing that ends, escapes or nests one."""
 
 LONGEST = 200
 """Characters of one name; a longer one is cut."""

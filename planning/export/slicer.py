@@ -57,7 +57,7 @@ class SceneNode:
     Attributes:
         kind: Of the node, by Slicer's name.
         name: As Slicer lists it.
-        file: Where it is stored, beside the scene.
+        file: Where it is stored, next to the scene.
     """
 
     kind: Kind
@@ -139,7 +139,7 @@ def slicer_files(case: Case, drawn: Drawn) -> SlicerFiles:
 
     Args:
         case: Its target and space.
-        drawn: The path, and what stands beside it.
+        drawn: The path, and what is next to it.
 
     Raises:
         InputError: A case in a frame of its own, which Slicer has no name for.

@@ -33,7 +33,7 @@ HARMLESS = (
     *("*sums", "*.sha256", "*.md5"),
 )
 """Names of what can hold no organ, in lower case: of file managers, of versions, what segmentation programs write
-beside their masks, cases, scenes, tables, lists of points, pictures and plain text."""
+with their masks, cases, scenes, tables, lists of points, pictures and plain text."""
 
 STRUCTURE_LIKE = re.compile(
     r"\.(nii|nrrd|nhdr|mha|mhd|hdr|img|mgz|mgh|mnc|npz|npy|dcm|stl|obj|ply|glb|gltf|vtp|vtk|vtu|3mf|wrl)(?![a-z0-9])",
@@ -51,7 +51,7 @@ THUMBNAILS = "@eaDir"
 """The folder in which a file server keeps previews, each named like the file that it shows."""
 
 APPLE_DOUBLE = "._"
-"""How the name of a file begins in which macOS keeps what another file system cannot, beside the file itself."""
+"""How the name of a file begins in which macOS keeps what another file system cannot, next to the file itself."""
 
 MOST_DEPTH, MOST_INSIDE = 6, 100_000
 """Folders in folders, and entries of each, that are looked through for something that is not accounted for."""

@@ -106,7 +106,7 @@ def _float_array(values: ArrayLike, *, what: str, where: str | Path, allowed: st
 
 
 def points_array(points: ArrayLike, names: Sequence[str], *, what: str, where: str | Path) -> NDArray[np.float64]:
-    """Points (n, 3), one or more, all finite; what each is, and its name, stand in the error."""
+    """Points (n, 3), one or more, all finite; what each is, and its name, are in the error."""
     allowed = f"three finite numbers per {what}, at least one {what}"
     array = _float_array(points, what=f"{what} list", where=where, allowed=allowed)
     if array.size == 0:

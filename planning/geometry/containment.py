@@ -187,11 +187,11 @@ OUTSIDE = 1e-12
 """By so much less than a cone's is the cosine of a ray that is outside of it whatever rounding did."""
 
 DOUBTFUL = 1e-12
-"""A triangle seen so nearly edge-on that the share of its area across the ray is of rounding: where on it the ray is
+"""A triangle seen so nearly edge-on that the part of its area across the ray is rounding: where on it the ray is
 crossed is not known."""
 
 NUDGE = 1e-7
-"""Radians by which a ray through an edge or corner is turned when its crossings do not add up."""
+"""Radians by which a ray through an edge or corner is rotated when its crossings do not add up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,7 +325,7 @@ def _seen(vertices, row, origin):  # type: ignore[no-untyped-def]  # numba infer
 
 @allocation_free()
 def _beyond(a, b, c, length):  # type: ignore[no-untyped-def]  # numba infers
-    """Whether no ray from the origin crosses a triangle at a length or less, told by its corners' distances.
+    """Whether no ray from the origin crosses a triangle at a length or less, by its corners' distances.
 
     No point is nearer than the first corner less the longer side from it; two points are no farther apart than twice
     that side, which is what rounding can do to the depth of a ray that grazes the triangle's plane.
@@ -435,9 +435,9 @@ def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) ->
     """Crossings, and which rays they are consistent for: as those of a ray from inside a closed surface.
 
     Such a ray leaves an odd number of times. Where triangles are wound alike it comes out and goes in by turns: if not,
-    one shell lies within another, or two share a wall, and the first crossing need not be the way out.
+    one shell lies within another, or two share a wall, and the first crossing need not be the exit.
 
-    A ray through an edge or corner may count twice or touch without crossing; it is turned by `NUDGE` and asked again.
+    A ray through an edge or corner may count twice or touch without crossing; it is rotated by `NUDGE` and tried again.
     """
     found = crossings(mesh, origin, directions)
     settled = _adds_up(mesh, found)

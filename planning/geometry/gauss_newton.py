@@ -35,7 +35,7 @@ MOST_DAMPINGS = 30
 """Of one step; from 1e-6 by tens, far beyond any step that moves the estimate."""
 
 UNSEEN = 1e-6
-"""Relative length of a column beside the model's own below which the data cannot show it."""
+"""Relative length of a column outside of the model's own below which the data cannot show it."""
 
 
 class System(NamedTuple, Generic[X]):
@@ -157,7 +157,7 @@ class Lacking(NamedTuple):
     freedom: int
     """Residuals less p and k."""
     variance: float
-    """Of one residual, beside them."""
+    """Of one residual, with them."""
     variance_without: float
     """Of one residual, as the model without them has it."""
 

@@ -154,7 +154,7 @@ def frame_of_axes(z: Floats, x: Floats) -> Floats:
 def frame_along(z: Floats, down: Floats) -> Floats:
     """The rotation with a unit vector z (3,) as its z axis and x = down × z, made a unit vector; y is nearest to down.
 
-    A camera's frame, where z is its view and ``down`` (3,), not parallel to it, is down in its picture.
+    A camera's frame, where z is its view and ``down`` (3,), not parallel to it, is down in its image.
     """
     x = np.cross(down, z)
     return frame_xz(x / np.linalg.norm(x), z)

@@ -36,8 +36,8 @@ HOME_TREE, GOAL_TREE = 0, 1
 """The planner's two trees."""
 
 STALLED = 1000
-"""When so many samples in a row have made a tree no larger, it is taken to be shut in. Beside a gantry, where most
-branches touch something, a tree that later found its way out grew every 25 samples."""
+"""When so many samples in a row have made a tree no larger, it is taken to be shut in. Next to a gantry, where most
+branches touch something, a tree that later found its exit grew every 25 samples."""
 
 
 class Connected(NamedTuple):
@@ -169,7 +169,7 @@ class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without
         return True
 
     def _is_detour(self, q: Angles) -> bool:
-        """Whether no path by way of a state is short enough (Gammell, Srinivasa and Barfoot 2014)."""
+        """Whether no path through a state is short enough (Gammell, Srinivasa and Barfoot 2014)."""
         left = self._limits.shorter_than - math.dist(self._home, q)
         return left < math.inf and all(math.dist(q, goal) >= left for goal in self._goals)
 

@@ -372,7 +372,7 @@ NEAREST = 4
 def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats) -> list[ReachAnswer]:
     """The motions that may follow an approach, nearest to home first; empty if the arm does not reach the direction.
 
-    Each answer of :func:`every_reach`, and the same with any joint turned by whole turns, as long as all of the
+    Each answer of :func:`every_reach`, and the same with any joint rotated by whole turns, as long as all of the
     insertion stays within the limits.
 
     Args:
@@ -421,7 +421,7 @@ FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 
 
 
 def small_workcell() -> FastChecker:
-    """A UR3, a body over a table, something else beside it; mm, base frame."""
+    """A UR3, a body over a table, something else next to it; mm, base frame."""
     table = Box("table", pose(np.eye(3), TARGET - [0.0, 0.0, 220.0]), (300.0, 300.0, 20.0))
     body, beside = octahedron(TARGET, 80.0), octahedron(TARGET - [0.0, 200.0, 100.0], 40.0)
     return FastChecker(ur_model("ur3"), NEEDLE, [table], body, outside=beside, padding_mm=1.0)

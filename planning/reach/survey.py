@@ -116,7 +116,7 @@ def survey(
     depths_mm: Sequence[Floats],
     rolls: Floats,
 ) -> Survey:
-    """Every branch and roll of many straight insertions, each turned as far from the joint limits as whole turns allow.
+    """Every branch and roll of many straight insertions, by whole turns as far from the joint limits as possible.
 
     Args:
         model: The arm.
@@ -424,6 +424,6 @@ def _sampled(  # type: ignore[no-untyped-def]  # numba infers
         link_frames(lengths, q, frames)
         motion_bounds(frames, q, bodies[0], bodies[1], bounds)
         worst = bounds.max()
-        if not worst > most_mm:  # NaN: the branch ends on the way
+        if not worst > most_mm:  # NaN: the branch ends early
             return q, depths
         samples = math.ceil((samples - 1) * worst / most_mm) + 1

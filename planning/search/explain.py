@@ -46,7 +46,7 @@ class Explanation:
         candidates: A search's result with this candidate alone.
         facts: The same path for whoever stands at the patient.
         breakdown: How sure it is; None where the case declares no errors, or the candidate was rejected before.
-        read: What was read beside the case to choose it.
+        read: What was read besides the case to choose it.
     """
 
     case: Case

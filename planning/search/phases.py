@@ -290,7 +290,7 @@ class Phase:
 
 
 CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE_BENDS.value)
-"""Reasons whose number is a clearance, the only one that is told of a phase."""
+"""Reasons whose number is a clearance, the only one that is reported of a phase."""
 
 
 def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:

@@ -179,7 +179,7 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
 
     The angle to the nearest direction of the grid that is not safe, or to the nearest beyond the grid, less a cell's
     diagonal. A disc as wide as that diagonal holds a direction of the grid; so where such a disc fits into what is not
-    safe, beside its border, the cone ends before it. What is thinner may pass between the directions: only a
+    safe, at its border, the cone ends before it. What is thinner may pass between the directions: only a
     certificate excludes that.
 
     Args:
@@ -199,7 +199,7 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
 def _border(grid: AngleGrid, safe: Bools) -> Bools:
     """Unsafe directions next to a safe one, or at the grid's end: among them is one nearest to any safe direction.
 
-    They are not safe themselves, and lie beside a safe one or at an end of the azimuths. From any other, the step
+    They are not safe themselves, and lie next to a safe one or at an end of the azimuths. From any other, the step
     towards the safe one, first in azimuth the shorter way and then in θ, stays in the grid and ends nearer (at a pole
     in the same direction) in one that is not safe either.
     """

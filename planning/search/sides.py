@@ -132,7 +132,7 @@ def _within(case: Case, outward_ct: Floats) -> Bools:
 
 
 def grid_of(sides: Sequence[Side]) -> Grid:
-    """The grid that covers the sides that are open: front or back with what is beside it, or all around."""
+    """The grid that covers the sides that are open: front or back with its neighbours, or all around."""
     is_open = {side.name: side.is_open for side in sides}
     if is_open["back"] and not is_open["front"]:
         return Grid((0.0, 90.0), BACK)

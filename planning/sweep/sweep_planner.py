@@ -168,7 +168,7 @@ def _followed(
 
 
 def _least_turn(R: Floats, z: Floats) -> Floats:
-    """A rotation (3, 3) whose z axis is turned to another, shape (3,), unit, and no farther."""
+    """A rotation (3, 3) whose z axis is rotated to another, shape (3,), unit, and no farther."""
     axis = np.cross(R[:, 2], z)
     sine = float(np.linalg.norm(axis))
     angle = float(np.arctan2(sine, R[:, 2] @ z))

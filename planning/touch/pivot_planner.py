@@ -48,7 +48,7 @@ SIDES = 12
 """Directions from the base in which they lie."""
 
 ROLLS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3)
-"""Of the flange about the needle, added to each tilt: they tell how far the tip is beside the flange's axis."""
+"""Of the flange about the needle, added to each tilt: they tell how far the tip is off the flange's axis."""
 
 RIDGE = 1e-6
 """Of A'A, so that fewer poses than unknowns can be compared."""
@@ -60,7 +60,7 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
     Args:
         context: Of a case with an arm.
         count: How many poses, 4 to 12.
-        place_base: Shape (3,), mm, where; None for a place that is found beside the patient.
+        place_base: Shape (3,), mm, where; None for a place that is found next to the patient.
         seed: Of the motions' planner.
         progress: Called with motions done and all of them.
 

@@ -164,7 +164,7 @@ def mean_over_faces(mesh: TriangleMesh, cov: Floats) -> float:
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
-    """A ball about the target, as a tip sees it that is believed elsewhere: a known mean error beside the covariance.
+    """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance.
 
     Args:
         offset: Shape (3,), mm, believed tip minus target, in the covariance's axes.

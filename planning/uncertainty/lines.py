@@ -144,7 +144,7 @@ MANY_LINES, MOST_LINES = 128, 512
 
 DISAGREE = 0.1
 """Standard deviation of the lines' chances up to which few are trusted with .003: against 4,096 lines they err by that
-at most, and by .013 where it is .2 (three anatomies; beside a lung and between ribs)."""
+at most, and by .013 where it is .2 (three anatomies; next to a lung and between ribs)."""
 
 
 def chance_by_rules(problem: Problem, doubt: NeedleUncertainty, basis: Floats, first: float, alone: bool) -> float:

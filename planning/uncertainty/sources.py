@@ -24,7 +24,7 @@ NOT_MODELLED: Mapping[str, tuple[str, str]] = MappingProxyType(
 """What no source stands for, which is something else than 0; and where the case declares it, what is done instead."""
 
 NAMED = 3
-"""Meshes that are named; of more their number is told."""
+"""Meshes that are named; of more their number is stated."""
 
 
 def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:

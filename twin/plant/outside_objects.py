@@ -1,4 +1,4 @@
-"""Objects outside of a patient in a scanner: arms beside or upon the trunk, what they lie on, and lines and cables.
+"""Objects outside of a patient in a scanner: arms along or upon the trunk, what they lie on, and lines and cables.
 
 Arms have hands and bones, drawn anew by every generator, sizes of adults. A patient lies on a flat table with a
 mattress, a curved table, or a pad as dense as the body. Limbs, bones and lines are closed surfaces along a line

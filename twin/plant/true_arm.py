@@ -70,7 +70,7 @@ class TrueArm(NamedTuple):
 def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator) -> TrueArm:
     """An arm whose errors are drawn from their standard deviations.
 
-    The offset d2 along axis 2 is not drawn beside d3: the axes are parallel, and both move the arm alike.
+    The offset d2 along axis 2 is not drawn with d3: the axes are parallel, and both move the arm alike.
     """
     d_errors = rng.normal(0.0, errors.link_mm, 6)
     d_errors[1] = 0.0

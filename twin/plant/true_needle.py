@@ -34,7 +34,7 @@ def true_needle(model: UrModel, q_true: Floats, eta: Floats, tip_mm: float) -> T
 
     Args:
         model: The nominal arm.
-        q_true: Shape (..., 6), rad: what the joints truly are, but for the error of their zeros.
+        q_true: Shape (..., 6), rad: true joints, but for the error of their zeros.
         eta: Shape (..., 28), the errors in the order of `error_jacobian`'s columns, mm and rad.
         tip_mm: Flange to tip by the controller's number.
     """
@@ -170,7 +170,7 @@ class TouchTruth:
 
     Attributes:
         seed: Of it.
-        T_base_ct: Shape (4, 4), mm: where the patient truly lies.
+        T_base_ct: Shape (4, 4), mm: true pose of the patient.
         eta: Shape (28,): what is wrong with the arm's parameters, mm and rad.
         aim_ct: Marker to shape (3,), mm: where the tip comes to on the marker, its touch noise included.
         arrival: Marker to shape (6,), rad: true joints minus what the encoders say there.

@@ -44,7 +44,7 @@ class Truth:
             or was not seen since the markers were touched.
         seed: What the random part was drawn from.
         source: How it was found, in words for the report.
-        target_ct: Shape (3,), mm: where the target truly is in the CT; None where it was read without error.
+        target_ct: Shape (3,), mm: true target in the CT; None where it was read without error.
         bevel_side: Whereto the bevel points about the needle's z, rad; of a needle that bends.
     """
 

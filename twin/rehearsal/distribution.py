@@ -40,7 +40,7 @@ class PhysicsTrials:
 
     Attributes:
         apart_mm: Shape (n,), its tip from that of the kinematics, in the patient.
-        contacts: So many of the rooms had a contact of the arm.
+        contacts: So many of the trials had a contact of the arm.
     """
 
     apart_mm: Floats
@@ -62,9 +62,9 @@ class Distribution:
 
     Attributes:
         seed: Of all draws.
-        unreached: Rooms beside these whose registration put the pose out of the arm's reach.
-        puncture: What every room repeats.
-        rooms: The n rooms.
+        unreached: Further trials, whose registration put the pose out of the arm's reach.
+        puncture: Common part of all trials.
+        rooms: The n trials.
         cov_ct: Shape (3, 3), predicted of it, mm^2.
         in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid.
         hit: Shape (n,).
@@ -75,8 +75,8 @@ class Distribution:
         wrong_belief: Whether the truth was drawn from other errors than the belief declares, on purpose.
         budget: Where the predicted error comes from.
         guessed_touches: Whether nobody says how the arm touched the markers, so that a posture was assumed.
-        not_modelled: What neither the rooms nor the chances hold.
-        physics: Some of the rooms in the simulator, where that was wanted.
+        not_modelled: What neither the trials nor the chances contain.
+        physics: Some of the trials in the simulator, where that was wanted.
     """
 
     seed: int
@@ -159,7 +159,7 @@ def rehearse_trials(
         context: Of a case with declared errors and markers.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target.
-        count: Rooms, at least 1.
+        count: Trials, at least 1.
         seed: Of all draws.
 
     Raises:

@@ -20,8 +20,8 @@ class ErrorRank:
     """Percentile of a rehearsal's tip error among trials, or in the predicted distribution.
 
     Attributes:
-        percentile: 0 to 100; so many of 100 rooms end nearer to the target.
-        rooms: So many rooms were drawn, and this is the median one; 0 where the percentile is the prediction's.
+        percentile: 0 to 100; so many of 100 trials end nearer to the target.
+        rooms: So many trials were drawn, and this is the median one; 0 where the percentile is the prediction's.
     """
 
     percentile: float
@@ -132,12 +132,12 @@ class Rehearsal:
     Attributes:
         seed: What the truth was drawn from.
         truth_source: How the truth was found.
-        T_base_ct_true: Shape (4, 4), where the patient truly lay.
+        T_base_ct_true: Shape (4, 4), true pose of the patient.
         times_s: Shape (m,), from the start of the approach.
         q: Shape (m, 6), what the encoders said.
         q_command: Shape (m, 6), what was asked.
         phase: Shape (m,), "approach", "settle", "insertion" or "hold".
-        T_base_flange_true: Shape (m, 4, 4), where the flange truly was.
+        T_base_flange_true: Shape (m, 4, 4), true pose of the flange.
         tip_true_ct: Shape (m, 3), the needle's true tip in the patient.
         clearance_times_s: Shape (k,), moments of the insertion and its end.
         clearance_mm: Structure to shape (k,): true needle's axis to true structure, minus the needle's radius.
@@ -148,7 +148,7 @@ class Rehearsal:
         lateral_mm: Its part across the needle.
         depth_mm: Its part along the needle, positive when too deep.
         predicted_error_mm: What the plan expected (rms), NaN without markers.
-        target_true_ct: Shape (3,), where the target truly was in the CT.
+        target_true_ct: Shape (3,), true target in the CT.
         truth_is_belief: Whether the patient lay exactly where it was believed, so that the error says little.
         control: How the insertion was followed: "impedance", "admittance" or "position".
         off_path_mm: The tip from its commanded path, by the encoders, at most from the insertion on.

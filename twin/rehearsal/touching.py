@@ -77,7 +77,7 @@ PAD_N_M = 1e5
 
 PAD_MM = (12.0, 12.0, 4.0)
 MOST_ASIDE_MM = 10.0
-"""A marker that lies farther beside its believed place is not the one that was planned to be touched."""
+"""A marker that lies farther from its believed place is not the one that was planned to be touched."""
 
 LOOK_EVERY = 8
 """Steps of the motors between two looks at where the needle is: 30 a second."""
@@ -125,9 +125,9 @@ class TouchingCell:
         room: The simulated workcell.
         rigid: The arm's masses as its controller knows them.
         tour: The touches.
-        truth: Where everything truly is.
+        truth: The ground truth.
         checkers: Of the workcell as it is believed.
-        true: Of the needle against the patient where they truly lie.
+        true: Of the needle against the patient at their true pose.
         rng: Of the force sensor's noise.
     """
 

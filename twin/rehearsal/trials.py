@@ -50,7 +50,7 @@ class Puncture:
         outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target.
         bend: Of the needle; None where it is straight.
-        aim: Of the method ``joint``: the insertion that every room's pose is corrected for; None where it is not.
+        aim: Of the method ``joint``: the insertion that every trial's pose is corrected for; None where it is not.
     """
 
     model: UrModel
@@ -73,11 +73,11 @@ class Trials(NamedTuple):
     Attributes:
         tip_ct: Shape (n, 3), where the tip ended.
         outward_ct: Shape (n, 3), unit, from there along the needle.
-        target_ct: Shape (n, 3), where the target truly was.
-        T_base_ct: Shape (n, 4, 4), what each room registered.
+        target_ct: Shape (n, 3), true target.
+        T_base_ct: Shape (n, 4, 4), what each trial registered.
         reached: Shape (n,), whether the arm could reach the pose that followed.
         R_ct_needle: Shape (n, 3, 3), the needle's axes as columns; z points to the tip.
-        chi_squared: Shape (n,), of the weighted residuals of each room's markers against the believed noise.
+        chi_squared: Shape (n,), of the weighted residuals of each trial's markers against the believed noise.
         bevel_side: Shape (n,), rad, whereto the bevel points about the needle's z; 0 where it has none.
     """
 
@@ -103,9 +103,9 @@ def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rand
     """Draw trials from declared errors and rehearse the puncture in each.
 
     Args:
-        puncture: What every room repeats.
+        puncture: Common part of all trials.
         errors: What their truth is drawn from.
-        count: Rooms.
+        count: Trials.
         rng: The source of all draws.
     """
     eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))

@@ -36,7 +36,7 @@ NO_WEIGHT = ET.fromstring(
 
 
 def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
-    """Write the arm with holder and needle as a URDF that PyBullet can load, and its collision pieces beside it.
+    """Write the arm with holder and needle as a URDF that PyBullet can load, and its collision pieces next to it.
 
     The collision bodies are the planner's own: convex pieces that contain each link.
 

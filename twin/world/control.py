@@ -92,7 +92,7 @@ def insert(
     """Run an insertion from where the arm is.
 
     Args:
-        workcell: An open room, its arm at rest at the trajectory's start.
+        workcell: An open workcell, its arm at rest at the trajectory's start.
         insertion: What is wanted.
         control: How the tip follows it.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
@@ -460,7 +460,7 @@ class Run:
     Attributes:
         dt: Between rows, s.
         q: Shape (n, 6), rad, encoders.
-        tip_m: Shape (n, 3), where the tip truly was, base frame.
+        tip_m: Shape (n, 3), true tip, base frame.
         force_n: Shape (n, 3), N, on the tip.
         stopped: Whether it ended before its reference did.
     """
@@ -498,7 +498,7 @@ def run(
     """Follow a reference from where the arm is.
 
     Args:
-        arm: Of an open room whose world is the base frame.
+        arm: Of an open workcell whose world is the base frame.
         controller: Its step becomes that of the physics.
         reference: What is wanted, a row a step.
         tip_of: The true tip of true joints.

@@ -33,7 +33,7 @@ class Execution:
         times_s: Shape (m,), of each record, from the first command.
         q_command: Shape (m, 6), rad, what was asked.
         q: Shape (m, 6), rad, what the encoders say: true angle minus offset.
-        T_base_flange: Shape (m, 4, 4), mm, where the flange truly was.
+        T_base_flange: Shape (m, 4, 4), mm, true pose of the flange.
         touches: Every contact at every physics step.
         max_speed: Shape (6,), rad/s, over every step.
     """
@@ -50,7 +50,7 @@ class Recorder:
     """Records the arm after physics steps: `RECORD_S` apart, and at the end.
 
     Args:
-        workcell: An open room.
+        workcell: An open workcell.
         q_command: Shape (n, 6), rad, one row a physics step.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
         dt: The physics step, s.
@@ -93,7 +93,7 @@ def execute(workcell: SimulatedWorkcell, q_command: Floats, joint_offsets: Float
     """Move the arm by its position motors from rest at the first command through all of them, one a physics step.
 
     Args:
-        workcell: An open room.
+        workcell: An open workcell.
         q_command: Shape (n, 6), rad, spaced by the physics time step.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
     """

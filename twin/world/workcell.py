@@ -78,7 +78,7 @@ def open_workcell(
 Rgba = tuple[float, float, float, float]
 
 MAX_PHYSICS_FACES = 20_000
-"""Surfaces with more triangles are thinned for physics and pictures; verdicts come from FCL on the full ones."""
+"""Surfaces with more triangles are thinned for physics and images; verdicts come from FCL on the full ones."""
 
 SKIN_RGBA: Rgba = (0.93, 0.78, 0.68, 1.0)
 BOX_RGBA: Rgba = (0.60, 0.63, 0.67, 1.0)
@@ -105,7 +105,7 @@ def load_surface(
         mesh: The surface, mm; thinned to ``max_faces``.
         T_world_mesh: Its pose, shape (4, 4), mm.
         solid: Whether bodies collide with it, or it is only seen.
-        max_faces: How many triangles physics and pictures bear.
+        max_faces: How many triangles physics and images bear.
 
     Returns:
         Body id.
@@ -188,8 +188,8 @@ class SimulatedCamera:
 
     Attributes:
         eye_mm: Shape (3,), world frame.
-        look_at_mm: Shape (3,), the middle of the picture.
-        up: Shape (3,), what is up in the picture, world frame.
+        look_at_mm: Shape (3,), the middle of the image.
+        up: Shape (3,), what is up in the image, world frame.
         width: Pixels.
         height: Pixels.
     """

@@ -164,7 +164,7 @@ def _center_along(corners, n, c):  # type: ignore[no-untyped-def]  # numba infer
 
 @allocation_free(nogil=True)
 def _mean_normal(corners):  # type: ignore[no-untyped-def]  # numba infers
-    """Unit mean of the triangles' normals by area, all turned to the side of the largest; z where there is none."""
+    """Unit mean of the triangles' normals by area, all flipped to the side of the largest; z where there is none."""
     first, largest = (0.0, 0.0, 0.0), 0.0
     for row in range(LANES):
         normal = _normal(corners[row])
@@ -208,7 +208,7 @@ def parent_discs(center, disc, child, count, parent):  # type: ignore[no-untyped
 
 @allocation_free(nogil=True)
 def _mean_of_discs(disc, low, high):  # type: ignore[no-untyped-def]  # numba infers
-    """Unit mean of the discs' normals by area, all turned to the side of the first; z where there is none."""
+    """Unit mean of the discs' normals by area, all flipped to the side of the first; z where there is none."""
     first = _axis(disc, low)
     x, y, z = 0.0, 0.0, 0.0
     for j in range(low, high):

@@ -90,7 +90,7 @@ def _edge(ux, uy, uz, length, px, py, pz, qx, qy, qz):  # type: ignore[no-untype
     """Nearest of an edge's candidates: its corner p, and the nearest points to the line, to its start and to its end.
 
     The squared distance from the axis is convex and smooth along the edge, and on each of its pieces (behind the start,
-    beside the axis, beyond the end) it is one of three parabolas; its minimum is that of one of them.
+    next to the axis, beyond the end) it is one of three parabolas; its minimum is that of one of them.
     """
     dx, dy, dz = qx - px, qy - py, qz - pz
     tp, td = px * ux + py * uy + pz * uz, dx * ux + dy * uy + dz * uz

@@ -1,6 +1,6 @@
 """Exact distances of many axes from many triangles, in float64, pair by pair.
 
-Each pair is brought into the frame of its axis. Most triangles lie beside their axis, where the distance is that of
+Each pair is brought into the frame of its axis. Most triangles lie next to their axis, where the distance is that of
 their projection on the plane across it; those are all measured in one loop without a branch, the few others singly.
 As in `segment_triangle.py`, every distance is that of a point *of the triangle*.
 `Scratch` holds the arrays in which one structure is searched: made once, passed down as one.
@@ -37,7 +37,7 @@ def bring_into_frame(u, e, f, triangles, row, origin, pairs, k):  # type: ignore
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def measure_beside(pairs, count):  # type: ignore[no-untyped-def]  # numba infers
-    """Answer the pairs whose triangle lies beside the axis or is pierced by it; mark the others.
+    """Answer the pairs whose triangle lies next to the axis or is pierced by it; mark the others.
 
     Args:
         pairs: Shape (12, m); rows 0 to 8 as `bring_into_frame` writes them, row 11 the axes' lengths; rows 9

@@ -30,7 +30,7 @@ ENOUGH_MM = 12.0
 """Along a path a larger gap saves questions; beyond this it is not worth a closer look."""
 
 FAR_MM = 200.0
-"""Larger distances to the skin are not told apart."""
+"""Larger distances to the skin are not distinguished."""
 
 
 class SkinTree(NamedTuple):
@@ -79,7 +79,7 @@ class ProofScratch(NamedTuple):
     corners: Ints
     """Shape (k, 2): the last corners."""
     spheres: Floats
-    """Shape (h, 3), mm: where the centres of the hulls' spheres stand."""
+    """Shape (h, 3), mm: where the centres of the hulls' spheres are."""
     stack: Ints
     inner_stack: Ints
     M: Floats
@@ -154,7 +154,7 @@ def near_gap(scene, work, at, frames, enough, far, needed):
 def state_gap(scene, work, at, frames, enough, far, needed):
     """Lower bound as of :func:`near_gap`, sooner where the spheres about two hulls are ``enough`` apart.
 
-    The spheres stand where :func:`place_spheres` has put them.
+    The spheres are where :func:`place_spheres` has put them.
     """
     kind, first, second = scene.checks[at, 0], scene.checks[at, 1], scene.checks[at, 2]
     if kind != SKIN:
@@ -217,7 +217,7 @@ def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
         motion: (frames, moved, rotated), with
             frames: Shape (m, 7, 4, 4), mm: the states;
             moved: Shape (m, 7), mm: how far each frame's bodies may have moved since the first state; rising;
-            rotated: Shape (m, 6), rad: how far each joint has turned since the first state; rising.
+            rotated: Shape (m, 6), rad: how far each joint has rotated since the first state; rising.
         work: See :class:`ProofScratch`.
         due: Shape (k,): the state at which each check is due; 0 at the beginning.
         tested: Shape (k,): which checks.

@@ -50,7 +50,7 @@ class NamedMasks:
 
     Attributes:
         masks: Name to mask.
-        notes: What a person should be told, one sentence each.
+        notes: Notes for a person, one sentence each.
     """
 
     masks: dict[str, MaskVolume]

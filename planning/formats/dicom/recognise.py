@@ -178,7 +178,7 @@ def _is_enough(tag: BaseTag, vr: str | None, length: int) -> bool:
 
 
 SHOWN, LOOKED_AT = 6, 100
-"""Series that a message lists, and files of a folder beside the slices that are opened."""
+"""Series that a message lists, and files of a folder next to the slices that are opened."""
 
 
 @dataclass(frozen=True)

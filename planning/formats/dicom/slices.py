@@ -320,7 +320,7 @@ class StraightGrid:
         shape: Voxels along columns, rows and slices.
         T_ct_index: Shape (4, 4), maps them to LPS mm.
         shifts: Shape (n, 2), where pixel (0, 0) of each slice lies in the grid, along columns and rows, in pixels.
-        tilt_deg: Between the slices' normal and the way from one to the next.
+        tilt_deg: Between the slices' normal and the direction from one to the next.
     """
 
     shape: tuple[int, int, int]

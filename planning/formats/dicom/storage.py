@@ -51,7 +51,7 @@ def kind_of(sop_class: str) -> Kind:
 
 
 def is_dicom(start: bytes) -> bool:
-    """Whether a file that begins so is DICOM: ``DICM`` stands behind a preamble of 128 bytes."""
+    """Whether a file that begins so is DICOM: ``DICM`` follows a preamble of 128 bytes."""
     return start[PREAMBLE_BYTES:META_START] == MAGIC
 
 

@@ -85,7 +85,7 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
 
     Raises:
         InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that
-            lie beside the CT's slices.
+            lie off the CT's slices.
     """
     data = parse_dicom(content(file), path)
     where = path.name

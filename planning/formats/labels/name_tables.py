@@ -1,4 +1,4 @@
-"""Tables that say which label is which structure, as programs and people write them beside a label map.
+"""Tables that say which label is which structure, as programs and people write them for a label map.
 
 CSV with any common naming of its columns, JSON (``{"1": "liver"}``, ``{"liver": 1}``, nnU-Net's ``labels``), ITK-SNAP's
 label descriptions and 3D Slicer's colour tables.

@@ -89,7 +89,7 @@ OWN_NAMES = "seg.nrrd"
 REST = "*"
 """The pattern of whatever no other pattern names."""
 WILDCARD = re.compile(r"\[[^\]]+\]|[*?]")
-"""What stands for characters in a shell pattern."""
+"""Placeholders of characters in a shell pattern."""
 MAX_CSV_BYTES = 10_000_000
 """A table of all 65,535 labels stays below 4 MB."""
 
@@ -299,7 +299,7 @@ def _listed(items: Sequence[object]) -> str:
 
 
 def _unique(names: Mapping[int, str], where: Path) -> dict[int, str]:
-    """The names, each of one label: two structures of one name could not be told apart in a result."""
+    """The names, each of one label: two structures of one name could not be distinguished in a result."""
     seen: dict[str, int] = {}
     for label, name in names.items():
         check_name(name, f"label {label}", where=where)

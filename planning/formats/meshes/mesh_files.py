@@ -63,7 +63,7 @@ def read_mesh(
 
     The caller declares the unit, also for GLB, whose standard says metres, and the space. A file that Slicer wrote
     states its space, which must be the declared one. All parts of a file become one surface, placed by their node
-    transforms, in the file's order; nothing is welded and no triangle dropped. Axes of a file whose y is up are turned
+    transforms, in the file's order; nothing is welded and no triangle dropped. Axes of a file whose y is up are rotated
     about x, so that z is; of a GLB it must be stated.
 
     Args:

@@ -75,7 +75,7 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
 
 
 def _sections(cursor: _Cursor, *, offsets: bool, where: str) -> tuple[NDArray[np.float64] | None, _Polygons | None]:
-    """The points and the polygons, whatever stands between; what comes after the surface is left."""
+    """The points and the polygons, whatever is between; what comes after the surface is left."""
     points: NDArray[np.float64] | None = None
     polygons: _Polygons | None = None
     while (words := cursor.words()) and words[0].upper() not in _DATA:

@@ -80,7 +80,7 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
     """Find the needle of a control CT.
 
     Metal that is wider than the needle (bolts, plates) is not looked at, nor what it blurs into: the axis is that of
-    the thin metal beside it. A tip there cannot be told from it and is refused.
+    the thin metal next to it. A tip there cannot be distinguished from it and is refused.
 
     Args:
         volume: The CT.

@@ -111,7 +111,7 @@ def pivot_calibration(
     Args:
         T_base_flange: Shape (n, 4, 4), mm, as the controller computes them.
         noise_mm: Standard deviation of one touch, per axis.
-        arm_cov: Shape (3 n, 3 n), mm^2: of what the arm misses the place by, beside that noise; None for nothing.
+        arm_cov: Shape (3 n, 3 n), mm^2: of what the arm misses the place by, besides that noise; None for nothing.
         where: What errors name.
 
     Raises:

@@ -106,7 +106,7 @@ class ServoErrors:
         tip_offset_mm: Of the needle's tip against the ball's centre, flange axes; no camera sees it.
         needle_direction: Of the needle, about each of the flange's x and y axes.
         camera: Of each camera.
-        ball_px: Of the centre of a ball or marker in one look; None takes what the tracker states of each picture.
+        ball_px: Of the centre of a ball or marker in one look; None takes what the tracker states of each image.
         measuring_mm: Of the measuring arm.
         marker_mm: Of a marker in the image.
         target_mm: Of the target in the image.

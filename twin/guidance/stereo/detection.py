@@ -25,7 +25,7 @@ DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
 """Fraction of diffuse light; the rest is from one direction."""
 
 WINDOW_MARGIN_PX = 24
-"""A picture, and the rod in it, are drawn this far beyond the region that is searched: the rest is never looked at."""
+"""An image, and the rod in it, are drawn this far beyond the region that is searched: the rest is never looked at."""
 
 
 class LocatedPair(NamedTuple):
@@ -41,7 +41,7 @@ class LocatedPair(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """A ball's centre in one picture."""
+    """A ball's centre in one image."""
 
     pixel: Floats
     """Shape (2,)."""

@@ -23,7 +23,7 @@ class Known(NamedTuple):
     """Knowledge of a session when the servo begins, and the workcell for its images."""
 
     workcell: StereoWorkcell
-    """Of which only the pictures are used."""
+    """Of which only the images are used."""
     calibration: RobotCalibration
     mapping: Mapping
     markers: list[Detections]
@@ -61,7 +61,7 @@ class Guide:
 
         Args:
             q_command: Shape (6,), rad: where the arm was sent; predicts where to search.
-            q_true: Shape (6,), rad: where it truly is, for the pictures alone.
+            q_true: Shape (6,), rad: true joints, for the images alone.
         """
         tool, limits = self._case.file.tool, self._case.file.servo
         ball = LocatedPair(self._room.ball_c(q_true), tool.ball_diameter_mm / 2, self._room.rod_c(q_true))

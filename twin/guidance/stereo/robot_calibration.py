@@ -44,7 +44,7 @@ class RobotCalibration:
         covariances: Shape (c, k, 2, 2), px^2.
         rms_px: Residual of each camera.
         robot_residual_mm: Shape (k,): what the rigid fit leaves; mostly the robot's own error.
-        q_true: Shape (k, 6), rad: where the arm truly stood; for the twin alone.
+        q_true: Shape (k, 6), rad: true joints; for the twin alone.
         branch: Of the inverse kinematics; the arm's errors are known on this one.
     """
 
@@ -87,7 +87,7 @@ def calibrate_by_robot(
 
     Args:
         workcell: The true room.
-        detector: Takes the pictures.
+        detector: Takes the images.
         checker: Judges contacts; the head is not there yet.
         rng: For the arm's repeatability and the measuring arm.
 

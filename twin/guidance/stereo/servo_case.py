@@ -100,7 +100,7 @@ class CalibrationSection(Section):
 
 
 class HeadSection(Section):
-    """The head: its surface and its points in the image frame, and where it stands; z up, face to the cameras."""
+    """The head: its surface and its points in the image frame, and where it is; z up, face to the cameras."""
 
     mesh: str
     unit: Literal["mm", "cm", "m"]
@@ -193,7 +193,7 @@ class ServoCase:
         file: Its content.
         model: The arm.
         skin: The head's surface, image frame, mm.
-        markers: The markers' centres, image frame, as they truly are.
+        markers: The markers' centres, image frame, in truth.
         targets: The targets, likewise.
         inputs: Every file, with role and hash.
     """

@@ -55,7 +55,7 @@ DAMPING = 0.05
 """Damping of a position-only step where the position itself is singular; none where it is not."""
 
 PIECE_MM = 1.0
-"""A step's way is cut into pieces no longer than this: over 1 mm the Jacobian of a UR3 errs by 2 or 3 micrometres."""
+"""A step's path is cut into pieces no longer than this: over 1 mm the Jacobian of a UR3 errs by 2 or 3 micrometres."""
 
 
 class ServoStop(StrEnum):
@@ -86,7 +86,7 @@ class Step(NamedTuple):
     q_path: Floats
     """Shape (m, 6), rad: from where the arm stands; one row where it may not go anywhere."""
     stop: ServoStop | None
-    """Why there is no way (on)."""
+    """Why there is no path (on)."""
     position_only: bool
     """Whether some piece gave the orientation up."""
 

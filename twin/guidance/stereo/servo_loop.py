@@ -94,7 +94,7 @@ class Servoed:
         stop: Why it ended.
         visits: Every stay at which the ball was seen, in order.
         q_command: Shape (6,), rad: the last command.
-        q_true: Shape (6,), rad: where the arm truly stands.
+        q_true: Shape (6,), rad: true joints.
         detail: What was met or missing, for people.
         position_only: Whether some step gave the orientation up.
     """
@@ -123,8 +123,8 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, move: Move)
     Args:
         task: What to do.
         q_command: Shape (6,), rad: where the arm was sent.
-        q_true: Shape (6,), rad: where it truly is; only handed on to ``look``.
-        look: Takes pictures and measures.
+        q_true: Shape (6,), rad: true joints; only handed on to ``look``.
+        look: Takes images and measures.
         move: Moves the arm.
     """
     visits: list[Visit] = []

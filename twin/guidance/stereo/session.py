@@ -89,7 +89,7 @@ class Session:
         mapping: What the markers gave.
         stereo_mm: Shape (10,): error of the stereo at points of the calibrated volume.
         reached: One for each target.
-        guide: Who told the servo where ball and target are; knows everything that was measured.
+        guide: The estimates of ball and target for the servo; knows everything that was measured.
     """
 
     seed: int
@@ -125,11 +125,11 @@ def run_session(
         case: The case.
         seed: Of all that is drawn.
         targets: Only these; all when None.
-        detector_of: Who looks; studies of what is behind the pictures leave them out.
+        detector_of: Who looks; studies of what is behind the images leave them out.
         empty: Checker of the workcell without the head, where one is at hand.
 
     Raises:
-        NoAnswerError: The calibration, the mapping or a start pose could not be done; says what stood in the way.
+        NoAnswerError: The calibration, the mapping or a start pose could not be done; says what blocked it.
         InputError: The case contradicts itself.
     """
     parts = _Parts(*(np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(len(_Parts._fields))))

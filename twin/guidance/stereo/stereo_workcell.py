@@ -50,9 +50,9 @@ class StereoWorkcell:
         arm: The true arm.
         T_c_base: Shape (4, 4), mm: the true arm's base in C.
         cameras: The true cameras.
-        T_c_m: Shape (4, 4), mm: where the head truly stands when its markers are seen, image frame to C.
-        T_c_m_after: Shape (4, 4), mm: where it stands from then on.
-        tool: What the arm truly carries.
+        T_c_m: Shape (4, 4), mm: true pose of the head when its markers are seen.
+        T_c_m_after: Shape (4, 4), mm: where it is from then on.
+        tool: The true tool.
     """
 
     case: ServoCase

@@ -56,9 +56,9 @@ class Acquisition:
 
     Attributes:
         recording: Poses as the controllers print them, tips and directions as detected.
-        shots: The pictures behind it, in the same order.
+        shots: The images behind it, in the same order.
         missed: Pictures in which no needle was found, by reason, and poses that were given up.
-        missed_shots: Those pictures.
+        missed_shots: Those images.
         left: Indices of candidates that were never gone to.
     """
 
@@ -108,11 +108,11 @@ def acquire(
         workcell: Its collision checker: the jog is checked too.
         candidates: Poses that can be taken.
         truth: The true room.
-        rng: For the choice, if random, the arms' repeatability, what the jog leaves, and the pictures.
-        count: Told after every picture.
+        rng: For the choice, if random, the arms' repeatability, what the jog leaves, and the images.
+        count: Called after every image.
 
     Raises:
-        NoAnswerError: The candidates are used up before enough pictures show the needle.
+        NoAnswerError: The candidates are used up before enough images show the needle.
     """
     motion, wanted = _Motion(case, truth, rng), case.content.poses.count
     shots: list[ProbeShot] = []
@@ -290,7 +290,7 @@ def jog_into_slice(
 ) -> Floats:
     """Move the needle's arm until the true needle is in the true image as wanted.
 
-    It stands for the operator, or a servo on the picture, that jogs until the needle shows: what is left is in
+    It stands for the operator, or a servo on the image, that jogs until the needle shows: what is left is in
     ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
 
     Args:

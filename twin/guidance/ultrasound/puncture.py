@@ -21,7 +21,7 @@ AIM_STEPS = 3
 """Of the command that counts the needle arm's errors: each leaves a thousandth of what was left before."""
 
 LESION_MM = 4.0
-"""Radius of the lesion that is drawn about the target in a picture."""
+"""Radius of the lesion that is drawn about the target in an image."""
 
 
 class Puncture(NamedTuple):
@@ -160,7 +160,7 @@ def unseen_errors_mm(
 ) -> Floats:
     """Predicted minus true tip at candidates that were not recorded, in the image; shape (n,), mm.
 
-    Both arms stand where they were told to by nominal kinematics, and their errors that were found are counted; the
+    Both arms stand where nominal kinematics put them, and their errors that were found are counted; the
     image's are not in it.
     """
     errors = []

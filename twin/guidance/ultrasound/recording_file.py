@@ -39,8 +39,8 @@ def read_recording(path: Path) -> Recording:
     Columns: ``name``; ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``; the same for B; ``P_u_mm, P_v_mm`` (or ``_px``); and,
     where directions were measured, ``v_x, v_y`` or ``v_x, v_y, v_z``, and behind them, where it was measured too, how
     much of the shaft shows, ``shaft_mm``; and, where the joints were recorded,
-    ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``; and, behind these, which way each joint last turned (1, -1; 0 where
-    nobody knows), ``A_turn1 .. B_turn6``. Lines that start with # are passed over.
+    ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``; and, behind these, the direction of each joint's last rotation
+    (1, -1; 0 where nobody knows), ``A_turn1 .. B_turn6``. Lines that start with # are passed over.
 
     Raises:
         InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.

@@ -113,7 +113,7 @@ class CaseScene:
         skin: The body's surface.
         cut: Shape (3, 2): at which ends the body goes on beyond its surface.
         tables: Shape (2, 3): the box about what the patient lies on; infinite without any.
-        outside_objects: What was laid beside the patient.
+        outside_objects: The objects outside of the patient.
         markers: True positions, or None.
         listed: The case's own readings of them.
         target: Shape (3,).
@@ -145,11 +145,11 @@ def case_scene(
     Args:
         case: The case.
         anatomy: Its structures.
-        settings: By how much the patient is turned; the cells of readings where the case declares none.
-        rng: Draws where in its cell each marker truly is.
+        settings: By how much the patient is rotated; the cells of readings where the case declares none.
+        rng: Draws each true marker in its cell.
         marker: What stands at each marker's place.
         needle: Drawn of metal, its usable length.
-        outside_objects: Arms, bed and lines to lay beside the patient.
+        outside_objects: Arms, bed and lines outside of the patient.
 
     Raises:
         InputError: A structure's surface is open.
@@ -311,7 +311,7 @@ def _bounds(meshes: Sequence[TriangleMesh]) -> Floats:
 AIR_MM = 15.0
 """Air around the body, and about arms and lines: a needle's entry is not at the image's edge."""
 TABLE_MM = 100.0
-"""Beside and behind the body, so much of a table is shown: where the image cuts it, what is beyond is not known."""
+"""Next to and behind the body, so much of a table is shown: where the image cuts it, what is beyond is not known."""
 MOST_VOXELS = 200_000_000
 """A whole trunk at 0.8 x 0.8 x 0.6 mm; each voxel takes some ten bytes while it is made."""
 DECIMALS = 4

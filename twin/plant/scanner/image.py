@@ -42,7 +42,7 @@ class ScanSettings:
         seed: Of the noise and of where the grid falls.
         fov_mm: Side of the square image; None shows the whole body.
         length_mm: Along the bed; None scans the whole body.
-        turn: By which the patient is turned about the bed's direction, rad.
+        turn: By which the patient is rotated about the bed's direction, rad.
     """
 
     spacing_mm: float = 2.5

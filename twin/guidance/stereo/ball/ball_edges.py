@@ -37,7 +37,7 @@ DISC_RINGS = 0.85 * np.sqrt((np.arange(6) + 0.5) / 6)
 
 
 class Grey(NamedTuple):
-    """A part of a picture, ready to be read between its pixels."""
+    """A part of an image, ready to be read between its pixels."""
 
     pixels: NDArray[np.uint8]
     spline: Floats
@@ -58,7 +58,7 @@ class Edges(NamedTuple):
     contrast: Floats
     """Grey levels, inside minus outside."""
     inside: NDArray[np.bool_]
-    """False where the steepest place lies at the end of the spoke or outside the picture: no edge."""
+    """False where the steepest place lies at the end of the spoke or outside the image: no edge."""
 
 
 class Spokes(NamedTuple):
@@ -74,7 +74,7 @@ class Spokes(NamedTuple):
 
 
 def grey_part(pixels: NDArray[np.uint8], offset: Floats) -> Grey:
-    """Prepare a part of a picture; its noise is the median of second differences, which edges hardly touch."""
+    """Prepare a part of an image; its noise is the median of second differences, which edges hardly touch."""
     grey = pixels.astype(np.float64)
     second = grey[:, :-2] - 2 * grey[:, 1:-1] + grey[:, 2:]
     noise = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6.0) if second.size else 0.0
@@ -108,7 +108,7 @@ def visible_fraction(
     """Fraction of the disc that looks like the ball: as bright as next to its edges, within a part of its contrast.
 
     Args:
-        grey: The picture.
+        grey: The image.
         camera: The camera.
         spokes: Around the measured ball.
         on_circle: Shape (n,): the spokes whose edge lies on the circle.

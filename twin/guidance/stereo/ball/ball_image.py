@@ -40,7 +40,7 @@ class BallScene:
         rod_radius_mm: The rod is a cylinder with round ends.
         rod_length_mm: From the ball's centre.
         light_c: Shape (3,): toward the lamp.
-        diffuse: Fraction of the light that comes from everywhere, 0 to 1; the lamp's share obeys Lambert's law.
+        diffuse: Fraction of the light that comes from everywhere, 0 to 1; directed light obeys Lambert's law.
         ball_grey: Of the ball where the lamp shines straight on it.
         rod_grey: The rod's.
         background_grey: What is behind.
@@ -73,12 +73,12 @@ class BallScene:
 
 
 class Picture(NamedTuple):
-    """A grey picture, or a part of one."""
+    """A grey image, or a part of one."""
 
     grey: NDArray[np.uint8]
     """Shape (h, w)."""
     offset: tuple[int, int] = (0, 0)
-    """Column and row, in the camera's picture, of the part's first pixel."""
+    """Column and row, in the camera's image, of the part's first pixel."""
 
 
 class _Layer(NamedTuple):
@@ -108,7 +108,7 @@ def render(
         rng: Draws the noise and the pattern of the background.
         noise: Standard deviation of the sensor's noise, grey levels.
         blur_px: Standard deviation of the lens's blur.
-        half_px: None takes the whole picture; a number only the window that far around the ball's centre.
+        half_px: None takes the whole image; a number only the window that far around the ball's centre.
     """
     low, high = _window(camera, scene, half_px)
     shape = (max(high[1] - low[1], 0), max(high[0] - low[0], 0))

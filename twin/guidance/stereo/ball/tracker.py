@@ -55,7 +55,7 @@ class TrackerSettings:
         min_visible: Fraction of the disc that must look like the ball.
         radius_share: How far the radius may be from the predicted one.
         min_contrast: Grey levels between ball and surroundings that make an edge.
-        noise_factor: The same in parts of the picture's own noise; the larger counts.
+        noise_factor: The same in parts of the image's own noise; the larger counts.
         model_px: Standard deviation, per axis, of what lamp, blur and rod do to the centre and the edges do not tell.
     """
 
@@ -109,12 +109,12 @@ def find_ball(
     """Find and measure the ball.
 
     Args:
-        image: A whole picture, shape (height, width), or a part of one with its offset.
+        image: A whole image, shape (height, width), or a part of one with its offset.
         camera: As calibrated.
         predicted_c: Shape (3,), mm: the ball's centre by the robot's kinematics. Its depth predicts the radius.
         radius_mm: The ball's.
         search_px: How far from the prediction the centre may be.
-        hough_only: The paper's way: the centre of the best circle that Hough finds, neither measured nor gated.
+        hough_only: The paper's method: the centre of the best circle that Hough finds, neither measured nor gated.
     """
     picture = image if isinstance(image, Picture) else Picture(image)
     predicted = camera.project(predicted_c)
@@ -242,7 +242,7 @@ def _away_from_others(on_circle: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _believable(edges: Edges, threshold: float) -> tuple[NDArray[np.bool_], bool]:
-    """Edges that are steep enough and go the way most do, and whether most are too faint."""
+    """Edges that are steep enough and of the usual sign, and whether most are too faint."""
     steep = edges.inside & (np.abs(edges.contrast) >= threshold)
     majority = np.sign(np.sum(np.sign(edges.contrast[steep]))) or 1.0
     return steep & (edges.contrast * majority > 0), bool(np.mean(np.abs(edges.contrast) < threshold) > 0.5)
@@ -263,7 +263,7 @@ RADIUS_RANGE = (0.7, 1.4)
 VOTES = 8
 """Edge pixels that must agree on a centre: few, since every circle is measured afterwards."""
 EDGE_FRACTION = 0.5
-"""Canny's upper threshold in parts of the strongest slope in the picture."""
+"""Canny's upper threshold in parts of the strongest slope in the image."""
 SOBEL_GAIN = 4.0
 """Height of Sobel's answer to a step of one grey level."""
 MOST = 8
@@ -274,7 +274,7 @@ class FoundCircle(NamedTuple):
     """Circles, best first."""
 
     centers: Floats
-    """Shape (n, 2), px, in the picture given."""
+    """Shape (n, 2), px, in the image given."""
     radii: Floats
     """Shape (n,), px."""
 

@@ -82,7 +82,7 @@ def calibrate(
     Args:
         points_c: Shape (n, 3), mm, n >= 6, not in a plane.
         pixels: Shape (n, 2), where the points were found; NaN for a ball that was not found.
-        size: Width and height of the picture, px.
+        size: Width and height of the image, px.
         names: What errors call the points; None numbers them from 1.
         distortion: False holds the lens perfect, as the paper does.
         sigma_px: Standard deviation of a pixel coordinate; None estimates it from the residuals.

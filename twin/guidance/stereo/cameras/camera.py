@@ -103,7 +103,7 @@ class Camera:
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
     def sees(self, pixels: Floats, margin_px: float = 0.0) -> NDArray[np.bool_]:
-        """Whether pixels (..., 2) lie in the picture, at least a margin from its border; NaN does not."""
+        """Whether pixels (..., 2) lie in the image, at least a margin from its border; NaN does not."""
         low = margin_px - 0.5
         high = np.array([self.width, self.height]) - 0.5 - margin_px
         with np.errstate(invalid="ignore"):
@@ -148,7 +148,7 @@ def tangent_axes(direction: Floats) -> Floats:
 
 
 DOWN_C = (0.0, 1.0, 0.0)
-"""What is down in a picture: y of C."""
+"""What is down in an image: y of C."""
 
 
 def looking_at(

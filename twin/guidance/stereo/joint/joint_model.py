@@ -259,7 +259,7 @@ def _camera_slopes(planned: Camera, camera: Camera, errors: Floats, points: Floa
 
 
 def _pose_slopes(points: Floats, center: Floats, turn: Floats, shift: Floats) -> Floats:
-    """Derivative (n, 3, 6) of moved points (n, 3) by the turn about a centre and the shift of ``turned``."""
+    """Derivative (n, 3, 6) of moved points (n, 3) by the rotation about a centre and the shift."""
     slopes = turn_and_shift_slopes(points - center - shift)
     x, y, z = turn
     left = np.eye(3) + 0.5 * np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # to second order in the turn

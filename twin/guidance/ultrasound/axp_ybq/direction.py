@@ -57,7 +57,7 @@ BETTER = 1 / 3
 """Another reading whose median angle is below this part of the given one's is the right one."""
 
 ALONG = 0.5
-"""Cosine between the needle's axis and the way from its flange to its tip from which on that way says where the tip
+"""Cosine between the needle's axis and the direction from flange to tip from which on the latter says where the tip
 is: a straight needle on a flange has .9 and more, one that a holder turns aside by 60 deg has this."""
 
 FEW = 0.1
@@ -91,7 +91,7 @@ class SeenDirection(NamedTuple):
     reversed: Bools
     """Shape (n,): the measured direction points from the tip to the hub."""
     sign_known: bool
-    """Whether the way from flange to tip says which end of the needle the tip is."""
+    """Whether the direction from flange to tip says which end of the needle the tip is."""
 
 
 def needle_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.bool_]) -> SeenDirection:
@@ -213,7 +213,7 @@ def _counted(names: tuple[str, ...], rows: Bools, said: str) -> str:
 def direction_from_plane(estimate: Estimate, recording: Recording) -> Floats:
     """V from nothing but the fact that the needle lies in the image: z.M_i V = 0 for every pose. Its sign is not known.
 
-    Needs poses between which the needle turned about itself; otherwise V is not unique.
+    Needs poses between which the needle rotated about itself; otherwise V is not unique.
     """
     across_image = needle_in_image(estimate, recording)[:, 2, :]
     return np.asarray(np.linalg.svd(across_image)[2][-1])

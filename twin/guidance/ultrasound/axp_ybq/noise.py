@@ -114,7 +114,7 @@ SPREAD_ROUNDS = 2
 """How often the residuals' spread is found and the fit repeated with it; it settles to a few percent in two."""
 
 LEAST_FREEDOM = 15
-"""Residuals minus unknowns below which inside and across are not told apart: their ratio would be chance."""
+"""Residuals minus unknowns below which inside and across are not distinguished: their ratio would be chance."""
 
 LEAST_RAD = 1e-9
 """The same for directions."""

@@ -197,9 +197,9 @@ def _relative(
 
 
 TURN_RAD = float(np.radians(25.0))
-"""How far the probe is turned, and the insertion angle changed."""
+"""How far the probe is rotated, and the insertion angle changed."""
 ROLL_RAD = float(np.radians(90.0))
-"""How far the needle is turned about itself."""
+"""How far the needle is rotated about itself."""
 SHIFT_MM = 20.0
 """How far the tip is brought away in the image."""
 SLACK = 1.5
@@ -317,7 +317,7 @@ def _all_moves() -> list[_Move]:
 
 
 def _central(recording: Recording) -> int:
-    """The pose whose tip lies nearest to the middle of all, among those whose probe is turned about as usual."""
+    """The pose whose tip lies nearest to the middle of all, among those whose probe is rotated about as usual."""
     turns = log_rotation(recording.A[0, :3, :3].T @ recording.A[:, :3, :3])
     sides = [recording.P - np.median(recording.P, axis=0), (turns - np.median(turns, axis=0)) * 100.0]
     return int(np.argmin(np.linalg.norm(np.column_stack(sides), axis=1)))

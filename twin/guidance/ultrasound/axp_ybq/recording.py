@@ -23,7 +23,7 @@ OPTIONAL = ("v", "shaft_mm", "q_probe", "q_needle", "turn_probe", "turn_needle")
 
 SHAFT_POWER = 1.5
 """A line's angle errs with the power -3/2 of its length: the variance of a least squares slope through n evenly spaced
-points is 12 sigma^2 / (n length^2), n as the length. Detected in pictures: .17 deg at 10 mm, .11 at 15, .03 at 32."""
+points is 12 sigma^2 / (n length^2), n as the length. Detected in images: .17 deg at 10 mm, .11 at 15, .03 at 32."""
 
 LEAST_SHAFT_MM = 1.0
 """Nothing shorter shows a direction."""
@@ -62,10 +62,10 @@ class Recording:
         q_probe: Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; None where they were not
             recorded. Without them errors of the arms cannot be identified from noise.
         q_needle: Joints of the needle's arm, shape (n, 6), rad; given if and only if the probe's are.
-        turn_probe: Which way each joint of the probe's arm last turned before it stopped, shape (n, 6): 1, -1, or 0
+        turn_probe: Direction of each probe joint's last rotation before it stopped, shape (n, 6): 1, -1, or 0
             where nobody knows. None where it was not recorded: the play's sign is then unknown.
-        turn_needle: The same of the needle's arm; both only beside joints.
-        shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known. Only beside
+        turn_needle: The same of the needle's arm; both only with joints.
+        shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known. Only with
             directions; None where it was not measured: all directions then count the same.
 
     Raises:

@@ -191,7 +191,7 @@ def refine(
 DOUBTED = 0.01
 """A recording without such errors is said to have them once in a hundred."""
 CLEAR = 3.0
-"""An error so many standard deviations from zero is named beside the largest one."""
+"""An error so many standard deviations from zero is named with the largest one."""
 
 TEXT = ("mm per unit of P along u: {:.3f} times", "along v: {:.3f} times", "skew {:+.2f} deg", "v turned {:+.2f} deg")
 

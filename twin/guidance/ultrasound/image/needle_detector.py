@@ -31,7 +31,7 @@ from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager
 
 
 class Segment(NamedTuple):
-    """A straight segment, in pixels of the picture that was searched."""
+    """A straight segment, in pixels of the image that was searched."""
 
     start: Floats
     """(column, row) of the shallower end."""
@@ -83,7 +83,7 @@ MEAN_OVER_MEDIAN = float(np.sqrt(np.pi / 2.0) / np.sqrt(2.0 * np.log(2.0)))
 """Of a Rayleigh amplitude."""
 
 COARSE = 2
-"""The background is taken, and the segment searched, in a picture this many times smaller."""
+"""The background is taken, and the segment searched, in an image this many times smaller."""
 
 ANGLE_STEP = float(np.radians(1.5))
 """Between the directions that are tried: 0.3 mm at the end of 20 mm, well inside the ridge."""
@@ -145,7 +145,7 @@ class DetectorSettings:
     Attributes:
         least_score_mm: Sum along the segment, amplitude over background times mm, that makes a needle.
         least_length_mm: Of the segment.
-        edge_mm: The tip is no nearer to the picture's sides.
+        edge_mm: The tip is no nearer to the image's sides.
         least_step: Fall of the amplitude at the tip, over background, that makes an end.
         sure_step: Below it, the end is believed only where the search's own end agrees.
         tip_bias: How far the detected tip lies beyond the true one along the shaft, on average, over the standard
@@ -187,7 +187,7 @@ def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = 
         settings: What is believed.
 
     Raises:
-        InputError: A picture of another size than the imager's.
+        InputError: An image of another size than the imager's.
     """
     settings = settings or DetectorSettings()
     if picture.shape != (imager.rows, imager.columns):
@@ -235,7 +235,7 @@ def _segment(relative: Floats, imager: Imager, settings: DetectorSettings) -> Se
 
 
 class _Line(NamedTuple):
-    """A line in the picture, mm: s = 0 at its point, growing toward the tip."""
+    """A line in the image, mm: s = 0 at its point, growing toward the tip."""
 
     point: Floats
     direction: Floats
@@ -251,7 +251,7 @@ class _Tip(NamedTuple):
 
 
 def _samples(relative: Floats, imager: Imager, line: _Line, s: Floats, t: Floats) -> Floats:
-    """Amplitude at s along and t across the line, shape (len(s), len(t)); 1 outside the picture."""
+    """Amplitude at s along and t across the line, shape (len(s), len(t)); 1 outside the image."""
     across = np.array([-line.direction[1], line.direction[0]])
     at = line.point + s[:, None, None] * line.direction + t[None, :, None] * across
     maps = (at / imager.pixel_mm).astype(np.float32)

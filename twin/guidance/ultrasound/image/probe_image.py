@@ -22,7 +22,7 @@ from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import InputError
 
 Complexes = NDArray[np.complexfloating]
-"""Single precision on the way: the display has 256 greys."""
+"""Single precision inside: the display has 256 greys."""
 
 FWHM_PER_SIGMA = float(2.0 * np.sqrt(2.0 * np.log(2.0)))
 """Full width at half maximum of a Gaussian, over its standard deviation."""
