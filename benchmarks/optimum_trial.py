@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
-from puncture_twin.twin.guidance.stereo.detection import picture_detector
+from puncture_twin.twin.guidance.stereo.detection import image_detector
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, Unknowns, bound
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.session import DetectorOf, run_session
@@ -36,7 +36,7 @@ class OptimumTrial(NamedTuple):
     offset_bound_mm: Floats
 
 
-def optimum_trial(case: ServoCase, seed: int, detector_of: DetectorOf = picture_detector) -> OptimumTrial:
+def optimum_trial(case: ServoCase, seed: int, detector_of: DetectorOf = image_detector) -> OptimumTrial:
     """Hold a session and bound it by all that was measured in it until each target's end."""
     session = run_session(case, seed, detector_of=detector_of)
     workcell = session.workcell

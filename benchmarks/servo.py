@@ -20,7 +20,7 @@ from benchmarks.optimum_trial import OptimumTrial, optimum_trial
 from benchmarks.servo_variants import pixel_detector, varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.processes import process_pool
-from puncture_twin.twin.guidance.stereo.detection import Detector, picture_detector
+from puncture_twin.twin.guidance.stereo.detection import Detector, image_detector
 from puncture_twin.twin.guidance.stereo.experiment import Statistics, run_trials, statistics
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import DetectorOf
@@ -102,7 +102,7 @@ def pixels_alone(room: StereoWorkcell, rng: np.random.Generator) -> Detector:
     return pixel_detector(room, PIXEL_PX, rng)
 
 
-def optimum(case: ServoCase, seeds: int, jobs: int, detector_of: DetectorOf = picture_detector) -> None:
+def optimum(case: ServoCase, seeds: int, jobs: int, detector_of: DetectorOf = image_detector) -> None:
     """Chain and joint estimate against the Cramer-Rao bound, the servo closed over each."""
     for frames in (1, 4):
         print(f"optimum, {frames} frame{'s' if frames > 1 else ''} a look: {seeds} seeds; rms, mm; ratio to the bound")

@@ -57,51 +57,51 @@ def pairs_of(scene: Scene, model: ChanceModel, draws: int) -> np.ndarray:
     for i, outward in enumerate(scene.outward_ct):
         errors = rng.multivariate_normal(np.zeros(6), cov_ct[i], draws, method="eigh")
         origins, along = case.target_ct + errors[:, :3], exp_rotation(errors[:, 3:]) @ outward
-        doubt = needle_uncertainty(case.target_ct, outward, cov_ct[i], 0.0)
+        uncertainty = needle_uncertainty(case.target_ct, outward, cov_ct[i], 0.0)
         for place, column in enumerate(columns):
             length = float(lengths[i, column])
             for threshold in case.needle.radius_mm + np.array([0.0, anatomy.checked[column].margin_mm]):
                 first = touch_chance(near, threshold)[i, place]
                 start = time.thread_time()
-                reach = doubt.reach(length, threshold)
+                reach = uncertainty.reach(length, threshold)
                 if near.distance[i, place] > max(reach):
                     continue
                 faces = near_faces(engine.blocks[column], case.target_ct, outward, length, reach)
-                lines = line_chance(faces, doubt, length, threshold, near.gradient[i, place])
+                lines = line_chance(faces, uncertainty, length, threshold, near.gradient[i, place])
                 took = time.thread_time() - start
                 distance = faces.distance(origins, along, length)
                 drawn = float(np.mean(distance < threshold))
                 if max(first, lines, drawn) > SURE and min(first, lines, drawn) < 1 - SURE:
                     gradient = near.gradient[i, place]
-                    one = one_line(faces, doubt, length, float(threshold), gradient)
-                    ten = ten_distances(faces, doubt, length, float(threshold), gradient)
+                    one = one_line(faces, uncertainty, length, float(threshold), gradient)
+                    ten = ten_distances(faces, uncertainty, length, float(threshold), gradient)
                     rows.append((drawn, first, lines, one, ten, took))
                     _measured_again(scene, int(column), (origins, along, length), threshold, distance)
     return np.array(rows).reshape(-1, 6)
 
 
 def one_line(
-    faces: NearFaces, doubt: NeedleUncertainty, length: float, threshold: float, gradient: np.ndarray
+    faces: NearFaces, uncertainty: NeedleUncertainty, length: float, threshold: float, gradient: np.ndarray
 ) -> float:
     """The chance along the line that first order says is steepest, followed to where it truly touches."""
-    slope = doubt.root.T @ gradient
+    slope = uncertainty.root.T @ gradient
     basis = np.zeros((6, 6))
     basis[0, :5] = -slope / np.linalg.norm(slope)
-    problem = (faces.triangles, faces.faces, faces.blocks, doubt.origin, doubt.outward, length, threshold)
-    return float(walked(problem, doubt.root, 0.0, basis, np.zeros((1, 5)), np.ones(1))[0])
+    problem = (faces.triangles, faces.faces, faces.blocks, uncertainty.origin, uncertainty.outward, length, threshold)
+    return float(walked(problem, uncertainty.root, 0.0, basis, np.zeros((1, 5)), np.ones(1))[0])
 
 
 def ten_distances(
-    faces: NearFaces, doubt: NeedleUncertainty, length: float, threshold: float, gradient: np.ndarray
+    faces: NearFaces, uncertainty: NeedleUncertainty, length: float, threshold: float, gradient: np.ndarray
 ) -> float:
     """The chance of a normal distance, its mean and deviation those of ten displaced needles.
 
     They lie at sqrt(5) standard deviations along five axes, both ways: exact for polynomials of the third degree.
     Needles that meet the structure are given first order's distance.
     """
-    moved = math.sqrt(5.0) * np.vstack([doubt.root.T, -doubt.root.T])
-    nominal = float(faces.distance(doubt.origin[None], doubt.outward[None], length)[0])
-    found = faces.distance(doubt.origin + moved[:, :3], exp_rotation(moved[:, 3:]) @ doubt.outward, length)
+    moved = math.sqrt(5.0) * np.vstack([uncertainty.root.T, -uncertainty.root.T])
+    nominal = float(faces.distance(uncertainty.origin[None], uncertainty.outward[None], length)[0])
+    found = faces.distance(uncertainty.origin + moved[:, :3], exp_rotation(moved[:, 3:]) @ uncertainty.outward, length)
     found = np.where(found > 0.0, found, np.minimum(nominal + moved @ gradient, 0.0))
     return float(ndtr(-(found.mean() - threshold) / found.std()))
 

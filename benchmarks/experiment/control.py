@@ -89,7 +89,7 @@ def through_layers(speed_mm_s=10.0):
         pressing, start = tissue(entry, -OUTWARD), time.process_time()
         done, error = follow(world, impedance(world), trajectory, hold_s=0.2, resistance=pressing)
         cost = (time.process_time() - start) / (done.dt * len(done.q))
-    return Inserted(float(error.max()), float(error.mean()), cost, pressing.felt)
+    return Inserted(float(error.max()), float(error.mean()), cost, pressing.greatest)
 
 
 def hand_over():

@@ -93,8 +93,8 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
         "urdf": urdf.digest,
         "shipped": model.shipped,
     }
-    kept = user_cache().arrays(made_from, lambda: _packed(_convex_links(model)), by=__name__, check=unpacked_meshes)
-    pieces, ends = unpacked_meshes(kept), np.cumsum(kept["pieces"])
+    cached = user_cache().arrays(made_from, lambda: _packed(_convex_links(model)), by=__name__, check=unpacked_meshes)
+    pieces, ends = unpacked_meshes(cached), np.cumsum(cached["pieces"])
     parts = zip(LINK_NAMES, [0, *ends], ends, strict=False)
     return tuple(Link(name, i, pieces[start:end]) for i, (name, start, end) in enumerate(parts))
 

@@ -251,7 +251,7 @@ class Comparison:
 
     def beyond(self, tolerance_mm: float) -> list[CaseChange]:
         """The cases whose verdict changed, or whose best clearance did by more than so much."""
-        return [one for one in self.changes if one.kind != "same" or not _kept(one, tolerance_mm)]
+        return [one for one in self.changes if one.kind != "same" or not _unchanged(one, tolerance_mm)]
 
 
 def compare(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> Comparison:
@@ -298,7 +298,7 @@ def _keyed(rows: Iterable[Mapping[str, Any]]) -> dict[CaseKey, Mapping[str, Any]
     return found
 
 
-def _kept(change: CaseChange, tolerance_mm: float) -> bool:
+def _unchanged(change: CaseChange, tolerance_mm: float) -> bool:
     """Whether the best clearance is unchanged; one that only one of them has is not."""
     one, other = change.before, change.after
     if one is None or other is None or (one["best_clearance_mm"] is None) != (other["best_clearance_mm"] is None):

@@ -187,9 +187,11 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     with running(out, request.part) as work:
         rows = request.part.of(plan.cases)
         cases = distinct(rows)
-        kept = [_kept_row(one, out, work) for one in cases]
-        tasks = [CaseTask(one, out, work, request.write_page) for one, row in zip(cases, kept, strict=True) if not row]
-        refused = sum(row["exit_code"] > 1 for row in kept if row)
+        cached = [_stored_row(one, out, work) for one in cases]
+        tasks = [
+            CaseTask(one, out, work, request.write_page) for one, row in zip(cases, cached, strict=True) if not row
+        ]
+        refused = sum(row["exit_code"] > 1 for row in cached if row)
         counts = RunCounts(len(rows), len(rows) - len(cases), len(cases) - len(tasks), refused)
         watcher.count("cases", 0, len(tasks))
         with closing(_ends(tasks, request, elsewhere)) as ends:
@@ -213,7 +215,7 @@ def _ends(tasks: Sequence[CaseTask], request: Request, elsewhere: RunTasks | Non
     return run_tasks(tasks, worker_count(request.jobs, len(tasks)), request.limits)
 
 
-def _kept_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | None:
+def _stored_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | None:
     """The stored row of a case; a failure of the program or half a result is removed."""
     row = read_row(out, planned.id)
     if is_final(row):
@@ -394,11 +396,11 @@ def cohort_state(out: Path, progress: Count) -> CohortState:
 CONNECT_S = 20.0
 """So long a scheduler may take to answer."""
 
-KEPT = "puncture_twin_kept"
+WORKER_CACHE = "puncture_twin_kept"
 """Attribute of Dask's worker object: what this process keeps, and who is at it."""
 
 
-class _Kept:
+class _WorkerCache:
     """Cache of one worker process. Its threads run one case at a time: FCL's objects are moved for each query."""
 
     def __init__(self) -> None:
@@ -464,6 +466,6 @@ def run_on_worker(task: CaseTask) -> CaseEnd:
     """Run a case in a worker's process, one at a time."""
     from distributed import get_worker
 
-    kept: _Kept = vars(get_worker()).setdefault(KEPT, _Kept())
-    with kept.turn:
-        return run_case(task, kept.memory)
+    cached: _WorkerCache = vars(get_worker()).setdefault(WORKER_CACHE, _WorkerCache())
+    with cached.turn:
+        return run_case(task, cached.memory)

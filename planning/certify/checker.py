@@ -284,10 +284,10 @@ def _apart(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools
     found |= _separated(corners, depth, limit, middle - (middle @ cell.u)[:, None] * cell.u, cell)
     found |= _before_own_plane(corners, limit, cell, length)
     rest = np.flatnonzero(~found) if cell.rho <= NEAR_BELOW else np.empty(0, np.int64)
-    beside = corners[rest] - depth[rest, :, None] * cell.u
-    edge = beside[:, [1, 2, 0]] - beside
-    part = -(beside * edge).sum(axis=2) / np.maximum((edge * edge).sum(axis=2), 1e-300)
-    feet = beside + np.clip(part, 0, 1)[:, :, None] * edge
+    shifted = corners[rest] - depth[rest, :, None] * cell.u
+    edge = shifted[:, [1, 2, 0]] - shifted
+    part = -(shifted * edge).sum(axis=2) / np.maximum((edge * edge).sum(axis=2), 1e-300)
+    feet = shifted + np.clip(part, 0, 1)[:, :, None] * edge
     for side in range(3):
         found[rest] |= _separated(corners[rest], depth[rest], limit[rest], feet[:, side], cell)
     return np.asarray(found)

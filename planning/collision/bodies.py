@@ -179,8 +179,8 @@ def padded_links(links: Sequence[Link], padding_mm: float) -> tuple[Link, ...]:
     def grown() -> Arrays:
         return packed_meshes([padded(piece, padding_mm) for piece in pieces])
 
-    kept = user_cache().arrays(made_from, grown, by=__name__, check=unpacked_meshes)
-    following = iter(unpacked_meshes(kept))
+    cached = user_cache().arrays(made_from, grown, by=__name__, check=unpacked_meshes)
+    following = iter(unpacked_meshes(cached))
     return tuple(Link(link.name, link.frame, tuple(islice(following, len(link.pieces)))) for link in links)
 
 

@@ -107,13 +107,13 @@ def _check_hanging(model: UrModel, links: Sequence[Link], solids: Solids, joined
     within = [_gaps_mm(some, some) <= APART_MM for some in solids]
     while fresh:
         link, piece = fresh.pop()
-        beside = {(link, int(other)) for other in np.flatnonzero(within[link][piece])}
+        joined_here = {(link, int(other)) for other in np.flatnonzero(within[link][piece])}
         if link < len(joined):
-            beside |= {(link + 1, int(other)) for other in np.flatnonzero(joined[link][piece])}
+            joined_here |= {(link + 1, int(other)) for other in np.flatnonzero(joined[link][piece])}
         if link > 0:
-            beside |= {(link - 1, int(other)) for other in np.flatnonzero(joined[link - 1][:, piece])}
-        fresh += beside - hanging
-        hanging |= beside
+            joined_here |= {(link - 1, int(other)) for other in np.flatnonzero(joined[link - 1][:, piece])}
+        fresh += joined_here - hanging
+        hanging |= joined_here
     for number, body in enumerate(links):
         for piece, shape in enumerate(body.pieces):
             if (number, piece) not in hanging:
@@ -179,8 +179,8 @@ class CellChecker:
         self._surface = patient if patient is None or outside is None else joined([patient, outside])
         self._patient = None
         if patient is not None:
-            beside = None if outside is None else FclSkin(outside, OUTSIDE_BODY)
-            self._patient = FclPatient(FclSkin(patient, PATIENT), beside)
+            outside_skin = None if outside is None else FclSkin(outside, OUTSIDE_BODY)
+            self._patient = FclPatient(FclSkin(patient, PATIENT), outside_skin)
         self._boxes = _boxes(boxes, {PATIENT, *(body.name for body in self._bodies)})
         self._bounds = {box.name: box.bounds for box in boxes}
         self._checks = (*self._workcell_checks(), *self._self_checks())

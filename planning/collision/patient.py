@@ -204,8 +204,8 @@ def refuse_base_in(
         BaseInPatientError: It does.
     """
     centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
-    met = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
-    if met or _encloses(patient, centre):
+    hit = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
+    if hit or _encloses(patient, centre):
         what = "the robot's base stands in the patient"
         raise BaseInPatientError(what, where="workcell", allowed="a base outside the skin")
     if surface is not patient and _encloses(surface, centre):

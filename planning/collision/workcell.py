@@ -66,10 +66,10 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
     model, tool = case.robot.model, case_tool(case)
 
     def make() -> FastChecker:
-        placed, beside = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in (skin, outside))
+        placed, placed_outside = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in (skin, outside))
         try:
             return FastChecker(
-                model, tool, boxes, placed, outside=beside, padding_mm=ARM_PADDING_MM, cache=user_cache()
+                model, tool, boxes, placed, outside=placed_outside, padding_mm=ARM_PADDING_MM, cache=user_cache()
             )
         except BaseInPatientError as error:
             where = f"{case.path}: {_placing_key(case)}"

@@ -233,10 +233,10 @@ class CollisionItem(pytest.Item):
         if table.kind != "plan":
             self.user_properties += arm_properties(session, table)
         found = FINDERS[table.kind](session, table, self.path.parent)
-        if found.differences and not (updating(self.config) and self._kept(session, found)):
+        if found.differences and not (updating(self.config) and self._queued_for_rewrite(session, found)):
             raise CollisionMismatchError(found.text(table.expected.why))
 
-    def _kept(self, session: Session, found: Finding) -> bool:
+    def _queued_for_rewrite(self, session: Session, found: Finding) -> bool:
         """Keep what differs for the rewriting at the end, if all of it is numbers."""
         numbers = [one.number for one in found.differences if one.number is not None]
         if len(numbers) < len(found.differences):

@@ -110,7 +110,7 @@ _AXES = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class SceneContent:
     """Content of the files for Slicer.
 
     Attributes:
@@ -134,7 +134,7 @@ class SlicerFiles:
     notes: tuple[str, ...]
 
 
-def slicer_files(case: Case, drawn: Drawn) -> SlicerFiles:
+def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
     """The files of a case and a path.
 
     Args:

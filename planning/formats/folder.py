@@ -41,7 +41,7 @@ STRUCTURE_LIKE = re.compile(
 )
 """Names of what may be a structure: of volumes and meshes, also those that are not read, packed, cut or renamed."""
 
-BESIDE = (".dvc", ".json")
+ABOUT_MASK = (".dvc", ".json")
 """Endings of files about a file next to them, whose name they have with or without its own ending."""
 
 PROBABILITIES, VOLUMES = (".npz", ".pkl"), (".nii.gz", ".nii", ".nrrd")
@@ -130,9 +130,9 @@ def is_harmless(name: str, names: Collection[str]) -> bool:
     stem, _, _ = name.rpartition(".")
     if name.endswith(PROBABILITIES) and any(stem + end in names for end in VOLUMES):
         return True
-    about = next((name.removesuffix(end) for end in BESIDE if name.endswith(end)), name)
+    about = next((name.removesuffix(end) for end in ABOUT_MASK if name.endswith(end)), name)
     about = about.removeprefix(APPLE_DOUBLE)
-    if about != name and any(f"{one}.".startswith(f"{about}.") and not one.endswith(BESIDE) for one in names):
+    if about != name and any(f"{one}.".startswith(f"{about}.") and not one.endswith(ABOUT_MASK) for one in names):
         return True
     inferred = not STRUCTURE_LIKE.search(name) or stem in names
     return inferred and any(fnmatchcase(name.lower(), pattern) for pattern in HARMLESS)

@@ -84,8 +84,8 @@ def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) 
     weights = _corner_weights(mesh.triangles[face], points)
     own = _normals(TriangleMesh(mesh.vertices, mesh.faces[face]))
     normals = _unit(at_vertex)[mesh.faces[face]]
-    turned = np.where(np.einsum("ijk,ik->ij", normals, own) < 0.0, -1.0, 1.0)
-    blended = _unit(np.einsum("ij,ij,ijk->ik", weights, turned, normals))
+    signs = np.where(np.einsum("ijk,ik->ij", normals, own) < 0.0, -1.0, 1.0)
+    blended = _unit(np.einsum("ij,ij,ijk->ik", weights, signs, normals))
     coherent = (kept >= COHERENT * whole)[mesh.faces[face]].all(axis=1)
     return np.where(coherent[:, None], blended, own)
 

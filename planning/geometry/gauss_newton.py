@@ -173,18 +173,18 @@ def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> 
     """
     basis, values, _ = np.linalg.svd(A, full_matrices=False)
     basis = basis[:, values > UNSEEN * values[0]]
-    beside, left = more - basis @ (basis.T @ more), z - basis @ (basis.T @ z)
+    outside, left = more - basis @ (basis.T @ more), z - basis @ (basis.T @ z)
     (m, k), p = more.shape, basis.shape[1]
     m = m if count is None else count
     freedom = m - p - k
     size = np.linalg.norm(more, axis=0)
     if freedom < 1 or not (size > 0.0).all():
         return None
-    shown = np.linalg.svd(beside / size, compute_uv=False)
+    shown = np.linalg.svd(outside / size, compute_uv=False)
     if not shown[-1] > UNSEEN:
         return None
-    found = np.asarray(np.linalg.lstsq(beside, left, rcond=None)[0], dtype=np.float64)
-    before, after = float(left @ left), float(np.sum((left - beside @ found) ** 2))
+    found = np.asarray(np.linalg.lstsq(outside, left, rcond=None)[0], dtype=np.float64)
+    before, after = float(left @ left), float(np.sum((left - outside @ found) ** 2))
     f = np.inf if after == 0.0 else (before - after) / k / (after / freedom)
-    sd = np.sqrt(after / freedom * np.diag(np.linalg.inv(beside.T @ beside)))
+    sd = np.sqrt(after / freedom * np.diag(np.linalg.inv(outside.T @ outside)))
     return Lacking(found, sd, float(fdtrc(k, freedom, max(f, 0.0))), freedom, after / freedom, before / (m - p))

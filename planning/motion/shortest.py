@@ -28,7 +28,7 @@ from puncture_twin.planning.geometry.rigid import apply, inverse
 from puncture_twin.planning.motion.rrt_connect import Connected, Limits, SegmentContact, connect
 
 MAX_SAMPLES = 8000
-"""Of the planner, in the first run; half of them near home and goals. Next to the body tens of them do, next to a gantry
+"""Of the planner, in the first run; half of them near home and goals. Next to the body tens of them do, at a gantry
 some hundred."""
 
 NEAR_RAD = math.pi

@@ -423,8 +423,8 @@ FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 
 def small_workcell() -> FastChecker:
     """A UR3, a body over a table, something else next to it; mm, base frame."""
     table = Box("table", pose(np.eye(3), TARGET - [0.0, 0.0, 220.0]), (300.0, 300.0, 20.0))
-    body, beside = octahedron(TARGET, 80.0), octahedron(TARGET - [0.0, 200.0, 100.0], 40.0)
-    return FastChecker(ur_model("ur3"), NEEDLE, [table], body, outside=beside, padding_mm=1.0)
+    body, outside = octahedron(TARGET, 80.0), octahedron(TARGET - [0.0, 200.0, 100.0], 40.0)
+    return FastChecker(ur_model("ur3"), NEEDLE, [table], body, outside=outside, padding_mm=1.0)
 
 
 def check_small_workcell(checker: FastChecker) -> list[ReachAnswer]:

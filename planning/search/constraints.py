@@ -89,13 +89,13 @@ def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -
     0 where none lacks any.
     """
     count = len(clearances.clearance)
-    worst, most, met = np.zeros(count, np.int64), np.full(count, -np.inf), np.full(count, np.inf)
+    worst, most, reached = np.zeros(count, np.int64), np.full(count, -np.inf), np.full(count, np.inf)
     for column, structure in enumerate(structures):
         rows = np.flatnonzero(clearances.violated[:, column])
         lack, depth = structure.margin_mm - clearances.clearance[rows, column], clearances.depth[rows, column]
-        more = (lack > most[rows]) | ((lack == most[rows]) & (depth < met[rows]))
+        more = (lack > most[rows]) | ((lack == most[rows]) & (depth < reached[rows]))
         rows = rows[more]
-        worst[rows], most[rows], met[rows] = column, lack[more], depth[more]
+        worst[rows], most[rows], reached[rows] = column, lack[more], depth[more]
     return worst
 
 

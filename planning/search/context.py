@@ -252,8 +252,8 @@ def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidat
     """Findings on what else would be safe for the organs, from the ranked candidates of the case."""
     more = safe_without_beyond(case, anatomy, candidates)
     if more:
-        said = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
-        yield Finding("hangs_on_beyond_image", Severity.NOTE, said, {"directions": more})
+        text = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
+        yield Finding("hangs_on_beyond_image", Severity.NOTE, text, {"directions": more})
     if case.needle.lengths_mm:
         yield _catalogue(case, anatomy, engine, candidates)
 
@@ -279,10 +279,10 @@ def _catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates
         length: organ_candidates(replace(case, needle=case.needle.of_length(length)), anatomy, engine, directions).safe
         for length in sorted(case.needle.lengths_mm)
     }
-    said = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
+    text = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
     best = [window.best for window in find_windows(candidates).windows]
     shortest = [next((length for length, rows in safe.items() if rows[row]), np.nan) for row in best]
     fits = ", ".join(f"{length:g} mm" for length in shortest)
     numbers = {"lengths_mm": list(safe), "safe": [float(rows.sum()) for rows in safe.values()], "shortest_mm": shortest}
-    said += f"; the shortest that fits the best path of each window: {fits or 'none'}"
-    return Finding("needle_catalogue", Severity.NOTE, f"needles, safe for the organs: {said}", numbers)
+    text += f"; the shortest that fits the best path of each window: {fits or 'none'}"
+    return Finding("needle_catalogue", Severity.NOTE, f"needles, safe for the organs: {text}", numbers)

@@ -267,7 +267,7 @@ class Explanation:
             margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
             lines.append(
                 f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.{decimals(structure)}f} {margin}"
-                + _beside(float(clearances[column]), bool(short[column]))
+                + _clearance_note(float(clearances[column]), bool(short[column]))
             )
         left = len(order) - len(shown)
         return [*lines, f"  and {left} more, farther away"] if left else lines
@@ -295,7 +295,7 @@ def decimals(structure: Structure) -> int:
     return 1 if structure.voxel_mm >= COARSE_VOXEL_MM else 2
 
 
-def _beside(clearance_mm: float, short: bool) -> str:
+def _clearance_note(clearance_mm: float, short: bool) -> str:
     """Text after a clearance: too close, or crossed where it is below zero."""
     said = ["too close"] * short + ["crossed"] * (clearance_mm < 0)
     return f"  {', '.join(said)}" if said else ""
@@ -323,12 +323,12 @@ def reason_text(candidates: Candidates, row: int) -> str:
         parts.append(f"({candidates.verdict.named[row]})")
     if np.isfinite(candidates.verdict.depth[row]):
         parts.append(f"at {candidates.verdict.depth[row]:.1f} mm from the target")
-    said = " ".join(parts)
+    text = " ".join(parts)
     if np.isfinite(candidates.verdict.amount[row]):
-        said += _amount_text(candidates, row)
+        text += _amount_text(candidates, row)
     if candidates.verdict.detail[row]:
-        said += f" - {candidates.verdict.detail[row]}"
-    return said
+        text += f" - {candidates.verdict.detail[row]}"
+    return text
 
 
 def deep_text(clearance_mm: float) -> str:

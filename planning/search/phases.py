@@ -446,10 +446,10 @@ def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
         return ()
     moving_weights(case, breathing, anatomy)
     count = int(breathing.in_window.sum())
-    said = [SAFE_WHEN.format(when=breathing.window_text, count=count)]
+    warnings = [SAFE_WHEN.format(when=breathing.window_text, count=count)]
     if breathing.gate is not None:
-        said.append(OPEN.format(part=fraction_within(breathing.gate, breathing.exponent)))
-    said.append(PLANS.format(s=breathing.scanned_at))
+        warnings.append(OPEN.format(part=fraction_within(breathing.gate, breathing.exponent)))
+    warnings.append(PLANS.format(s=breathing.scanned_at))
     if breathing.gate is not None and breathing.scanned_at > breathing.gate:
-        said.append(OUTSIDE_GATE.format(s=breathing.scanned_at, gate=breathing.gate))
-    return tuple(said)
+        warnings.append(OUTSIDE_GATE.format(s=breathing.scanned_at, gate=breathing.gate))
+    return tuple(warnings)

@@ -127,8 +127,8 @@ def _within(case: Case, outward_ct: Floats) -> Bools:
     """Which directions the case's grid holds, shape (n,)."""
     theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
     (low, high), (first, last), slack = case.search.theta, case.search.beta, GRID_SLACK
-    turned = (first - slack <= beta) & (beta <= last + slack)
-    return np.asarray((low - slack <= theta) & (theta <= high + slack) & (turned | (np.sin(theta) < slack)))
+    within_beta = (first - slack <= beta) & (beta <= last + slack)
+    return np.asarray((low - slack <= theta) & (theta <= high + slack) & (within_beta | (np.sin(theta) < slack)))
 
 
 def grid_of(sides: Sequence[Side]) -> Grid:
@@ -136,8 +136,8 @@ def grid_of(sides: Sequence[Side]) -> Grid:
     is_open = {side.name: side.is_open for side in sides}
     if is_open["back"] and not is_open["front"]:
         return Grid((0.0, 90.0), BACK)
-    beside = not is_open["front"] and (is_open["left"] or is_open["right"])
-    return Grid(WHOLE if is_open["back"] or beside else (0.0, 90.0), FRONT)
+    sideways = not is_open["front"] and (is_open["left"] or is_open["right"])
+    return Grid(WHOLE if is_open["back"] or sideways else (0.0, 90.0), FRONT)
 
 
 def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:

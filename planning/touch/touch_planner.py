@@ -63,20 +63,22 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
             found.
     """
     every = _task(context, q_insertion)
-    found = _open(every)
+    open_markers = _open(every)
     while True:
-        task = every.of(found.rows)
-        error = _error(task, every, found.left_out)
-        chosen, worst = (least_error(error, found.candidates, q_insertion, worst=worst) for worst in (False, True))
+        task = every.of(open_markers.rows)
+        error = _error(task, every, open_markers.left_out)
+        chosen, worst = (
+            least_error(error, open_markers.candidates, q_insertion, worst=worst) for worst in (False, True)
+        )
         stops = Stops(task.markers.names, task.markers.points_base, chosen)
         try:
             tour = tour_through(context, stops, seed=seed, progress=progress)
         except NoMotionError as none:
-            found = found.without(none.place, task.markers.names[none.place], str(none))
+            open_markers = open_markers.without(none.place, task.markers.names[none.place], str(none))
             continue
         return TouchPlan(
             **vars(tour),
-            left_out=found.left_out,
+            left_out=open_markers.left_out,
             expected_mm=task.expected_mm(chosen),
             worst_mm=task.expected_mm(worst),
         )
@@ -147,9 +149,9 @@ class _Open(NamedTuple):
 
     def without(self, place: int, name: str, why: str) -> _Open:
         """The open markers without the one at a place of ``rows``."""
-        rows, kept = list(self.rows), list(self.candidates)
-        del rows[place], kept[place]
-        return _Open(tuple(rows), tuple(kept), {**self.left_out, name: why})
+        rows, candidates = list(self.rows), list(self.candidates)
+        del rows[place], candidates[place]
+        return _Open(tuple(rows), tuple(candidates), {**self.left_out, name: why})
 
 
 def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
@@ -242,15 +244,15 @@ def approach_checkers(context: CaseContext, needle_padding_mm: float) -> Approac
 def _open(task: _Task) -> _Open:
     """Poses of each marker that reach it and are clear."""
     checkers = approach_checkers(task.context, PLANNED_PADDING_MM)
-    rows, kept, left_out = [], [], {}
+    rows, candidates, left_out = [], [], {}
     for row, (name, point) in enumerate(zip(task.markers.names, task.markers.points_base, strict=True)):
         free, why = _free(checkers, task.tip_mm, touch_candidates(task.model, task.tip_mm, point, task.q_insertion))
         if len(free):
             rows.append(row)
-            kept.append(free)
+            candidates.append(free)
         else:
             left_out[name] = why
-    return _Open(tuple(rows), tuple(kept), left_out)
+    return _Open(tuple(rows), tuple(candidates), left_out)
 
 
 def _free(checkers: ApproachCheckers, tip_mm: float, candidates: Candidates) -> tuple[Floats, str]:

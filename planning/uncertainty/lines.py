@@ -41,26 +41,36 @@ from puncture_twin.planning.geometry.rigid import frame_about, skew
 from puncture_twin.planning.uncertainty.hit import Proximity
 
 
-def line_chance(near: NearFaces, doubt: NeedleUncertainty, length: float, threshold: float, gradient: Floats) -> float:
+def line_chance(
+    near: NearFaces, uncertainty: NeedleUncertainty, length: float, threshold: float, gradient: Floats
+) -> float:
     """P that the needle comes nearer to a structure than a threshold; NaN where nothing displaces it.
 
     Args:
         near: The structure's faces within `NeedleUncertainty.reach` of the axis.
-        doubt: The needle and its doubt.
+        uncertainty: The needle and the distribution of its displacement.
         length: Of the axis, mm.
         threshold: Needle radius, or that and a margin, mm.
         gradient: Shape (6,), g: what shift and rotation do to the distance, to first order.
     """
-    problem = (near.triangles, near.faces, near.blocks, doubt.origin, doubt.outward, float(length), float(threshold))
-    slope = doubt.root.T @ gradient
-    sigma = math.hypot(float(np.linalg.norm(slope)), doubt.surface_mm)
-    likeliest, alone = likeliest_slope(problem, doubt, slope, _slack(problem))
-    steep = math.hypot(float(np.linalg.norm(likeliest)), doubt.surface_mm)
+    problem = (
+        near.triangles,
+        near.faces,
+        near.blocks,
+        uncertainty.origin,
+        uncertainty.outward,
+        float(length),
+        float(threshold),
+    )
+    slope = uncertainty.root.T @ gradient
+    sigma = math.hypot(float(np.linalg.norm(slope)), uncertainty.surface_mm)
+    likeliest, alone = likeliest_slope(problem, uncertainty, slope, _slack(problem))
+    steep = math.hypot(float(np.linalg.norm(likeliest)), uncertainty.surface_mm)
     if not steep > 0.0:
         return math.nan
-    basis = line_basis(likeliest, doubt.surface_mm / steep, float(np.linalg.norm(likeliest)) / steep)
+    basis = line_basis(likeliest, uncertainty.surface_mm / steep, float(np.linalg.norm(likeliest)) / steep)
     first = -_slack(problem) / max(sigma, 1e-12)
-    return chance_by_rules(problem, doubt, basis, first, alone)
+    return chance_by_rules(problem, uncertainty, basis, first, alone)
 
 
 def _slack(problem: Problem) -> float:
@@ -76,13 +86,13 @@ SCRAMBLED_WITH = 20191104
 
 
 def by_lines(
-    problem: Problem, doubt: NeedleUncertainty, basis: Floats, lines: Lines, first: float
+    problem: Problem, uncertainty: NeedleUncertainty, basis: Floats, lines: Lines, first: float
 ) -> tuple[float, float]:
     """The mean chance of some lines, and their standard deviation; beyond first order's where sizes are uncertain."""
-    chances = walked(problem, doubt.root, doubt.surface_mm, basis, lines.offsets, lines.sizes)
+    chances = walked(problem, uncertainty.root, uncertainty.surface_mm, basis, lines.offsets, lines.sizes)
     whole = 0.0
-    if doubt.freedom is not None:
-        whole, chances = float(stdtr(doubt.freedom, first)), chances - ndtr(first / lines.sizes)
+    if uncertainty.freedom is not None:
+        whole, chances = float(stdtr(uncertainty.freedom, first)), chances - ndtr(first / lines.sizes)
     mean = float(lines.weights @ chances)
     return whole + mean, math.sqrt(float(lines.weights @ (chances - mean) ** 2))
 
@@ -147,18 +157,20 @@ DISAGREE = 0.1
 at most, and by .013 where it is .2 (three anatomies; next to a lung and between ribs)."""
 
 
-def chance_by_rules(problem: Problem, doubt: NeedleUncertainty, basis: Floats, first: float, alone: bool) -> float:
+def chance_by_rules(
+    problem: Problem, uncertainty: NeedleUncertainty, basis: Floats, first: float, alone: bool
+) -> float:
     """By the small rule; by many lines where its lines disagree, or several things are touched, or by most lines.
 
     Where the errors' size is uncertain every line has its own, and the lines say by how much first order, of quantile
     ``first``, errs.
     """
-    surface = doubt.surface_mm > 0.0
-    rules = [many_lines(surface, count, doubt.freedom) for count in (MANY_LINES, MOST_LINES)]
-    if alone and doubt.freedom is None:
+    surface = uncertainty.surface_mm > 0.0
+    rules = [many_lines(surface, count, uncertainty.freedom) for count in (MANY_LINES, MOST_LINES)]
+    if alone and uncertainty.freedom is None:
         rules.insert(0, few_lines(surface))
     for lines in rules:
-        mean, spread = by_lines(problem, doubt, basis, lines, first)
+        mean, spread = by_lines(problem, uncertainty, basis, lines, first)
         if spread <= DISAGREE:
             break
     return min(max(mean, 0.0), 1.0)
@@ -233,14 +245,14 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
         pose = needle_uncertainty(around.target_ct, outward, needles.cov_ct[row], 0.0, needles.freedom)
         for column in np.flatnonzero(wanted[row] & np.isfinite(first[row])):
             surface_mm = float(needles.surface_mm[row, column])
-            doubt = replace(pose, surface_mm=surface_mm) if surface_mm > 0 else pose
+            uncertainty = replace(pose, surface_mm=surface_mm) if surface_mm > 0 else pose
             length, threshold = float(around.length[row, column]), float(threshold_mm[column])
-            reach = doubt.reach(length, threshold)
+            reach = uncertainty.reach(length, threshold)
             if needles.near.distance[row, column] > max(reach):
                 continue
             faces = near_faces(around.blocks[column], around.target_ct, outward, length, reach)
             if len(faces):
-                chance = line_chance(faces, doubt, length, threshold, needles.near.gradient[row, column])
+                chance = line_chance(faces, uncertainty, length, threshold, needles.near.gradient[row, column])
                 found[row, column] = first[row, column] if np.isnan(chance) else chance
     return found
 
@@ -540,7 +552,9 @@ PREFERRED, SOONER, NO_MATTER = 0.1, 0.8, 3.8
 something else is touched; and how far out it does not matter."""
 
 
-def likeliest_slope(problem: Problem, doubt: NeedleUncertainty, slope: Floats, slack: float) -> tuple[Floats, bool]:
+def likeliest_slope(
+    problem: Problem, uncertainty: NeedleUncertainty, slope: Floats, slack: float
+) -> tuple[Floats, bool]:
     """The slope (5,) along which the needle touches soonest, and whether nothing else touches about as soon.
 
     The nearest face need not be the likeliest, where a farther one lies in the direction of greater doubt: rays are
@@ -549,7 +563,7 @@ def likeliest_slope(problem: Problem, doubt: NeedleUncertainty, slope: Floats, s
     size = float(np.linalg.norm(slope))
     directions = np.vstack([-slope / size if size > 0.0 else np.eye(5)[0], _rays()])
     radii = np.empty(len(directions))
-    first_touches(problem, doubt.root, directions, radii)
+    first_touches(problem, uncertainty.root, directions, radii)
     best = int(np.argmin(radii))
     if not np.isfinite(radii[best]) or radii[best] <= 0.0 or radii[0] < radii[best] + PREFERRED:
         best = 0

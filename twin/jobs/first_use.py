@@ -74,10 +74,10 @@ def _err_once() -> None:
 
     target, up, cov = read_only(TARGET), np.array([0.0, 0.0, 1.0]), np.diag([1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4])
     hit_in_mesh(target_rays(octahedron(target, 5.0), target), cov[None, :3, :3])
-    doubt, length, threshold = needle_uncertainty(target, up, cov, 0.5), 100.0, 1.0
+    uncertainty, length, threshold = needle_uncertainty(target, up, cov, 0.5), 100.0, 1.0
     beside = pack(octahedron(target + [23.0, 0.0, 40.0], 20.0))
-    near = near_faces(beside, target, up, length, doubt.reach(length, threshold))
-    line_chance(near, doubt, length, threshold, np.array([-1.0, 0.0, 0.0, 0.0, -40.0, 0.0]))
+    near = near_faces(beside, target, up, length, uncertainty.reach(length, threshold))
+    line_chance(near, uncertainty, length, threshold, np.array([-1.0, 0.0, 0.0, 0.0, -40.0, 0.0]))
 
 
 def draw_once() -> None:

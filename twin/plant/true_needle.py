@@ -104,12 +104,12 @@ class TrueTissue:
     def __init__(self, insertion: Insertion, path: StraightPath, side: float, shaft_mm: float) -> None:
         self._force, self._bent = insertion.force, insertion.path
         self._path, self._side, self._shaft_mm = path, np.array([np.cos(side), np.sin(side), 0.0]), shaft_mm
-        self._deepest, self._held, self._felt = 0.0, 0.0, TissueForce(0.0, 0.0)
+        self._deepest, self._held, self._greatest = 0.0, 0.0, TissueForce(0.0, 0.0)
 
     @property
-    def felt(self) -> TissueForce:
+    def greatest(self) -> TissueForce:
         """The greatest force so far."""
-        return self._felt
+        return self._greatest
 
     def __call__(self, tip: Tip) -> tuple[Push, ...]:
         """Forces of the tissue on the needle now."""
@@ -117,7 +117,9 @@ class TrueTissue:
         depth = float((to_mm(at_m) - self._path.entry_base) @ self._path.into_base)
         along = self._along(depth)
         at_tip, at_holder = self._across(depth)
-        self._felt = TissueForce(max(self._felt.along_n, along), max(self._felt.across_n, abs(at_tip + at_holder)))
+        self._greatest = TissueForce(
+            max(self._greatest.along_n, along), max(self._greatest.across_n, abs(at_tip + at_holder))
+        )
         holder_m = at_m - to_m(self._shaft_mm) * R[:, 2]
         side = R @ self._side
         return Push(at_tip * side - along * self._path.into_base, at_m), Push(at_holder * side, holder_m)

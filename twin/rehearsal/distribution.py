@@ -64,7 +64,7 @@ class Distribution:
         seed: Of all draws.
         unreached: Further trials, whose registration put the pose out of the arm's reach.
         puncture: Common part of all trials.
-        rooms: The n trials.
+        trials: The n trials.
         cov_ct: Shape (3, 3), predicted of it, mm^2.
         in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid.
         hit: Shape (n,).
@@ -82,7 +82,7 @@ class Distribution:
     seed: int
     unreached: int
     puncture: Puncture
-    rooms: Trials
+    trials: Trials
     cov_ct: Floats
     in_region: Bools
     hit: Bools
@@ -97,12 +97,12 @@ class Distribution:
     physics: PhysicsTrials | None = None
 
     def __len__(self) -> int:
-        return len(self.rooms.tip_ct)
+        return len(self.trials.tip_ct)
 
     @property
     def error_ct(self) -> Floats:
         """Shape (n, 3), true tip minus true target."""
-        return np.asarray(self.rooms.tip_ct - self.rooms.target_ct)
+        return np.asarray(self.trials.tip_ct - self.trials.target_ct)
 
     @property
     def tip_error_mm(self) -> Floats:
@@ -146,8 +146,8 @@ class Distribution:
         }
 
 
-def _fraction(rooms: Bools) -> float | None:
-    return float(rooms.mean()) if len(rooms) else None
+def _fraction(trials: Bools) -> float | None:
+    return float(trials.mean()) if len(trials) else None
 
 
 def rehearse_trials(
@@ -167,9 +167,9 @@ def rehearse_trials(
     """
     query = _query(context, outward_ct, q_insertion)
     rng = np.random.default_rng(seed)
-    rooms = draw_trials(query.puncture, query.truth, count, rng)
-    off = rng.normal(size=(count, len(context.anatomy.checked)))[rooms.reached]
-    return _measured(context, query, rooms, off, seed)
+    trials = draw_trials(query.puncture, query.truth, count, rng)
+    off = rng.normal(size=(count, len(context.anatomy.checked)))[trials.reached]
+    return _measured(context, query, trials, off, seed)
 
 
 def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: int) -> Floats:
@@ -178,8 +178,8 @@ def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
     Arguments and errors as of `rehearse_trials`.
     """
     query = _query(context, outward_ct, q_insertion)
-    room = draw_trials(query.puncture, query.truth, 1, np.random.default_rng(seed))
-    return np.asarray(np.linalg.inv(query.puncture.T_base_ct) @ room.T_base_ct[0])
+    truth_trial = draw_trials(query.puncture, query.truth, 1, np.random.default_rng(seed))
+    return np.asarray(np.linalg.inv(query.puncture.T_base_ct) @ truth_trial.T_base_ct[0])
 
 
 class _Query(NamedTuple):
@@ -228,13 +228,13 @@ def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
     return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
 
 
-def _measured(context: CaseContext, query: _Query, rooms: Trials, off: Floats, seed: int) -> Distribution:
+def _measured(context: CaseContext, query: _Query, trials: Trials, off: Floats, seed: int) -> Distribution:
     """The distribution of trials; ``off`` has a normal number for each structure's surface in each trial."""
     case, believed, puncture = context.case, query.believed, query.puncture
     q = puncture.q_insertion[None]
-    unreached = int((~rooms.reached).sum())
-    rooms = rooms.reached_alone()
-    cov_ct, error_ct = believed.tip_covariance_ct(q)[0], rooms.tip_ct - rooms.target_ct
+    unreached = int((~trials.reached).sum())
+    trials = trials.reached_alone()
+    cov_ct, error_ct = believed.tip_covariance_ct(q)[0], trials.tip_ct - trials.target_ct
     model = chance_model(case, context.anatomy, context.engine, believed)
     assert model is not None
     chances = refined_chances(model, puncture.outward_ct[None], q, model.chances(puncture.outward_ct[None], q))
@@ -245,13 +245,13 @@ def _measured(context: CaseContext, query: _Query, rooms: Trials, off: Floats, s
         seed=seed,
         unreached=unreached,
         puncture=puncture,
-        rooms=rooms,
+        trials=trials,
         cov_ct=cov_ct,
         in_region=square <= chdtri(3, 1 - INTERVAL),
-        hit=_hits(context, rooms, off_mm),
+        hit=_hits(context, trials, off_mm),
         p_hit=float(chances.hit[0]),
         structures=chances.structures,
-        touched=_touches(context, puncture, rooms, off_mm),
+        touched=_touches(context, puncture, trials, off_mm),
         p_touch=chances.touch[0],
         wrong_belief=case.truth_errors is not None,
         budget=error_budget(believed, q[0], puncture.T_base_ct[:3, :3] @ puncture.outward_ct),
@@ -272,16 +272,16 @@ def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floa
     return np.asarray(passed)
 
 
-def _hits(context: CaseContext, rooms: Trials, off_mm: Floats) -> Bools:
+def _hits(context: CaseContext, trials: Trials, off_mm: Floats) -> Bools:
     """Which trials hit: within the radius of the true target, or in the mesh of the target's own scan."""
     case = context.case
     if case.hit_radius_mm is not None:
-        return np.asarray(np.linalg.norm(rooms.tip_ct - rooms.target_ct, axis=1) < case.hit_radius_mm)
+        return np.asarray(np.linalg.norm(trials.tip_ct - trials.target_ct, axis=1) < case.hit_radius_mm)
     mesh, off = context.anatomy.structure(case.target_structure).mesh, off_mm[:, _target_column(context.anatomy, case)]
-    hit = inside_each(mesh, rooms.tip_ct)
-    shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1)
+    hit = inside_each(mesh, trials.tip_ct)
+    shift = np.linalg.norm(trials.tip_ct - case.target_ct, axis=1)
     for row in np.flatnonzero((off != 0) & (surface_distance(mesh, case.target_ct) - shift <= abs(off))):
-        if surface_distance(mesh, rooms.tip_ct[row]) <= abs(off[row]):
+        if surface_distance(mesh, trials.tip_ct[row]) <= abs(off[row]):
             hit[row] = off[row] > 0
     return hit
 
@@ -290,7 +290,7 @@ def _target_column(anatomy: Anatomy, case: Case) -> int:
     return [one.name for one in anatomy.checked].index(case.target_structure)
 
 
-def _touches(context: CaseContext, puncture: Puncture, rooms: Trials, off_mm: Floats) -> Bools:
+def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: Floats) -> Bools:
     """Structures that each trial's needle touches, shape (n, k), by FCL's capsule where no bound excludes it.
 
     A surface that lies farther out is touched from farther; one that lies deeper than the needle is thick is touched
@@ -300,13 +300,13 @@ def _touches(context: CaseContext, puncture: Puncture, rooms: Trials, off_mm: Fl
     columns, outward_ct = demanding(checked), puncture.outward_ct[None]
     lengths = own_lengths(case, context.anatomy, outward_ct)[0]
     distance = context.engine.measure(case.target_ct, outward_ct, lengths).distance[0]
-    shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1)
-    turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1)
-    touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)
+    shift = np.linalg.norm(trials.tip_ct - case.target_ct, axis=1)
+    turn = np.linalg.norm(trials.outward_ct - puncture.outward_ct, axis=1)
+    touched = np.zeros((len(trials.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):
         length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], CONTACT_MM)
         for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):
             touched[row, place] = context.engine.collides(
-                int(column), rooms.tip_ct[row], rooms.outward_ct[row], length, float(radius[row])
+                int(column), trials.tip_ct[row], trials.outward_ct[row], length, float(radius[row])
             )
     return touched

@@ -35,12 +35,12 @@ TRIED = 16
 """Trials that are drawn for one: the arm may not reach the pose that a trial's registration demands."""
 
 
-def drawn_truth(puncture: Puncture, rooms: Trials, row: int, seed: int, source: str) -> Truth:
+def drawn_truth(puncture: Puncture, trials: Trials, row: int, seed: int, source: str) -> Truth:
     """The truth whose execution ends as one of the trials did.
 
     Args:
         puncture: What the rooms repeat.
-        rooms: As drawn.
+        trials: As drawn.
         row: Which.
         seed: Of their draws.
         source: In words for the report.
@@ -48,9 +48,9 @@ def drawn_truth(puncture: Puncture, rooms: Trials, row: int, seed: int, source: 
     T_base_tip = np.array(flange_pose(puncture.model, puncture.q_insertion))
     T_base_tip[:3, 3] += puncture.tip_mm * T_base_tip[:3, 2]
     T_ct_tip = np.eye(4)
-    T_ct_tip[:3, :3], T_ct_tip[:3, 3] = rooms.R_ct_needle[row], rooms.tip_ct[row]
-    T_base_ct, side = T_base_tip @ np.linalg.inv(T_ct_tip), float(rooms.bevel_side[row])
-    return Truth(T_base_ct, np.zeros(6), seed, source, rooms.target_ct[row], side)
+    T_ct_tip[:3, :3], T_ct_tip[:3, 3] = trials.R_ct_needle[row], trials.tip_ct[row]
+    T_base_ct, side = T_base_tip @ np.linalg.inv(T_ct_tip), float(trials.bevel_side[row])
+    return Truth(T_base_ct, np.zeros(6), seed, source, trials.target_ct[row], side)
 
 
 def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Truth:
@@ -117,7 +117,7 @@ def _of_drawn(found: Distribution, row: int, source: str) -> Truth:
         raise NoAnswerError(
             f"in none of {found.unreached} rooms did the arm reach the pose that its registration asked for"
         )
-    return drawn_truth(found.puncture, found.rooms, row, found.seed, source)
+    return drawn_truth(found.puncture, found.trials, row, found.seed, source)
 
 
 def _declared(found: Distribution) -> str:
@@ -146,8 +146,8 @@ def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_tar
         truth: That the touches met.
         at_target: What is true on arrival.
     """
-    met = bent_truth(context, plan, puncture_truth(plan, truth, at_target))
-    return rehearse(plan, context.case, context.anatomy, met)
+    hit = bent_truth(context, plan, puncture_truth(plan, truth, at_target))
+    return rehearse(plan, context.case, context.anatomy, hit)
 
 
 def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
@@ -174,9 +174,9 @@ def physics_trials(context: CaseContext, plan: Plan, found: Distribution, count:
     rows = spread_rows(found, count)
     apart, contacts = np.empty(len(rows)), 0
     for number, row in enumerate(rows.tolist()):
-        truth = drawn_truth(found.puncture, found.rooms, row, found.seed, "a room")
+        truth = drawn_truth(found.puncture, found.trials, row, found.seed, "a room")
         done = rehearse(plan, context.case, context.anatomy, truth)
-        apart[number] = np.linalg.norm(done.tip_true_ct[-1] - found.rooms.tip_ct[row])
+        apart[number] = np.linalg.norm(done.tip_true_ct[-1] - found.trials.tip_ct[row])
         contacts += bool(done.contacts)
         progress(number + 1, len(rows))
     return PhysicsTrials(apart, contacts)

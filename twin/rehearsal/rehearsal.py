@@ -96,7 +96,7 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth, engine: Fcl
         truth_is_belief=bool(np.array_equal(T_base_ct, plan.T_base_ct)),
         control=case.rehearsal.control,
         off_path_mm=seen.off_path_mm,
-        felt=seen.felt,
+        tissue_force=seen.tissue_force,
     )
 
 
@@ -187,13 +187,13 @@ class Executed:
         execution: Its records.
         phase: Shape (m,), of each record: "approach", "settle", "insertion" or "hold".
         off_path_mm: Of the tip from its commanded path, by the encoders, at most from the insertion on.
-        felt: The greatest forces of the tissue; None where none was declared.
+        tissue_force: The greatest forces of the tissue; None where none was declared.
     """
 
     execution: Execution
     phase: NDArray[np.str_]
     off_path_mm: float
-    felt: TissueForce | None
+    tissue_force: TissueForce | None
 
 
 def executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executed:
@@ -204,17 +204,17 @@ def executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executed
     approach = steps(plan.approach)
     before = np.concatenate([approach, np.repeat(approach[-1:], round(SETTLE_S / TIME_STEP_S), axis=0)])
     start_s = TIME_STEP_S * len(before)
-    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as room:
-        approached = execute(room, before, truth.joint_offsets)
+    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as workcell:
+        approached = execute(workcell, before, truth.joint_offsets)
         insertion = Insertion(model, tool, T_base_ct[:3, :3] @ down_ct, plan.insertion, DWELL_S)
         how = case.rehearsal.control
-        inserted = insert(room, insertion, how, truth.joint_offsets, start_s=start_s, resistance=tissue)
+        inserted = insert(workcell, insertion, how, truth.joint_offsets, start_s=start_s, resistance=tissue)
     done = joined(approached, inserted.execution)
     ends = np.cumsum([len(approach), len(before) - len(approach), len(steps(plan.insertion))])
     row = np.floor(done.times_s / TIME_STEP_S + ROUNDING).astype(np.int64)
     phase = np.array(["approach", "settle", "insertion", "hold"])[np.searchsorted(ends, row, side="right")]
-    felt = None if case.bending is None else TissueForce(0.0, 0.0) if tissue is None else tissue.felt
-    return Executed(done, phase, inserted.off_path_mm, felt)
+    tissue_force = None if case.bending is None else TissueForce(0.0, 0.0) if tissue is None else tissue.greatest
+    return Executed(done, phase, inserted.off_path_mm, tissue_force)
 
 
 def steps(trajectory: Trajectory) -> Floats:
@@ -278,9 +278,9 @@ def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floa
     before = np.concatenate([approach, pause])
     with open_workcell(
         plan.model, tool, anatomy.skin.mesh, T_base_ct, case_boxes(case, T_base_ct), down_ct=down_ct
-    ) as room:
-        first = execute(room, before, still)
+    ) as workcell:
+        first = execute(workcell, before, still)
         motion = Insertion(plan.model, tool, T_base_ct[:3, :3] @ down_ct, plan.sweep, SETTLE_S)
-        done = insert(room, motion, case.rehearsal.control, still, start_s=len(before) * TIME_STEP_S).execution
+        done = insert(workcell, motion, case.rehearsal.control, still, start_s=len(before) * TIME_STEP_S).execution
     contacts = tuple(dict.fromkeys((one.link, one.body) for one in (*first.touches, *done.touches)))
     return Swept(done.times_s, plan.off_point_mm(done.T_base_flange), contacts)

@@ -21,11 +21,11 @@ class ErrorRank:
 
     Attributes:
         percentile: 0 to 100; so many of 100 trials end nearer to the target.
-        rooms: So many trials were drawn, and this is the median one; 0 where the percentile is the prediction's.
+        trials: So many trials were drawn, and this is the median one; 0 where the percentile is the prediction's.
     """
 
     percentile: float
-    rooms: int = 0
+    trials: int = 0
 
     @property
     def place(self) -> str:
@@ -35,22 +35,24 @@ class ErrorRank:
     @property
     def text(self) -> str:
         """The rank for headlines and text."""
-        if self.rooms == 0:
+        if self.trials == 0:
             return f"{self.place} of the tip errors that are predicted"
         return (
-            f"median of {self.rooms:,} rooms ({self.place} of their tip errors)" if self.rooms > 1 else "the only room"
+            f"median of {self.trials:,} rooms ({self.place} of their tip errors)"
+            if self.trials > 1
+            else "the only room"
         )
 
     @property
     def short(self) -> str:
         """The rank for a frame of the film."""
-        if self.rooms == 0:
+        if self.trials == 0:
             return f"{self.place} by prediction"
-        return f"median of {self.rooms:,} rooms" if self.rooms > 1 else "the only room"
+        return f"median of {self.trials:,} rooms" if self.trials > 1 else "the only room"
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
-        return {"percentile": self.percentile, "percentile_of": "rooms" if self.rooms else "prediction"}
+        return {"percentile": self.percentile, "percentile_of": "rooms" if self.trials else "prediction"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,16 +61,16 @@ class TrialScale:
 
     Attributes:
         errors_mm: Shape (n,), of those in which the arm reached the pose.
-        rooms: All.
+        trials: All.
     """
 
     errors_mm: Floats
-    rooms: int
+    trials: int
 
     def of(self, tip_error_mm: float) -> ErrorRank:
         """Rank of an error among them."""
         below = np.mean(self.errors_mm < tip_error_mm) + np.mean(self.errors_mm <= tip_error_mm)
-        return ErrorRank(float(50 * below), self.rooms)
+        return ErrorRank(float(50 * below), self.trials)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,7 @@ class Rehearsal:
         truth_is_belief: Whether the patient lay exactly where it was believed, so that the error says little.
         control: How the insertion was followed: "impedance", "admittance" or "position".
         off_path_mm: The tip from its commanded path, by the encoders, at most from the insertion on.
-        felt: The greatest forces of the tissue on the needle; None where the case declares none.
+        tissue_force: The greatest forces of the tissue on the needle; None where the case declares none.
         standing: Where the error stands among others; None where the case declares no errors.
     """
 
@@ -178,7 +180,7 @@ class Rehearsal:
     truth_is_belief: bool
     control: str
     off_path_mm: float
-    felt: TissueForce | None
+    tissue_force: TissueForce | None
     standing: ErrorRank | None = None
 
     @brief
@@ -194,7 +196,7 @@ class Rehearsal:
     @property
     def force_text(self) -> str:
         """Forces of the tissue, for a person."""
-        return NO_TISSUE_FORCE if self.felt is None else self.felt.text
+        return NO_TISSUE_FORCE if self.tissue_force is None else self.tissue_force.text
 
     def __post_init__(self) -> None:
         for value in (*vars(self).values(), *self.clearance_mm.values()):

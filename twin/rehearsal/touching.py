@@ -122,7 +122,7 @@ class TouchingCell:
     """Workcell, tool and generators of every touch.
 
     Attributes:
-        room: The simulated workcell.
+        workcell: The simulated workcell.
         rigid: The arm's masses as its controller knows them.
         tour: The touches.
         truth: The ground truth.
@@ -131,7 +131,7 @@ class TouchingCell:
         rng: Of the force sensor's noise.
     """
 
-    room: SimulatedWorkcell
+    workcell: SimulatedWorkcell
     rigid: RigidModel
     tour: TouchTour
     truth: TouchTruth
@@ -191,12 +191,12 @@ def touch_marker(cell: TouchingCell, touch: Touch) -> TouchReading | FailedTouch
         return FailedTouch(line, seconds_of(moved_outside(cell, touch.come, cell.truth.arrival[touch.name])))
     pad = _pad(cell, line)
     try:
-        return _felt_and_read(cell, touch, line)
+        return _touched_and_read(cell, touch, line)
     finally:
-        remove(cell.room.client, pad)
+        remove(cell.workcell.client, pad)
 
 
-def _felt_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchReading | FailedTouch:
+def _touched_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchReading | FailedTouch:
     arrival = cell.truth.arrival[touch.name]
     come = moved_outside(cell, touch.come, arrival)
     to_near = _slow(cell, np.vstack([touch.come.q[-1:], line.far]))
@@ -205,15 +205,15 @@ def _felt_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchReadin
         back = _moved(cell, _back(cell, touch, line, there.q[-1]), arrival)
         why = f"it was felt more than {SLOW_MM:g} mm before where it was believed, and given up"
         return FailedTouch(why, sum(map(seconds_of, (come, there, back))))
-    felt = _felt(cell, line, arrival)
-    q = felt.q[-1]
+    contact = _approached_contact(cell, line, arrival)
+    q = contact.q[-1]
     back = _moved(cell, _back(cell, touch, line, q), arrival)
-    seconds = sum(map(seconds_of, (come, there, felt, back)))
-    if not felt.stopped:
+    seconds = sum(map(seconds_of, (come, there, contact, back)))
+    if not contact.stopped:
         return FailedTouch(f"no contact: the tip went {PAST_MM:g} mm past where it was believed and came back", seconds)
-    depth = float((1e3 * felt.tip_m[-1] - line.face_base) @ line.axis_base)
-    moved = 1e3 * np.linalg.norm(felt.tip_m[-1] - felt.tip_m[-2]) / felt.dt if len(felt.tip_m) > 1 else 0.0
-    force = max(float(np.linalg.norm(one.force_n, axis=1).max()) for one in (there, felt, back))
+    depth = float((1e3 * contact.tip_m[-1] - line.face_base) @ line.axis_base)
+    moved = 1e3 * np.linalg.norm(contact.tip_m[-1] - contact.tip_m[-2]) / contact.dt if len(contact.tip_m) > 1 else 0.0
+    force = max(float(np.linalg.norm(one.force_n, axis=1).max()) for one in (there, contact, back))
     point = nominal_tip(cell.tour.model, cell.tour.tip_mm, q)
     return TouchReading(touch.name, point, q, seconds, force, depth, float(moved), line.aside_mm)
 
@@ -232,12 +232,12 @@ PASSED_MM = 0.1
 def _pad(cell: TouchingCell, line: _Line) -> int:
     """The marker's body, its face square to the needle."""
     centre = line.face_base + PAD_MM[2] / 2 * line.axis_base
-    pad = load_box(cell.room.client, np.array(PAD_MM), pose(frame_about(line.axis_base), centre))
-    soften(cell.room.client, pad, PAD_N_M)
+    pad = load_box(cell.workcell.client, np.array(PAD_MM), pose(frame_about(line.axis_base), centre))
+    soften(cell.workcell.client, pad, PAD_N_M)
     return pad
 
 
-def _felt(cell: TouchingCell, line: _Line, arrival: Floats) -> Run:
+def _approached_contact(cell: TouchingCell, line: _Line, arrival: Floats) -> Run:
     """Move the last millimetres under a spring at the tip, until contact is measured or the line ends."""
     J = tips(cell.tour.model, cell.rigid.tip_m, line.near[:1]).J[0]
     dt = allowed_step(SPRING, J, cell.rigid.mass_matrix(line.near[0]))
@@ -308,7 +308,9 @@ def _run(
 ) -> Run:
     reference = reference_of(cell.tour.model, cell.rigid.tip_m, trajectory, controller.dt, pause_s)
     around = Surroundings(arrival, stop=stop, watch=lambda row: _refuse_contacts(cell))
-    return run(cell.room.arm, controller, reference, lambda q: tips(cell.tour.model, cell.rigid.tip_m, q[None]), around)
+    return run(
+        cell.workcell.arm, controller, reference, lambda q: tips(cell.tour.model, cell.rigid.tip_m, q[None]), around
+    )
 
 
 def _refuse_contacts(cell: TouchingCell) -> None:
@@ -317,9 +319,9 @@ def _refuse_contacts(cell: TouchingCell) -> None:
     Raises:
         StoppedError: It does.
     """
-    for one in touches(cell.room.arm):
-        if one.body in cell.room.bodies:
-            raise StoppedError(f"{one.link} touches {cell.room.bodies[one.body]}")
+    for one in touches(cell.workcell.arm):
+        if one.body in cell.workcell.bodies:
+            raise StoppedError(f"{one.link} touches {cell.workcell.bodies[one.body]}")
 
 
 def seconds_of(done: Run) -> float:
@@ -361,12 +363,12 @@ def execute_touches(
     tool, T = case_tool(case), truth.T_base_ct
     down_ct = -bed_frame(case)[:3, 2]
     with (
-        open_workcell(tour.model, tool, anatomy.skin.mesh, T, case_boxes(case, T), down_ct=down_ct) as room,
+        open_workcell(tour.model, tool, anatomy.skin.mesh, T, case_boxes(case, T), down_ct=down_ct) as workcell,
         rigid_model(tour.model, tool, T[:3, :3] @ down_ct) as rigid,
     ):
         true = CellChecker(tour.model, tool, patient=patient_surface(anatomy).transformed(T))
-        cell = TouchingCell(room, rigid, tour, truth, checkers, true, np.random.default_rng([truth.seed, 1]))
-        room.arm.place(tour.touches[0].come.q[0])
+        cell = TouchingCell(workcell, rigid, tour, truth, checkers, true, np.random.default_rng([truth.seed, 1]))
+        workcell.arm.place(tour.touches[0].come.q[0])
         return _tour(cell, progress)
 
 

@@ -26,7 +26,7 @@ NEEDLE_DENSITY_KG_M3 = 7900.0
 """Stainless steel, taken as solid."""
 
 
-KEPT = ("visual", "collision", "inertial")
+KEPT_TAGS = ("visual", "collision", "inertial")
 """Of a link; other programs' additions would be taken for friction and the like."""
 
 NO_WEIGHT = ET.fromstring(
@@ -84,7 +84,7 @@ def _simplify(robot: ET.Element) -> None:
             robot.remove(element)
     for link in robot.findall("link"):
         for element in list(link):
-            if element.tag not in KEPT:
+            if element.tag not in KEPT_TAGS:
                 link.remove(element)
         if link.find("inertial") is None:
             link.append(deepcopy(NO_WEIGHT))

@@ -153,11 +153,11 @@ def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
             what = f"passes {np.linalg.norm(off):.4g} mm beside where a UR's does, by ({_mm(off)}) mm in the base"
             raise _other(chain, joint, what, document)
     off = [float(T[0, 3] - p[3, 0]), 0.0, float(T[2, 3] - p[5, 2])]
-    turned = rotation_angle(R_BASE_FLANGE.T @ T[:3, :3])
-    if np.linalg.norm(off) > OFF_MM or turned > SQUARE_RAD:
+    off_angle = rotation_angle(R_BASE_FLANGE.T @ T[:3, :3])
+    if np.linalg.norm(off) > OFF_MM or off_angle > SQUARE_RAD:
         what = (
             f"the flange '{chain.flange}' is {np.linalg.norm(off):.4g} mm beside axis 6 and turned by "
-            f"{np.degrees(turned):.4g} degrees against a UR's"
+            f"{np.degrees(off_angle):.4g} degrees against a UR's"
         )
         raise InputError(what, where=document.where, allowed=f"the link that a UR has as tool0; {AS_UR}")
 

@@ -109,9 +109,9 @@ def _rules(at: Mapping[str, Floats]) -> Iterator[bool]:
     spine = [centre[0] for name, centre in at.items() if name.startswith("vertebrae")]
     if spine:
         middle = float(np.mean(spine))
-        beside = {name: at[name][0] - middle for name in at if name.startswith(BESIDE_SPINE)}
-        yield from (bool(x > 0) for name, x in beside.items() if "left" in name)
-        yield from (bool(x < 0) for name, x in beside.items() if "right" in name)
+        lateral = {name: at[name][0] - middle for name in at if name.startswith(BESIDE_SPINE)}
+        yield from (bool(x > 0) for name, x in lateral.items() if "left" in name)
+        yield from (bool(x < 0) for name, x in lateral.items() if "right" in name)
     for chains, axis, sign in ((FROM_RIGHT, 0, 1.0), (FROM_HEAD, 2, -1.0)):
         for chain in chains:
             known = [at[name] for name in chain if name in at]

@@ -209,12 +209,12 @@ def cached_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tu
         facts = [(mesh.closed, mesh.wound_alike) for mesh in meshes.values()]
         return {"lines": np.array(lines, np.str_), "facts": np.array(facts, np.bool_).reshape(-1, 2)}
 
-    def check(kept: Arrays) -> None:
-        lines, facts = kept["lines"], kept["facts"]
+    def check(cached: Arrays) -> None:
+        lines, facts = cached["lines"], cached["facts"]
         if lines.dtype.kind != "U" or lines.ndim != 1 or facts.dtype != np.bool_ or facts.shape != (len(meshes), 2):
             raise ValueError("no lines, or not of these meshes")
 
-    kept = cache.arrays(made_from, found, by=__name__, check=check)
-    for mesh, (closed, wound_alike) in zip(meshes.values(), kept["facts"].tolist(), strict=True):
+    cached = cache.arrays(made_from, found, by=__name__, check=check)
+    for mesh, (closed, wound_alike) in zip(meshes.values(), cached["facts"].tolist(), strict=True):
         mesh.known(closed=closed, wound_alike=wound_alike)
-    return tuple(kept["lines"].tolist())
+    return tuple(cached["lines"].tolist())

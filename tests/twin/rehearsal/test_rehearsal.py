@@ -235,9 +235,9 @@ def through_tissue(control: str):
 
 def test_the_tissues_force_acts_on_the_needle_while_it_goes_in(exact):
     """A skin that ruptures at 4 N takes the tip .15 mm off its path at most; who yields to it, is off by F / K."""
-    assert exact.felt is None and exact.off_path_mm < 0.05 and "declares none" in exact.force_text
+    assert exact.tissue_force is None and exact.off_path_mm < 0.05 and "declares none" in exact.force_text
     done, yielding = through_tissue("impedance"), through_tissue("admittance")
-    assert done.felt.along_n == pytest.approx(4.0, rel=0.02) and done.felt.across_n > 0.05
+    assert done.tissue_force.along_n == pytest.approx(4.0, rel=0.02) and done.tissue_force.across_n > 0.05
     assert 0.02 < done.off_path_mm <= 0.15
     assert np.linalg.norm(done.tip_true_ct[-1] - exact.tip_true_ct[-1]) < 0.02
     assert yielding.off_path_mm > 3.0

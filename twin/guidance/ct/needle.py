@@ -119,8 +119,8 @@ def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bo
     if not hidden[tuple(at[inside].T)].any():
         return
     away = target_ct - found.tip_ct
-    beside = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
-    what = f"the needle ends at other metal, which hides its tip; its axis passes the target by {beside:.1f} mm"
+    lateral = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
+    what = f"the needle ends at other metal, which hides its tip; its axis passes the target by {lateral:.1f} mm"
     raise InputError(what, where=volume.path, allowed=f"a tip {SEEN_MM:g} mm clear of wider metal and its blur")
 
 

@@ -58,8 +58,8 @@ def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, 
     worst, two = 0.0, (0, 0)
     for i, j in combinations(range(len(names)), 2):
         cosine = (np.trace(axes_base[i].T @ axes_base[j]) - 1) / 2
-        turned = float(np.sqrt(max(2 - 2 * min(cosine, 1.0), 0.0)))  # 2 sin(angle / 2)
-        beyond = float(np.linalg.norm(tips_base[i] - tips_base[j])) - turned * MOST_OFF_MM - SLACK_MM
+        chord = float(np.sqrt(max(2 - 2 * min(cosine, 1.0), 0.0)))  # 2 sin(angle / 2)
+        beyond = float(np.linalg.norm(tips_base[i] - tips_base[j])) - chord * MOST_OFF_MM - SLACK_MM
         if beyond > worst:
             worst, two = beyond, (i, j)
     if worst > 0:

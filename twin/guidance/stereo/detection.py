@@ -1,6 +1,6 @@
 """Detections of the stereo guidance: a ball's centre in each camera, from images of the true workcell.
 
-``picture_detector`` renders an image with the true camera and measures it with the believed one. Another `Detector` may
+``image_detector`` renders an image with the true camera and measures it with the believed one. Another `Detector` may
 leave the image out: for studies of everything behind it.
 """
 
@@ -72,7 +72,7 @@ class Detections(NamedTuple):
     """Shape (c, 2, 2), px^2."""
 
 
-def picture_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Detector:
+def image_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Detector:
     """Pictures of the true workcell, each drawn anew with noise; what the head hides is hidden."""
     plan = workcell.case.file.cameras
 

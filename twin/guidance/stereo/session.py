@@ -17,9 +17,9 @@ from puncture_twin.twin.guidance.stereo.detection import (
     Detector,
     LocatedPair,
     Search,
+    image_detector,
     in_space,
     look_at,
-    picture_detector,
 )
 from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide, Known
 from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, NeedleOutcome, needle_outcome
@@ -116,7 +116,7 @@ def run_session(
     seed: int,
     *,
     targets: tuple[str, ...] | None = None,
-    detector_of: DetectorOf = picture_detector,
+    detector_of: DetectorOf = image_detector,
     empty: StateChecker | None = None,
 ) -> Session:
     """Run a whole session in a workcell drawn from a seed.

@@ -93,8 +93,8 @@ class StereoWorkcell:
 
     def _on_flange_c(self, q_true: Floats, offset: Floats) -> Floats:
         flange = self.arm.flange_pose(q_true)
-        beside = offset + np.array([0.0, 0.0, self.case.file.tool.rod_mm])
-        return apply(self.T_c_base, flange[..., :3, 3] + flange[..., :3, :3] @ beside)
+        on_flange = offset + np.array([0.0, 0.0, self.case.file.tool.rod_mm])
+        return apply(self.T_c_base, flange[..., :3, 3] + flange[..., :3, :3] @ on_flange)
 
     def needle_c(self, q_true: Floats) -> Floats:
         """The needle's true axes as columns, z to the tip, shape (3, 3), C, at a true configuration (6,), rad."""

@@ -42,7 +42,7 @@ class ProbeShot(NamedTuple):
     """Direction in which each of its joints last rotated, shape (6,): 1, -1, or 0."""
     turn_needle: Floats
     """The same of the needle's arm."""
-    picture: Pixels
+    image: Pixels
     found: Detection | Missed
     true_needle: NeedleInImage
     """The true needle in the true image."""
@@ -182,10 +182,10 @@ def _shot(
     rest_needle = motion.settle(1, q_needle)
     needle = truth.needle_in_image(rest_probe, rest_needle)
     imager = case.content.image.imager()
-    picture = render(imager, needle, rng, echo=case.content.image.echo())
+    image = render(imager, needle, rng, echo=case.content.image.echo())
     touched = not motion.between.apart(rest_probe, rest_needle)
     return ProbeShot(
-        row, q_probe, q_needle, motion.turns[0], motion.turns[1], picture, detect(picture, imager), needle, touched
+        row, q_probe, q_needle, motion.turns[0], motion.turns[1], image, detect(image, imager), needle, touched
     )
 
 

@@ -182,7 +182,7 @@ def unseen_errors_mm(
     return np.array(errors)
 
 
-def puncture_picture(case: SelfcalCase, puncture: Puncture, rng: np.random.Generator) -> Pixels:
+def puncture_image(case: SelfcalCase, puncture: Puncture, rng: np.random.Generator) -> Pixels:
     """The image after the puncture: a lesion about the target, and the needle."""
     lesion = Lesion(puncture.target_image, LESION_MM)
     return render(case.content.image.imager(), puncture.needle, rng, echo=case.content.image.echo(), lesion=lesion)

@@ -168,9 +168,9 @@ def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bool
         return at
     low, high = np.maximum(at.min(axis=0) - 1, 0), at.max(axis=0) + 2
     box = labels[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
-    beside = ndimage.binary_dilation(box == label, np.ones((3, 3, 3), bool))
+    near_label = ndimage.binary_dilation(box == label, np.ones((3, 3, 3), bool))
     x, y, z = (at - low).T
-    return at[~beside[x, y, z] & ~later[box[x, y, z]]]
+    return at[~near_label[x, y, z] & ~later[box[x, y, z]]]
 
 
 def _samples(corners: Floats) -> Iterator[Floats]:

@@ -72,7 +72,7 @@ class BallScene:
     rod: bool = True
 
 
-class Picture(NamedTuple):
+class GreyImage(NamedTuple):
     """A grey image, or a part of one."""
 
     grey: NDArray[np.uint8]
@@ -99,7 +99,7 @@ def render(
     noise: float = 2.0,
     blur_px: float = 0.7,
     half_px: int | None = None,
-) -> Picture:
+) -> GreyImage:
     """The camera's image of a scene.
 
     Args:
@@ -118,7 +118,7 @@ def render(
         grey += pattern * (scene.texture_grey / max(float(pattern.std()), 1e-12))
     _paint(grey, low, camera, scene, blur_px)
     grey += rng.normal(0.0, noise, shape)
-    return Picture(np.clip(np.round(grey), 0, 255).astype(np.uint8), (int(low[0]), int(low[1])))
+    return GreyImage(np.clip(np.round(grey), 0, 255).astype(np.uint8), (int(low[0]), int(low[1])))
 
 
 def _window(camera: Camera, scene: BallScene, half_px: int | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

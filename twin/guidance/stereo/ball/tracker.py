@@ -27,7 +27,7 @@ from puncture_twin.twin.guidance.stereo.ball.ball_edges import (
     refit,
     visible_fraction,
 )
-from puncture_twin.twin.guidance.stereo.ball.ball_image import Picture
+from puncture_twin.twin.guidance.stereo.ball.ball_image import GreyImage
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
 
 Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low_contrast"]
@@ -98,7 +98,7 @@ class LostBall(NamedTuple):
 
 
 def find_ball(
-    image: Picture | NDArray[np.uint8],
+    image: GreyImage | NDArray[np.uint8],
     camera: Camera,
     predicted_c: Floats,
     radius_mm: float,
@@ -116,12 +116,12 @@ def find_ball(
         search_px: How far from the prediction the centre may be.
         hough_only: The paper's method: the centre of the best circle that Hough finds, neither measured nor gated.
     """
-    picture = image if isinstance(image, Picture) else Picture(image)
+    whole = image if isinstance(image, GreyImage) else GreyImage(image)
     predicted = camera.project(predicted_c)
     if not camera.sees(predicted):
         return LostBall("not_in_view")
     radius = camera.ball_radius_px(predicted_c, radius_mm)
-    part = _cut(picture, predicted, search_px + 2 * radius + MARGIN_PX)
+    part = _cut(whole, predicted, search_px + 2 * radius + MARGIN_PX)
     if min(part.grey.shape) < 2 * radius:
         return LostBall("not_in_view")
     grey = grey_part(part.grey, np.array(part.offset, dtype=np.float64))
@@ -138,13 +138,13 @@ def find_ball(
     return _best(grey, camera, FoundCircle(centers[near], found.radii[near]), radius, DEFAULT)
 
 
-def _cut(picture: Picture, center: Floats, half: float) -> Picture:
+def _cut(whole: GreyImage, center: Floats, half: float) -> GreyImage:
     """The part of a picture around a pixel, as far as there is one."""
-    size = np.array(picture.grey.shape[::-1])
-    low = np.clip(np.floor(center - half).astype(int) - picture.offset, 0, size)
-    high = np.clip(np.ceil(center + half).astype(int) + 1 - picture.offset, 0, size)
-    part = np.ascontiguousarray(picture.grey[low[1] : high[1], low[0] : high[0]])
-    return Picture(part, (int(low[0]) + picture.offset[0], int(low[1]) + picture.offset[1]))
+    size = np.array(whole.grey.shape[::-1])
+    low = np.clip(np.floor(center - half).astype(int) - whole.offset, 0, size)
+    high = np.clip(np.ceil(center + half).astype(int) + 1 - whole.offset, 0, size)
+    part = np.ascontiguousarray(whole.grey[low[1] : high[1], low[0] : high[0]])
+    return GreyImage(part, (int(low[0]) + whole.offset[0], int(low[1]) + whole.offset[1]))
 
 
 def _contrast(grey: NDArray[np.uint8]) -> float:

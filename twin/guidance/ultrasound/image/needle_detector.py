@@ -178,11 +178,11 @@ class Detection(NamedTuple):
     """Of shaft that shows: the more, the better its direction is known."""
 
 
-def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
+def detect(image: Pixels, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
     """Detect the needle, or return why not.
 
     Args:
-        picture: Grey levels, shape (rows, columns).
+        image: Grey levels, shape (rows, columns).
         imager: Pixel, display range and point spread of the machine.
         settings: What is believed.
 
@@ -190,10 +190,10 @@ def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = 
         InputError: An image of another size than the imager's.
     """
     settings = settings or DetectorSettings()
-    if picture.shape != (imager.rows, imager.columns):
+    if image.shape != (imager.rows, imager.columns):
         size = f"({imager.rows}, {imager.columns})"
-        raise InputError(f"picture of shape {picture.shape}", where="needle detector", allowed=f"{size}, the imager's")
-    relative = over_background(picture, imager)
+        raise InputError(f"picture of shape {image.shape}", where="needle detector", allowed=f"{size}, the imager's")
+    relative = over_background(image, imager)
     segment = _segment(relative, imager, settings)
     length = float(np.linalg.norm(segment.end - segment.start))
     if segment.score < settings.least_score_mm:
@@ -214,13 +214,13 @@ def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = 
     return Detection(found, line.direction, segment.score, contrast, -line.start)
 
 
-def over_background(picture: Pixels, imager: Imager) -> Floats:
+def over_background(image: Pixels, imager: Imager) -> Floats:
     """Amplitude over the mean amplitude of the background around, shape (rows, columns)."""
     size = int(BACKGROUND_MM / imager.pixel_mm) // COARSE | 1
-    coarse = np.ascontiguousarray(picture[::COARSE, ::COARSE])
+    coarse = np.ascontiguousarray(image[::COARSE, ::COARSE])
     median = cv2.medianBlur(coarse, size).astype(np.float64)
-    grey = cv2.resize(cv2.GaussianBlur(median, (0, 0), size / 8.0), picture.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.asarray(imager.amplitude(picture) / (MEAN_OVER_MEDIAN * imager.amplitude(grey)))
+    grey = cv2.resize(cv2.GaussianBlur(median, (0, 0), size / 8.0), image.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(imager.amplitude(image) / (MEAN_OVER_MEDIAN * imager.amplitude(grey)))
 
 
 def _segment(relative: Floats, imager: Imager, settings: DetectorSettings) -> Segment:

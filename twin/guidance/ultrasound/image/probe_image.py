@@ -151,9 +151,9 @@ class Imager:
         level = 20.0 * np.log10(np.maximum(amplitude, 1e-12)) - self.speckle_db
         return np.clip(np.round(WHITE * (1.0 + level / self.range_db)), 0, WHITE).astype(np.uint8)
 
-    def amplitude(self, picture: NDArray[np.generic]) -> Floats:
+    def amplitude(self, grey: NDArray[np.generic]) -> Floats:
         """Amplitude from greys, the inverse of :meth:`grey` where a pixel is neither black nor white."""
-        level = self.range_db * (np.asarray(picture, dtype=np.float64) / WHITE - 1.0)
+        level = self.range_db * (np.asarray(grey, dtype=np.float64) / WHITE - 1.0)
         return np.asarray(10.0 ** ((level + self.speckle_db) / 20.0))
 
 
