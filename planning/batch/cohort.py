@@ -27,9 +27,32 @@ from puncture_twin.planning.case.options import NO_OPTIONS, SECTIONS, CaseOption
 from puncture_twin.planning.case.toml_types import Section, Text
 
 CASE_FILE = "case.toml"
+
 ALLOWED = f"a folder with {CASE_FILE} files, a CSV with the header 'case', or a cohort.toml"
+
 MAX_FILE_BYTES = 200_000_000
 """A million lines of two hundred characters."""
+
+
+@dataclass(frozen=True)
+class CohortCase:
+    """One case with its options.
+
+    Attributes:
+        stated: As the cohort writes it.
+        path: The case file, or the folder that holds ``case.toml``.
+        name: What people call it; "" leaves it to the case.
+        options: What is stated in place of what the case states.
+    """
+
+    stated: str
+    path: Path
+    name: str = ""
+    options: CaseOptions = NO_OPTIONS
+
+
+MOST_CASES = 1_000_000
+"""Cases of one cohort: more is a slip in a grid of options."""
 
 
 def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]]:
@@ -102,7 +125,9 @@ def _refuse(what: str, where: str) -> NoReturn:
 
 
 CASE, NAME, TARGET = "case", "name", "target"
+
 ALLOWED_COLUMNS = f"{CASE}, {NAME}, {TARGET}, and options as KIND.KEY (KIND one of {', '.join(SECTIONS)})"
+
 LONGEST_CELL = 20_000
 
 
@@ -190,6 +215,7 @@ def _value(cell: str) -> Any:
 
 
 ALLOWED_TOML = "a cohort.toml with cases = [patterns] and, if wanted, tables of options"
+
 KEYS = "docs/how-to/cohorts.md"
 
 Choices = dict[Text, dict[str, Any]] | tuple[Any, ...]
@@ -285,24 +311,3 @@ def _combined(choices: Sequence[_Choice], path: Path) -> tuple[str, CaseOptions]
 def _labels(choices: Sequence[_Choice]) -> Iterator[str]:
     for one in choices:
         yield f"{one.kind} {one.name}"
-
-
-@dataclass(frozen=True)
-class CohortCase:
-    """One case with its options.
-
-    Attributes:
-        stated: As the cohort writes it.
-        path: The case file, or the folder that holds ``case.toml``.
-        name: What people call it; "" leaves it to the case.
-        options: What is stated in place of what the case states.
-    """
-
-    stated: str
-    path: Path
-    name: str = ""
-    options: CaseOptions = NO_OPTIONS
-
-
-MOST_CASES = 1_000_000
-"""Cases of one cohort: more is a slip in a grid of options."""

@@ -36,226 +36,6 @@ from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit, to_lps
 
-_ALLOWED = (
-    "a header name,x_mm,y_mm,z_mm (or _cm, _m; kind, and q1_deg to q6_deg, may be added), "
-    "then as many fields in every line"
-)
-
-
-class _Row(NamedTuple):
-    line: int
-    fields: list[str]
-
-
-def read_csv_points(data: bytes, where: str) -> RawPoints:
-    """The points of a CSV file, in the order of its lines; empty lines are passed over.
-
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
-    Raises:
-        InputError: If the header or a line is not understood; the error names the line.
-    """
-    rows = list(_rows(data, where))
-    if not rows:
-        refuse("no line", where, _ALLOWED)
-    header = [field.strip() for field in rows[0].fields]
-    unit = _unit(header, where)
-    columns = {name.partition("_")[0]: index for index, name in enumerate(header)}
-    for line, fields in rows[1:]:
-        if len(fields) != len(header):
-            refuse(f"{len(fields)} fields instead of {len(header)}", f"{where}, line {line}", _ALLOWED)
-        if not fields[columns["name"]].strip():
-            refuse("empty name", f"{where}, line {line}", _ALLOWED)
-    points = [
-        tuple(parse_coordinate(fields[columns[axis]], f"{where}, line {line}") for axis in "xyz")
-        for line, fields in rows[1:]
-    ]
-    return RawPoints(
-        names=[fields[columns["name"]].strip() for _, fields in rows[1:]],
-        points=[(x, y, z) for x, y, z in points],
-        unit=unit,
-        space=None,
-        kinds=tuple(f[columns["kind"]].strip() for _, f in rows[1:]) if "kind" in columns else None,
-        joints_deg=[
-            tuple(row_numbers(fields, header, JOINTS_DEG, f"{where}, line {line}")) for line, fields in rows[1:]
-        ]
-        if "q1" in columns
-        else None,
-    )
-
-
-def _rows(data: bytes, where: str) -> Iterator[_Row]:
-    reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
-    try:
-        for fields in reader:
-            if any(field.strip() for field in fields):
-                yield _Row(reader.line_num, fields)
-    except csv.Error as error:
-        raise InputError(f"{error}", where=f"{where}, line {reader.line_num}", allowed=_ALLOWED) from error
-
-
-def _unit(header: list[str], where: str) -> Unit | None:
-    """The one unit of the three coordinate columns, None if they have none."""
-    units: dict[str, str] = {}
-    for name in header:
-        axis = re.fullmatch(r"([xyz])(?:_(\w+))?", name)
-        if axis:
-            units[axis[1]] = axis[2] or ""
-        elif name not in ("name", "kind", *JOINTS_DEG):
-            refuse(f"column {name[:40]!r}", f"{where}, header", _ALLOWED)
-    if len(set(header)) != len(header) or sorted(units) != ["x", "y", "z"] or "name" not in header:
-        refuse(f"columns {header}", f"{where}, header", _ALLOWED)
-    joints = sum(name in JOINTS_DEG for name in header)
-    if joints not in (0, 6) or len(header) != 4 + ("kind" in header) + joints:  # such as x_mm beside x_m
-        refuse(f"columns {header}", f"{where}, header", _ALLOWED)
-    if len(set(units.values())) != 1:
-        refuse(f"mixed units {sorted(set(units.values()))}", f"{where}, header", _ALLOWED)
-    text = units["x"]
-    return parse_unit(text, where=f"{where}, header") if text else None
-
-
-_MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, defined control points"
-_LINE_POINTS = 2
-_SPACES = {"LPS": Space.LPS, "RAS": Space.RAS, "0": Space.RAS, "1": Space.LPS}
-_FCSV_ALLOWED = "a Slicer fiducial list with '# CoordinateSystem = ' and '# columns = id,x,y,z,...,label,...'"
-_FCSV_DEFINED = "2"
-"""Slicer 5 writes two fields more than its header names: whether the position is defined (2), and one other."""
-_FCSV_SYSTEM = "# coordinatesystem"
-_FCSV_COLUMNS = "# columns"
-
-
-def read_markups_points(data: bytes, where: str) -> RawPoints:
-    """The control points of a Slicer markups file: a list of fiducials, or a line, each by its label.
-
-    Which end of a line is the target no file says: the case names it by its label.
-
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
-    Raises:
-        InputError: If it is no such file, states no known space, or a point has no label or defined position.
-    """
-    tree = parse_json(data, where=where, allowed=_MARKUPS_ALLOWED)
-    markups = tree.get("markups") if isinstance(tree, dict) else None
-    if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
-        refuse("not exactly one entry in 'markups'", where, _MARKUPS_ALLOWED)
-    markup = markups[0]
-    points = _control_points(markup, where)
-    places = [f"{where}, control point {number}" for number in range(1, len(points) + 1)]
-    return RawPoints(
-        names=[_label(point, place) for point, place in zip(points, places, strict=True)],
-        points=[_position(point, place) for point, place in zip(points, places, strict=True)],
-        unit=_slicer_unit(markup.get("coordinateUnits"), where),
-        space=_space(markup.get("coordinateSystem"), where),
-    )
-
-
-def _control_points(markup: dict[str, Any], where: str) -> list[Any]:
-    kind, points = markup.get("type", "Fiducial"), markup.get("controlPoints")
-    if kind not in ("Fiducial", "Line"):
-        refuse(f"markup of type {str(kind)[:40]!r}", where, _MARKUPS_ALLOWED)
-    if not isinstance(points, list) or not points:
-        refuse("no control point", where, _MARKUPS_ALLOWED)
-    if kind == "Line" and len(points) != _LINE_POINTS:
-        refuse(f"a line of {len(points)} control points", where, "both ends of a line: 2 control points")
-    return points
-
-
-def read_fcsv_points(data: bytes, where: str) -> RawPoints:
-    """The points of an older Slicer fiducial list, which is in mm by its definition.
-
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
-    Raises:
-        InputError: If it states no known space or columns, or a line is not understood.
-    """
-    lines = decode_text(data, where).splitlines()
-    system, header = _fcsv_value(lines, _FCSV_SYSTEM), _fcsv_value(lines, _FCSV_COLUMNS)
-    columns = [] if header is None else [name.strip() for name in header.split(",")]
-    if any(columns.count(name) != 1 for name in ("x", "y", "z", "label")):
-        refuse(f"columns {columns}", where, _FCSV_ALLOWED)
-    names, points = [], []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        place = f"{where}, line {number}"
-        fields = _fcsv_fields(line, place)
-        if len(fields) - len(columns) not in (0, 2):
-            refuse(f"{len(fields)} fields instead of {len(columns)}", place, _FCSV_ALLOWED)
-        if (status := (*fields, _FCSV_DEFINED)[len(columns)]) != _FCSV_DEFINED:
-            refuse(f"position status {status[:40]!r}", place, f"{_FCSV_DEFINED} (defined)")
-        names.append(fields[columns.index("label")].strip())
-        x, y, z = (parse_coordinate(fields[columns.index(axis)], place) for axis in "xyz")
-        points.append((x, y, z))
-    return RawPoints(names, points, Unit.MM, _space(system, where))
-
-
-def _space(value: object, where: str) -> Space:
-    key = str(value).strip() if isinstance(value, (str, int)) and not isinstance(value, bool) else ""
-    if key not in _SPACES:
-        refuse(f"coordinate system {str(value)[:40]!r}", where, "LPS or RAS (in older files 1 or 0)")
-    return _SPACES[key]
-
-
-def _slicer_unit(value: object, where: str) -> Unit:
-    """From "mm", or a coded entry such as ["mm", "UCUM", "millimeter"]; mm, the schema's default, if there is none."""
-    if value is None:
-        return Unit.MM
-    text = value[0] if isinstance(value, list) and value else value
-    if not isinstance(text, str):
-        refuse(f"coordinateUnits {str(value)[:40]!r}", where, 'such as "mm" or ["mm", "UCUM", "millimeter"]')
-    return parse_unit(text, where=where)
-
-
-def _label(point: object, where: str) -> str:
-    label = point.get("label") if isinstance(point, dict) else None
-    if not isinstance(label, str) or not label.strip():
-        refuse(f"label {str(label)[:40]!r}", where, "a label that is not empty")
-    return label.strip()
-
-
-def _position(point: dict[str, Any], where: str) -> tuple[float, float, float]:
-    status = point.get("positionStatus", "defined")
-    if status != "defined":
-        refuse(f"positionStatus is {str(status)[:40]!r}", where, '"defined"')
-    position = point.get("position")
-    if not isinstance(position, list) or len(position) != 3:
-        refuse(f"position {str(position)[:60]!r}", where, "three numbers")
-    for value in position:
-        if not isinstance(value, (int, float)) or isinstance(value, bool):
-            refuse(f"position {str(position)[:60]!r}", where, "three numbers")
-    x, y, z = (parse_coordinate(str(value), where) for value in position)
-    return x, y, z
-
-
-def _fcsv_value(lines: list[str], key: str) -> str | None:
-    found = [line.partition("=")[2].strip() for line in lines if line.lower().startswith(key)]
-    return found[0] if len(found) == 1 else None
-
-
-def _fcsv_fields(line: str, where: str) -> list[str]:
-    try:
-        return next(csv.reader([line], strict=True))
-    except csv.Error as error:
-        raise InputError(f"{error}", where=where, allowed=_FCSV_ALLOWED) from error
-
-
-MAX_FILE_BYTES = 10_000_000
-"""A hundred thousand points; a larger file is no list of markers."""
-
-_READERS: Mapping[str, Callable[[bytes, str], RawPoints]] = MappingProxyType(
-    {".csv": read_csv_points, ".mrk.json": read_markups_points, ".fcsv": read_fcsv_points}
-)
-
-
-MOST_NAMED = 8
-"""Points that a line about a list names."""
-
 
 @dataclass(frozen=True, eq=False)
 class NamedPoints:
@@ -286,6 +66,13 @@ class NamedPoints:
                 array = np.array(getattr(self, name), dtype=np.float64)
                 array.setflags(write=False)
                 object.__setattr__(self, name, array)
+
+
+MAX_FILE_BYTES = 10_000_000
+"""A hundred thousand points; a larger file is no list of markers."""
+
+MOST_NAMED = 8
+"""Points that a line about a list names."""
 
 
 def read_points(
@@ -420,13 +207,236 @@ def parse_coordinate(text: str, where: str) -> float:
     return number
 
 
+_ALLOWED = (
+    "a header name,x_mm,y_mm,z_mm (or _cm, _m; kind, and q1_deg to q6_deg, may be added), "
+    "then as many fields in every line"
+)
+
+
+class _Row(NamedTuple):
+    line: int
+    fields: list[str]
+
+
+def read_csv_points(data: bytes, where: str) -> RawPoints:
+    """The points of a CSV file, in the order of its lines; empty lines are passed over.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If the header or a line is not understood; the error names the line.
+    """
+    rows = list(_rows(data, where))
+    if not rows:
+        refuse("no line", where, _ALLOWED)
+    header = [field.strip() for field in rows[0].fields]
+    unit = _unit(header, where)
+    columns = {name.partition("_")[0]: index for index, name in enumerate(header)}
+    for line, fields in rows[1:]:
+        if len(fields) != len(header):
+            refuse(f"{len(fields)} fields instead of {len(header)}", f"{where}, line {line}", _ALLOWED)
+        if not fields[columns["name"]].strip():
+            refuse("empty name", f"{where}, line {line}", _ALLOWED)
+    points = [
+        tuple(parse_coordinate(fields[columns[axis]], f"{where}, line {line}") for axis in "xyz")
+        for line, fields in rows[1:]
+    ]
+    return RawPoints(
+        names=[fields[columns["name"]].strip() for _, fields in rows[1:]],
+        points=[(x, y, z) for x, y, z in points],
+        unit=unit,
+        space=None,
+        kinds=tuple(f[columns["kind"]].strip() for _, f in rows[1:]) if "kind" in columns else None,
+        joints_deg=[
+            tuple(row_numbers(fields, header, JOINTS_DEG, f"{where}, line {line}")) for line, fields in rows[1:]
+        ]
+        if "q1" in columns
+        else None,
+    )
+
+
+def _rows(data: bytes, where: str) -> Iterator[_Row]:
+    reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
+    try:
+        for fields in reader:
+            if any(field.strip() for field in fields):
+                yield _Row(reader.line_num, fields)
+    except csv.Error as error:
+        raise InputError(f"{error}", where=f"{where}, line {reader.line_num}", allowed=_ALLOWED) from error
+
+
+def _unit(header: list[str], where: str) -> Unit | None:
+    """The one unit of the three coordinate columns, None if they have none."""
+    units: dict[str, str] = {}
+    for name in header:
+        axis = re.fullmatch(r"([xyz])(?:_(\w+))?", name)
+        if axis:
+            units[axis[1]] = axis[2] or ""
+        elif name not in ("name", "kind", *JOINTS_DEG):
+            refuse(f"column {name[:40]!r}", f"{where}, header", _ALLOWED)
+    if len(set(header)) != len(header) or sorted(units) != ["x", "y", "z"] or "name" not in header:
+        refuse(f"columns {header}", f"{where}, header", _ALLOWED)
+    joints = sum(name in JOINTS_DEG for name in header)
+    if joints not in (0, 6) or len(header) != 4 + ("kind" in header) + joints:  # such as x_mm beside x_m
+        refuse(f"columns {header}", f"{where}, header", _ALLOWED)
+    if len(set(units.values())) != 1:
+        refuse(f"mixed units {sorted(set(units.values()))}", f"{where}, header", _ALLOWED)
+    text = units["x"]
+    return parse_unit(text, where=f"{where}, header") if text else None
+
+
+_MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, defined control points"
+
+_LINE_POINTS = 2
+
+_SPACES = {"LPS": Space.LPS, "RAS": Space.RAS, "0": Space.RAS, "1": Space.LPS}
+
+_FCSV_ALLOWED = "a Slicer fiducial list with '# CoordinateSystem = ' and '# columns = id,x,y,z,...,label,...'"
+
+_FCSV_DEFINED = "2"
+"""Slicer 5 writes two fields more than its header names: whether the position is defined (2), and one other."""
+
+_FCSV_SYSTEM = "# coordinatesystem"
+
+_FCSV_COLUMNS = "# columns"
+
+
+def read_markups_points(data: bytes, where: str) -> RawPoints:
+    """The control points of a Slicer markups file: a list of fiducials, or a line, each by its label.
+
+    Which end of a line is the target no file says: the case names it by its label.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If it is no such file, states no known space, or a point has no label or defined position.
+    """
+    tree = parse_json(data, where=where, allowed=_MARKUPS_ALLOWED)
+    markups = tree.get("markups") if isinstance(tree, dict) else None
+    if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
+        refuse("not exactly one entry in 'markups'", where, _MARKUPS_ALLOWED)
+    markup = markups[0]
+    points = _control_points(markup, where)
+    places = [f"{where}, control point {number}" for number in range(1, len(points) + 1)]
+    return RawPoints(
+        names=[_label(point, place) for point, place in zip(points, places, strict=True)],
+        points=[_position(point, place) for point, place in zip(points, places, strict=True)],
+        unit=_slicer_unit(markup.get("coordinateUnits"), where),
+        space=_space(markup.get("coordinateSystem"), where),
+    )
+
+
+def _control_points(markup: dict[str, Any], where: str) -> list[Any]:
+    kind, points = markup.get("type", "Fiducial"), markup.get("controlPoints")
+    if kind not in ("Fiducial", "Line"):
+        refuse(f"markup of type {str(kind)[:40]!r}", where, _MARKUPS_ALLOWED)
+    if not isinstance(points, list) or not points:
+        refuse("no control point", where, _MARKUPS_ALLOWED)
+    if kind == "Line" and len(points) != _LINE_POINTS:
+        refuse(f"a line of {len(points)} control points", where, "both ends of a line: 2 control points")
+    return points
+
+
+def read_fcsv_points(data: bytes, where: str) -> RawPoints:
+    """The points of an older Slicer fiducial list, which is in mm by its definition.
+
+    Args:
+        data: The whole file.
+        where: Its name, for the error.
+
+    Raises:
+        InputError: If it states no known space or columns, or a line is not understood.
+    """
+    lines = decode_text(data, where).splitlines()
+    system, header = _fcsv_value(lines, _FCSV_SYSTEM), _fcsv_value(lines, _FCSV_COLUMNS)
+    columns = [] if header is None else [name.strip() for name in header.split(",")]
+    if any(columns.count(name) != 1 for name in ("x", "y", "z", "label")):
+        refuse(f"columns {columns}", where, _FCSV_ALLOWED)
+    names, points = [], []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        place = f"{where}, line {number}"
+        fields = _fcsv_fields(line, place)
+        if len(fields) - len(columns) not in (0, 2):
+            refuse(f"{len(fields)} fields instead of {len(columns)}", place, _FCSV_ALLOWED)
+        if (status := (*fields, _FCSV_DEFINED)[len(columns)]) != _FCSV_DEFINED:
+            refuse(f"position status {status[:40]!r}", place, f"{_FCSV_DEFINED} (defined)")
+        names.append(fields[columns.index("label")].strip())
+        x, y, z = (parse_coordinate(fields[columns.index(axis)], place) for axis in "xyz")
+        points.append((x, y, z))
+    return RawPoints(names, points, Unit.MM, _space(system, where))
+
+
+def _space(value: object, where: str) -> Space:
+    key = str(value).strip() if isinstance(value, (str, int)) and not isinstance(value, bool) else ""
+    if key not in _SPACES:
+        refuse(f"coordinate system {str(value)[:40]!r}", where, "LPS or RAS (in older files 1 or 0)")
+    return _SPACES[key]
+
+
+def _slicer_unit(value: object, where: str) -> Unit:
+    """From "mm", or a coded entry such as ["mm", "UCUM", "millimeter"]; mm, the schema's default, if there is none."""
+    if value is None:
+        return Unit.MM
+    text = value[0] if isinstance(value, list) and value else value
+    if not isinstance(text, str):
+        refuse(f"coordinateUnits {str(value)[:40]!r}", where, 'such as "mm" or ["mm", "UCUM", "millimeter"]')
+    return parse_unit(text, where=where)
+
+
+def _label(point: object, where: str) -> str:
+    label = point.get("label") if isinstance(point, dict) else None
+    if not isinstance(label, str) or not label.strip():
+        refuse(f"label {str(label)[:40]!r}", where, "a label that is not empty")
+    return label.strip()
+
+
+def _position(point: dict[str, Any], where: str) -> tuple[float, float, float]:
+    status = point.get("positionStatus", "defined")
+    if status != "defined":
+        refuse(f"positionStatus is {str(status)[:40]!r}", where, '"defined"')
+    position = point.get("position")
+    if not isinstance(position, list) or len(position) != 3:
+        refuse(f"position {str(position)[:60]!r}", where, "three numbers")
+    for value in position:
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            refuse(f"position {str(position)[:60]!r}", where, "three numbers")
+    x, y, z = (parse_coordinate(str(value), where) for value in position)
+    return x, y, z
+
+
+def _fcsv_value(lines: list[str], key: str) -> str | None:
+    found = [line.partition("=")[2].strip() for line in lines if line.lower().startswith(key)]
+    return found[0] if len(found) == 1 else None
+
+
+def _fcsv_fields(line: str, where: str) -> list[str]:
+    try:
+        return next(csv.reader([line], strict=True))
+    except csv.Error as error:
+        raise InputError(f"{error}", where=where, allowed=_FCSV_ALLOWED) from error
+
+
+_READERS: Mapping[str, Callable[[bytes, str], RawPoints]] = MappingProxyType(
+    {".csv": read_csv_points, ".mrk.json": read_markups_points, ".fcsv": read_fcsv_points}
+)
+
 AngleUnit = Literal["rad", "deg"]
 
 JOINTS_DEG = tuple(f"q{number}_deg" for number in range(1, 7))
+
 JOINTS_RAD = tuple(f"q{number}_rad" for number in range(1, 7))
+
 RTDE_JOINTS = tuple(f"actual_q_{number}" for number in range(6))
+
 RTDE_TOOL = tuple(f"actual_TCP_pose_{number}" for number in range(3))
 """Where the controller has its tool, m, base frame."""
+
 TIMES = ("time_s", "timestamp")
 
 MOST_RAD = np.radians([363.0, 363.0, 363.0, 363.0, 363.0, 720.0])
@@ -434,6 +444,7 @@ MOST_RAD = np.radians([363.0, 363.0, 363.0, 363.0, 363.0, 720.0])
 
 WHOLE_TURN = 2.0 * np.pi + 0.05
 """Six angles that all lie within it are none in degrees: an arm that lies stretched out, or radians."""
+
 _ALLOWED_JOINTS = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actual_q_0 to actual_q_5, one row a pose"
 
 

@@ -37,11 +37,80 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
-SERIES_END = 1e-8
-"""The series stops where what is left of its weights, which add up to 1, is smaller."""
 
-MOST_TERMS = 20_000
-"""Enough for standard deviations of a ratio of 30; what is left then is not counted, so that P is never too large."""
+@dataclass(frozen=True, eq=False)
+class HitModel:
+    """When a tip hits: within a radius of the target, or within its mesh.
+
+    Attributes:
+        radius_mm: Where a case gives one.
+        rays: The target's mesh, else.
+    """
+
+    radius_mm: float | None
+    rays: TargetRays | None
+
+    def chance(self, error: PoseError, cov_ct: Floats, surface_mm: float = 0.0) -> Floats:
+        """The chance of needles with these Sigma6, shape (n, 6, 6), CT axes, in a mesh that may lie off: shape (n,)."""
+        if self.rays is None or self.radius_mm is not None:
+            assert self.radius_mm is not None
+            return hit_in_ball(cov_ct[:, :3, :3] + error.target_covariance_ct, self.radius_mm, error.freedom)
+        return hit_in_mesh(self.rays, np.ascontiguousarray(cov_ct[:, :3, :3]), error.freedom, surface_mm)
+
+
+def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:
+    """By the radius where there is one, else by the mesh of the target's structure."""
+    return HitModel(radius_mm, None if radius_mm is not None else target_rays(mesh, target_ct))
+
+
+def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Floats:
+    """The chance that the tip is within a radius of the intended point.
+
+    Args:
+        cov: Shape (n, 3, 3), mm^2, of tip against that point, any frame.
+        radius_mm: The radius.
+        freedom: Degrees of the errors' size, where the residuals gave it.
+
+    Returns:
+        Shape (n,).
+    """
+    values = np.asarray(np.linalg.eigvalsh(cov) + LEAST_VARIANCE, dtype=np.float64)
+    if freedom is None:
+        return chance_within(values, np.full((len(cov), 1), radius_mm))[:, 0]
+    parts = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    radii = radius_mm * np.sqrt(chdtri(freedom, parts) / freedom)
+    return np.asarray(chance_within(values, np.broadcast_to(radii, (len(cov), QUANTILES))).mean(axis=1))
+
+
+def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) -> float:
+    """Radius about the intended point within which the tip ends with a chance, mm: the inverse of `hit_in_ball`.
+
+    Args:
+        cov: Shape (3, 3), mm^2, of tip against that point, any frame.
+        chance: Below 1.
+        freedom: Degrees of the errors' size, where the residuals gave it.
+    """
+    size = float(np.sqrt(np.trace(cov)))
+    if size == 0.0:
+        return 0.0
+    high = size
+    while hit_in_ball(cov[None], high, freedom)[0] < chance:
+        high *= 2.0
+    return float(
+        brentq(lambda radius: hit_in_ball(cov[None], radius, freedom)[0] - chance, 0.0, high, xtol=1e-4 * size)
+    )
+
+
+def _with_unknown_size(rays: TargetRays, inverse: Floats, freedom: int) -> Floats:
+    squares = np.einsum("ia,nab,ib->ni", rays.directions, inverse, rays.directions)
+    weights = squares**-1.5
+    within = fdtr(3, freedom, rays.depth**2 * squares[:, rays.ray] / 3)
+    found = (rays.sign * np.sign(rays.depth) * within * weights[:, rays.ray]).sum(axis=1) / weights.sum(axis=1)
+    return np.asarray(np.clip(found, 0.0, 1.0))
+
+
+QUANTILES = 64
+"""Of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
 
 
 def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
@@ -61,6 +130,13 @@ def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
     chances = np.empty(radii.shape)
     _ruben(np.sort(eigenvalues, axis=1), np.ascontiguousarray(radii, dtype=np.float64) ** 2, chances)
     return chances
+
+
+SERIES_END = 1e-8
+"""The series stops where what is left of its weights, which add up to 1, is smaller."""
+
+MOST_TERMS = 20_000
+"""Enough for standard deviations of a ratio of 30; what is left then is not counted, so that P is never too large."""
 
 
 @nb.njit(cache=True)
@@ -93,31 +169,6 @@ def _series(weight, e1, e2, x):  # type: ignore[no-untyped-def]
     return min(max(total, 0.0), 1.0)
 
 
-DIRECTIONS = 512
-"""Directions for a mesh, spread evenly: against a million draws P errs by .001, for axis ratios of 10 by .004."""
-
-QUANTILES = 64
-"""Of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
-
-TABLE_STEPS = 256
-"""Steps of the table of F3 per standard deviation: straight lines between err by 2e-6."""
-
-ROOT_HALF = math.sqrt(0.5)
-ROOT_TWO_OVER_PI = math.sqrt(2.0 / math.pi)
-
-LEAST_VARIANCE = 1e-12
-"""mm^2, added to every axis, and to areas: what cannot happen must not divide by zero."""
-
-SURFACES = 32
-"""Of a surface that lies off, at the middles of equal chances: however sharply it decides, P errs by half of one."""
-
-GRAZING = 0.2
-"""Least cosine between ray and normal: a crossing that a surface moves farther than this says is not moved by it."""
-
-ROWS_AT_ONCE = 512
-"""Covariances at once: a table of rows times crossings stays below some MB."""
-
-
 @dataclass(frozen=True, eq=False)
 class TargetRays:
     """A target's mesh as its point sees it.
@@ -137,6 +188,10 @@ class TargetRays:
     moved: Floats | None = None
 
 
+DIRECTIONS = 512
+"""Directions for a mesh, spread evenly: against a million draws P errs by .001, for axis ratios of 10 by .004."""
+
+
 def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     """Cast the directions once; the mesh is closed."""
     directions = _fibonacci(DIRECTIONS)
@@ -150,17 +205,13 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     return TargetRays(directions, found.ray, found.depth, sign, sign / np.maximum(facing, GRAZING))
 
 
-def _areas(mesh: TriangleMesh) -> Floats:
-    """Normals of the faces as long as twice their areas, shape (m, 3)."""
-    a, b, c = np.moveaxis(mesh.triangles.reshape(-1, 3, 3), 1, 0)
-    return np.asarray(np.cross(b - a, c - a))
-
-
-def mean_over_faces(mesh: TriangleMesh, cov: Floats) -> float:
-    """Standard deviation along the normals, as the root of the mean of n' S n over a surface, S (3, 3)."""
-    area = _areas(mesh)
-    size = np.linalg.norm(area, axis=1)
-    return float(np.sqrt(np.einsum("ma,ab,mb->", area / (size[:, None] + LEAST_VARIANCE), cov, area) / size.sum()))
+def _fibonacci(count: int) -> Floats:
+    """Unit vectors spread evenly over the ball, shape (n, 3)."""
+    number = np.arange(count)
+    z = 1 - (2 * number + 1) / count
+    angle = number * np.pi * (3 - np.sqrt(5))
+    across = np.sqrt(1 - z**2)
+    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
@@ -206,6 +257,37 @@ def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, su
     return np.concatenate([np.empty(0), *(_with_unknown_size(rays, part, freedom) for part in parts)])
 
 
+SURFACES = 32
+"""Of a surface that lies off, at the middles of equal chances: however sharply it decides, P errs by half of one."""
+
+GRAZING = 0.2
+"""Least cosine between ray and normal: a crossing that a surface moves farther than this says is not moved by it."""
+
+ROWS_AT_ONCE = 512
+"""Covariances at once: a table of rows times crossings stays below some MB."""
+
+LEAST_VARIANCE = 1e-12
+"""mm^2, added to every axis, and to areas: what cannot happen must not divide by zero."""
+
+
+def mean_over_faces(mesh: TriangleMesh, cov: Floats) -> float:
+    """Standard deviation along the normals, as the root of the mean of n' S n over a surface, S (3, 3)."""
+    area = _areas(mesh)
+    size = np.linalg.norm(area, axis=1)
+    return float(np.sqrt(np.einsum("ma,ab,mb->", area / (size[:, None] + LEAST_VARIANCE), cov, area) / size.sum()))
+
+
+def _areas(mesh: TriangleMesh) -> Floats:
+    """Normals of the faces as long as twice their areas, shape (m, 3)."""
+    a, b, c = np.moveaxis(mesh.triangles.reshape(-1, 3, 3), 1, 0)
+    return np.asarray(np.cross(b - a, c - a))
+
+
+ROOT_HALF = math.sqrt(0.5)
+
+ROOT_TWO_OVER_PI = math.sqrt(2.0 / math.pi)
+
+
 @nb.njit(cache=True, error_model="numpy")
 def _directional(x, y, z, ray, depth, sign, table, inverse, chances):  # type: ignore[no-untyped-def]  # numba infers
     """The sum of the module's first equation, row by row."""
@@ -225,91 +307,15 @@ def _directional(x, y, z, ray, depth, sign, table, inverse, chances):  # type: i
         chances[row] = min(max(within / weights.sum(), 0.0), 1.0)
 
 
+TABLE_STEPS = 256
+"""Steps of the table of F3 per standard deviation: straight lines between err by 2e-6."""
+
+
 @cache
 def _length_table() -> Floats:
     """F3 at steps of 1 / `TABLE_STEPS`, up to where it is 1."""
     t = np.arange(9 * TABLE_STEPS + 1) / TABLE_STEPS
     return np.asarray(erf(t * ROOT_HALF) - ROOT_TWO_OVER_PI * t * np.exp(-0.5 * t * t))
-
-
-def _with_unknown_size(rays: TargetRays, inverse: Floats, freedom: int) -> Floats:
-    squares = np.einsum("ia,nab,ib->ni", rays.directions, inverse, rays.directions)
-    weights = squares**-1.5
-    within = fdtr(3, freedom, rays.depth**2 * squares[:, rays.ray] / 3)
-    found = (rays.sign * np.sign(rays.depth) * within * weights[:, rays.ray]).sum(axis=1) / weights.sum(axis=1)
-    return np.asarray(np.clip(found, 0.0, 1.0))
-
-
-def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Floats:
-    """The chance that the tip is within a radius of the intended point.
-
-    Args:
-        cov: Shape (n, 3, 3), mm^2, of tip against that point, any frame.
-        radius_mm: The radius.
-        freedom: Degrees of the errors' size, where the residuals gave it.
-
-    Returns:
-        Shape (n,).
-    """
-    values = np.asarray(np.linalg.eigvalsh(cov) + LEAST_VARIANCE, dtype=np.float64)
-    if freedom is None:
-        return chance_within(values, np.full((len(cov), 1), radius_mm))[:, 0]
-    parts = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    radii = radius_mm * np.sqrt(chdtri(freedom, parts) / freedom)
-    return np.asarray(chance_within(values, np.broadcast_to(radii, (len(cov), QUANTILES))).mean(axis=1))
-
-
-def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) -> float:
-    """Radius about the intended point within which the tip ends with a chance, mm: the inverse of `hit_in_ball`.
-
-    Args:
-        cov: Shape (3, 3), mm^2, of tip against that point, any frame.
-        chance: Below 1.
-        freedom: Degrees of the errors' size, where the residuals gave it.
-    """
-    size = float(np.sqrt(np.trace(cov)))
-    if size == 0.0:
-        return 0.0
-    high = size
-    while hit_in_ball(cov[None], high, freedom)[0] < chance:
-        high *= 2.0
-    return float(
-        brentq(lambda radius: hit_in_ball(cov[None], radius, freedom)[0] - chance, 0.0, high, xtol=1e-4 * size)
-    )
-
-
-def _fibonacci(count: int) -> Floats:
-    """Unit vectors spread evenly over the ball, shape (n, 3)."""
-    number = np.arange(count)
-    z = 1 - (2 * number + 1) / count
-    angle = number * np.pi * (3 - np.sqrt(5))
-    across = np.sqrt(1 - z**2)
-    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
-
-
-@dataclass(frozen=True, eq=False)
-class HitModel:
-    """When a tip hits: within a radius of the target, or within its mesh.
-
-    Attributes:
-        radius_mm: Where a case gives one.
-        rays: The target's mesh, else.
-    """
-
-    radius_mm: float | None
-    rays: TargetRays | None
-
-    def chance(self, error: PoseError, cov_ct: Floats, surface_mm: float = 0.0) -> Floats:
-        """The chance of needles with these Sigma6, shape (n, 6, 6), CT axes, in a mesh that may lie off: shape (n,)."""
-        if self.rays is None or self.radius_mm is not None:
-            assert self.radius_mm is not None
-            return hit_in_ball(cov_ct[:, :3, :3] + error.target_covariance_ct, self.radius_mm, error.freedom)
-        return hit_in_mesh(self.rays, np.ascontiguousarray(cov_ct[:, :3, :3]), error.freedom, surface_mm)
-
-
-def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:
-    """By the radius where there is one, else by the mesh of the target's structure."""
-    return HitModel(radius_mm, None if radius_mm is not None else target_rays(mesh, target_ct))
 
 
 @dataclass(frozen=True, eq=False)

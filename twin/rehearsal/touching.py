@@ -76,6 +76,7 @@ PAD_N_M = 1e5
 """Stiffness of a marker on skin; a rigid one's first peak would be momentum over the time step."""
 
 PAD_MM = (12.0, 12.0, 4.0)
+
 MOST_ASIDE_MM = 10.0
 """A marker that lies farther from its believed place is not the one that was planned to be touched."""
 
@@ -84,6 +85,93 @@ LOOK_EVERY = 8
 
 PAUSE_S = 0.25
 """Before motors and torques take over from one another."""
+
+
+@dataclass(frozen=True, eq=False)
+class Touched:
+    """Readings of all touches, in their order.
+
+    Attributes:
+        readings: One a marker that was felt.
+        failed: Marker to why it was not read, in words.
+        seconds: Home to home; where the arm stopped, of the touches before that.
+    """
+
+    readings: tuple[TouchReading, ...]
+    failed: Mapping[str, str]
+    seconds: float
+
+
+def execute_touches(
+    tour: TouchTour, case: Case, anatomy: Anatomy, checkers: ApproachCheckers, truth: TouchTruth, progress: Count
+) -> Touched:
+    """Touch the markers at their true places. The same tour and truth give the same numbers.
+
+    A marker that is not felt where it should be is given up with its reason, and the arm goes on from its standoff.
+    Where the arm or needle touched something else it stops, and what was not read by then stays unread.
+
+    Args:
+        tour: Where, in which order, by which motions.
+        case: For tool, boxes and gravity.
+        anatomy: For the skin.
+        checkers: Of the workcell as it is believed: a line moved at the standoff is checked again.
+        truth: All randomness but the force sensor's is in it, and that comes from its seed.
+        progress: Called with touches done and all of them.
+    """
+    tool, T = case_tool(case), truth.T_base_ct
+    down_ct = -bed_frame(case)[:3, 2]
+    with (
+        open_workcell(tour.model, tool, anatomy.skin.mesh, T, case_boxes(case, T), down_ct=down_ct) as workcell,
+        rigid_model(tour.model, tool, T[:3, :3] @ down_ct) as rigid,
+    ):
+        true = CellChecker(tour.model, tool, patient=patient_surface(anatomy).transformed(T))
+        cell = TouchingCell(workcell, rigid, tour, truth, checkers, true, np.random.default_rng([truth.seed, 1]))
+        workcell.arm.place(tour.touches[0].come.q[0])
+        return _tour(cell, progress)
+
+
+def _tour(cell: TouchingCell, progress: Count) -> Touched:
+    """Touch every marker, and go home."""
+    readings: list[TouchReading] = []
+    failed: dict[str, str] = {}
+    touches, seconds = cell.tour.touches, 0.0
+    try:
+        for number, touch in enumerate(touches):
+            found = touch_marker(cell, touch)
+            if isinstance(found, FailedTouch):
+                failed[touch.name] = found.why
+            else:
+                readings.append(found)
+            seconds += found.seconds
+            progress(number + 1, len(touches))
+        seconds += seconds_of(moved_outside(cell, cell.tour.leave, np.zeros(6)))
+    except StoppedError as stop:
+        done = {one.name for one in readings} | set(failed)
+        failed |= {touch.name: f"the tour was stopped: {stop}" for touch in touches if touch.name not in done}
+    return Touched(tuple(readings), failed, seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class TouchingCell:
+    """Workcell, tool and generators of every touch.
+
+    Attributes:
+        workcell: The simulated workcell.
+        rigid: The arm's masses as its controller knows them.
+        tour: The touches.
+        truth: The ground truth.
+        checkers: Of the workcell as it is believed.
+        true: Of the needle against the patient at their true pose.
+        rng: Of the force sensor's noise.
+    """
+
+    workcell: SimulatedWorkcell
+    rigid: RigidModel
+    tour: TouchTour
+    truth: TouchTruth
+    checkers: ApproachCheckers
+    true: CellChecker
+    rng: np.random.Generator
 
 
 class TouchReading(NamedTuple):
@@ -117,27 +205,24 @@ class StoppedError(Exception):
     """The arm stopped where it had no planned path: something is not where it is believed to be."""
 
 
-@dataclass(frozen=True, eq=False)
-class TouchingCell:
-    """Workcell, tool and generators of every touch.
+def touch_marker(cell: TouchingCell, touch: Touch) -> TouchReading | FailedTouch:
+    """One marker: come, set the line, feel, read, go back to the standoff.
 
-    Attributes:
-        workcell: The simulated workcell.
-        rigid: The arm's masses as its controller knows them.
-        tour: The touches.
-        truth: The ground truth.
-        checkers: Of the workcell as it is believed.
-        true: Of the needle against the patient at their true pose.
-        rng: Of the force sensor's noise.
+    Args:
+        cell: The workcell, the arm at the last standoff or at home.
+        touch: As planned.
+
+    Raises:
+        StoppedError: The arm touched what it should not.
     """
-
-    workcell: SimulatedWorkcell
-    rigid: RigidModel
-    tour: TouchTour
-    truth: TouchTruth
-    checkers: ApproachCheckers
-    true: CellChecker
-    rng: np.random.Generator
+    line = _line(cell, touch)
+    if isinstance(line, str):
+        return FailedTouch(line, seconds_of(moved_outside(cell, touch.come, cell.truth.arrival[touch.name])))
+    pad = _pad(cell, line)
+    try:
+        return _touched_and_read(cell, touch, line)
+    finally:
+        remove(cell.workcell.client, pad)
 
 
 class _Line(NamedTuple):
@@ -174,26 +259,6 @@ def _line(cell: TouchingCell, touch: Touch) -> _Line | str:
         return f"on the line that was set at the standoff {refused}"
     face = nominal_tip(model, tip_mm, q + cell.truth.arrival[touch.name])
     return _Line(far, near, face, flange_pose(model, q + cell.truth.arrival[touch.name])[:3, 2], aside)
-
-
-def touch_marker(cell: TouchingCell, touch: Touch) -> TouchReading | FailedTouch:
-    """One marker: come, set the line, feel, read, go back to the standoff.
-
-    Args:
-        cell: The workcell, the arm at the last standoff or at home.
-        touch: As planned.
-
-    Raises:
-        StoppedError: The arm touched what it should not.
-    """
-    line = _line(cell, touch)
-    if isinstance(line, str):
-        return FailedTouch(line, seconds_of(moved_outside(cell, touch.come, cell.truth.arrival[touch.name])))
-    pad = _pad(cell, line)
-    try:
-        return _touched_and_read(cell, touch, line)
-    finally:
-        remove(cell.workcell.client, pad)
 
 
 def _touched_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchReading | FailedTouch:
@@ -327,67 +392,3 @@ def _refuse_contacts(cell: TouchingCell) -> None:
 def seconds_of(done: Run) -> float:
     """Duration of a motion, s."""
     return done.dt * len(done.q)
-
-
-@dataclass(frozen=True, eq=False)
-class Touched:
-    """Readings of all touches, in their order.
-
-    Attributes:
-        readings: One a marker that was felt.
-        failed: Marker to why it was not read, in words.
-        seconds: Home to home; where the arm stopped, of the touches before that.
-    """
-
-    readings: tuple[TouchReading, ...]
-    failed: Mapping[str, str]
-    seconds: float
-
-
-def execute_touches(
-    tour: TouchTour, case: Case, anatomy: Anatomy, checkers: ApproachCheckers, truth: TouchTruth, progress: Count
-) -> Touched:
-    """Touch the markers at their true places. The same tour and truth give the same numbers.
-
-    A marker that is not felt where it should be is given up with its reason, and the arm goes on from its standoff.
-    Where the arm or needle touched something else it stops, and what was not read by then stays unread.
-
-    Args:
-        tour: Where, in which order, by which motions.
-        case: For tool, boxes and gravity.
-        anatomy: For the skin.
-        checkers: Of the workcell as it is believed: a line moved at the standoff is checked again.
-        truth: All randomness but the force sensor's is in it, and that comes from its seed.
-        progress: Called with touches done and all of them.
-    """
-    tool, T = case_tool(case), truth.T_base_ct
-    down_ct = -bed_frame(case)[:3, 2]
-    with (
-        open_workcell(tour.model, tool, anatomy.skin.mesh, T, case_boxes(case, T), down_ct=down_ct) as workcell,
-        rigid_model(tour.model, tool, T[:3, :3] @ down_ct) as rigid,
-    ):
-        true = CellChecker(tour.model, tool, patient=patient_surface(anatomy).transformed(T))
-        cell = TouchingCell(workcell, rigid, tour, truth, checkers, true, np.random.default_rng([truth.seed, 1]))
-        workcell.arm.place(tour.touches[0].come.q[0])
-        return _tour(cell, progress)
-
-
-def _tour(cell: TouchingCell, progress: Count) -> Touched:
-    """Touch every marker, and go home."""
-    readings: list[TouchReading] = []
-    failed: dict[str, str] = {}
-    touches, seconds = cell.tour.touches, 0.0
-    try:
-        for number, touch in enumerate(touches):
-            found = touch_marker(cell, touch)
-            if isinstance(found, FailedTouch):
-                failed[touch.name] = found.why
-            else:
-                readings.append(found)
-            seconds += found.seconds
-            progress(number + 1, len(touches))
-        seconds += seconds_of(moved_outside(cell, cell.tour.leave, np.zeros(6)))
-    except StoppedError as stop:
-        done = {one.name for one in readings} | set(failed)
-        failed |= {touch.name: f"the tour was stopped: {stop}" for touch in touches if touch.name not in done}
-    return Touched(tuple(readings), failed, seconds)
