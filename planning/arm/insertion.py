@@ -76,14 +76,14 @@ FULL_MARGIN_RAD = math.pi / 2
 
 
 class InsertionStop(NamedTuple):
-    """Where a path along the needle ends, and why."""
+    """End of a path along the needle, and its reason."""
 
     depth_mm: float
     detail: str
 
 
 def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop | None:
-    """Where a path stops being feasible: out of reach, at a singularity, or with a joint that jumps; None if nowhere.
+    """First sample at which a path is not feasible: out of reach, singular, or a joint jumps; None if none.
 
     Args:
         model: The arm.

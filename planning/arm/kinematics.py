@@ -228,7 +228,7 @@ ELBOW = 2
 """The row of `link_poses` whose origin is the elbow: where the upper arm ends."""
 
 ELBOW_DIGITS = 6
-"""The same of its place, mm: it does not move with the roll."""
+"""Decimals of the elbow's place, mm: it does not move with the roll."""
 
 
 class Singularity(NamedTuple):
@@ -319,23 +319,24 @@ class SpeedLimits(NamedTuple):
     """Speed limits that a case allows, and its plan keeps. The names are the keys of ``[robot]``."""
 
     tip_speed_mm_s: float = 250.0
-    """Of the needle's tip, on the approach: what ISO 10218-1 calls reduced speed."""
+    """Speed of the needle's tip on the approach: what ISO 10218-1 calls reduced speed."""
 
     insertion_speed_mm_s: float = 10.0
-    """Of the tip, along the insertion: a needle is inserted slowly, and an operator must be able to stop it."""
+    """Speed of the tip along the insertion: a needle is inserted slowly, and an operator must be able to stop it."""
 
     joint_speed_fraction: float = 0.5
-    """Of each joint's highest speed, as MoveIt's velocity scaling."""
+    """Fraction of each joint's highest speed, as MoveIt's velocity scaling."""
 
     joint_acceleration_fraction: float = 1.0
-    """Of each joint's highest acceleration, as MoveIt's acceleration scaling."""
+    """Fraction of each joint's highest acceleration, as MoveIt's acceleration scaling."""
 
 
 DEFAULT_SPEEDS = SpeedLimits()
 """Where nobody says how fast."""
 
 HIGHEST = SpeedLimits(1000.0, 100.0, 1.0, 1.0)
-"""That a case may ask for: a UR's usual tool speed, a needle that is pushed briskly, and all that the joints can."""
+"""The highest speeds that a case may state: a UR's usual tool speed, a needle that is pushed briskly, and all that the
+joints can."""
 
 
 def slowed(model: UrModel, speeds: SpeedLimits) -> UrModel:

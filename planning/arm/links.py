@@ -38,7 +38,7 @@ the mesh itself never does; with these slabs 73.3 % of them are free against 73.
 
 
 PIN_RADIUS_MM = 10.0
-"""Of the pin that stands for a joint where the meshes leave a gap: well inside every link."""
+"""Radius of the pin that replaces a joint where the meshes leave a gap: well inside every link."""
 
 FLUSH_MM = 1e-4
 """Meshes that overlap along their joint's axis by less than this end in one plane: rounding says whether they touch."""
@@ -47,7 +47,7 @@ FLAT_MM = 0.05
 """Points that lie within such a sheet span no body: their hull would be one of rounding."""
 
 MOST_GAP_MM = 5.0
-"""Of an own URDF's shapes: the UR5's meshes leave 3 mm, and a mesh in another unit hundreds."""
+"""Gap between an own URDF's shapes, at most: the UR5's meshes leave 3 mm, and a mesh in another unit hundreds."""
 
 PIN_ROOT_MM = 5.0
 """How far such a pin reaches into the links at both sides."""
@@ -218,7 +218,7 @@ def _pin(low: float, high: float) -> TriangleMesh:
 
 
 def _crossings(starts: Floats, ends: Floats, axis: int, cut: float) -> Floats:
-    """Where edges (n, 3) to (n, 3) pass the plane ``axis = cut``, shape (k, 3), mm."""
+    """Points where edges (n, 3) to (n, 3) pass the plane ``axis = cut``, shape (k, 3), mm."""
     a, b = starts[:, axis], ends[:, axis]
     crosses = (a - cut) * (b - cut) < 0.0
     fraction = ((cut - a[crosses]) / (b[crosses] - a[crosses]))[:, None]

@@ -105,12 +105,12 @@ class Tool:
 
     @property
     def holder_span_mm(self) -> tuple[float, float]:
-        """Where the holder's body begins and ends on the flange's z axis, mm."""
+        """Start and end of the holder's body on the flange's z axis, mm."""
         return (-HOLDER_ROOT_MM, self.holder_length_mm)
 
     @property
     def needle_span_mm(self) -> tuple[float, float]:
-        """Where the needle's body begins and ends on the flange's z axis, mm."""
+        """Start and end of the needle's body on the flange's z axis, mm."""
         return (self.holder_length_mm - NEEDLE_ROOT_MM, self.needle_length_mm)
 
 
@@ -156,7 +156,7 @@ class Box:
 
 
 SIDES = 24
-"""Of the polygon that stands for the bore: inscribed, so the bore is up to 0.9 % narrower than it is (3 mm of 350)."""
+"""Sides of the polygon of the bore: inscribed, so the bore is up to 0.9 % narrower than it is (3 mm of 350)."""
 
 
 def gantry_boxes(

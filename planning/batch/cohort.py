@@ -274,7 +274,7 @@ def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
 
 
 def _matches(patterns: Sequence[str], path: Path) -> list[str]:
-    """What the patterns match, each once, in the order of the patterns."""
+    """Matches of the patterns, each once, in the order of the patterns."""
     found: dict[str, None] = {}
     for pattern in patterns:
         matches = sorted(glob.glob(pattern, root_dir=path.parent, recursive=True))  # noqa: PTH207  # absolute ones too

@@ -156,7 +156,7 @@ def _started(task: CaseTask, limits: Limits) -> _Worker:
 
 @contextmanager
 def _without_interrupt() -> Iterator[None]:
-    """What is started here never sees Ctrl-C: the main process ends it."""
+    """Start processes that never see Ctrl-C: the main process ends them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

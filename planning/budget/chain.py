@@ -117,7 +117,7 @@ class Breath:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """What ties a target in the CT to a needle's tip.
+    """The chain from a target in the CT to a needle's tip: registration, arm, errors.
 
     Attributes:
         model: The arm.

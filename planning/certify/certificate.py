@@ -336,7 +336,7 @@ def _range(values: Any) -> tuple[float, float]:
 
 
 UNDECIDED_COLOUR: Rgb = (255, 255, 255)
-"""Of cells that are too small to say: neither a safe colour nor a reason's."""
+"""Colour of cells that are too small to decide: neither a safe colour nor a reason's."""
 
 
 @never_raises

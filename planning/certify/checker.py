@@ -308,7 +308,7 @@ def _before_own_plane(corners: Floats, limit: Floats, cell: _Cell, length: Float
 
 
 def _separated(corners: Floats, depth: Floats, limit: Floats, aside: Floats, cell: _Cell) -> Bools:
-    """Where m·v <= 0 for every direction v of the cell and m·p >= limit for the corners p; m is ``aside``, tilted."""
+    """Whether m·v <= 0 for every direction v of the cell and m·p >= limit for the corners p; m is ``aside``, tilted."""
     normal, ahead = _unit(aside), cell.corners @ cell.u
     tilt = np.full(len(corners), np.tan(cell.rho))
     if ahead.min() > cell.bulge:

@@ -21,7 +21,7 @@ EDGE_ON = 0.9e-10
 
 @dataclass(frozen=True, eq=False)
 class SkinFacts:
-    """What holds for every ray of one cone; see `puncture_twin.planning.certify.skin_cones.SkinBounds`."""
+    """Facts of the skin for every ray of a cone; see `puncture_twin.planning.certify.skin_cones.SkinBounds`."""
 
     count: int
     cut: bool

@@ -253,7 +253,7 @@ class Tiles:
     chord: Floats
 
     def parts(self, most: int) -> list[Tiles]:
-        """The same bundles in at most so many runs of about as many each, none below ``LEAST_BUNDLES``."""
+        """The bundles in at most so many runs of about as many each, none below ``LEAST_BUNDLES``."""
         count = max(1, min(most, len(self.middle) // LEAST_BUNDLES))
         edges = np.linspace(0, len(self.middle), count + 1).astype(int)
         return [self._run(low, high) for low, high in itertools.pairwise(edges)]

@@ -243,11 +243,11 @@ def padded(mesh: TriangleMesh, padding_mm: float) -> TriangleMesh:
 
 
 PRISM_SIDES = 24
-"""Of the prism about a cylinder: 0.9 % fuller than it."""
+"""Sides of the prism about a cylinder: 0.9 % fuller than it."""
 
 
 FINE_SIDES = 96
-"""Of the prism about a cylinder that is held against triangles: 0.05 % fuller than it."""
+"""Sides of the prism about a cylinder that is tested against triangles: 0.05 % fuller than it."""
 
 
 def prism(radius_mm: float, length_mm: float, sides: int = PRISM_SIDES) -> Floats:
@@ -269,7 +269,7 @@ SLACK_MM = 1e-6
 """Every sphere is larger by this: covers the rounding of cuts and of the hull's edges (about 1e-12 mm)."""
 
 CENTRE_STEPS = 25
-"""Of the walk to a sphere's centre; how good it is decides how tight the sphere is, never whether it encloses."""
+"""Steps of the walk to a sphere's centre; how good it is decides how tight the sphere is, never whether it encloses."""
 
 LEAF_RADIUS_MM = 30.0
 """Parts are cut until their sphere is no larger: half of a UR3 wrist's size."""

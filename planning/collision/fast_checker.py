@@ -267,7 +267,7 @@ class SegmentChecker:
                 return touching
 
     def _touching(self, start: Floats, end: Floats, queries: int) -> Contact | None:
-        """What FCL finds first where so many queries are left to it."""
+        """First contact by FCL where so many queries are left to it."""
         answer = self._filled.answer
         where = answer.fractions[:queries].tolist(), answer.checks[:queries].tolist()
         for fraction, at in zip(*where, strict=True):

@@ -52,7 +52,8 @@ Axes = tuple[Floats, Floats, Floats]
 
 
 COARSE_DIRECTIONS = 60
-"""In which a coarse hull is as wide as the hull: 26 degrees apart, so a round body of 45 mm bulges out by 1.5 mm."""
+"""Directions in which a coarse hull is as wide as the hull: 26 degrees apart, so a round body of 45 mm bulges out by
+1.5 mm."""
 
 WORKCELL_FRAME = 0
 """The frame of what does not move: the base's."""
@@ -112,7 +113,7 @@ def inscribed_prism(corners: Floats) -> Floats:
 
 
 def row_starts(sizes: Sequence[int] | Ints) -> Ints:
-    """Where each row begins, and where the last ends, shape (n + 1,), of rows of given lengths."""
+    """Start of each row and end of the last, shape (n + 1,), of rows of given lengths."""
     return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]).astype(np.int64)
 
 
@@ -357,7 +358,7 @@ FIELD_MARGIN_MM = 500.0
 """How far around the skin distances are kept: beyond, they are seldom needed."""
 
 MOST_CELLS = 4_000_000
-"""Of that field (16 MB): a larger skin gets a narrower margin."""
+"""Cells of that field at most (16 MB): a larger skin gets a narrower margin."""
 
 
 def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache) -> SkinTree:

@@ -137,7 +137,7 @@ class Proofs:
             yield divmod(at, len(self))
 
     def first_not_clear(self, frames: Floats, begins: Ints, tested: Bools, of_state: Ints) -> NotClear:
-        """Of each state by itself the first check that is not proven clear, at or after one.
+        """First check of each state that is not proven clear, at or after one.
 
         Args:
             frames: Shape (m, 7, 4, 4), mm.
@@ -172,7 +172,7 @@ JOINTS_BETWEEN = 2
 """Such pairs see two angles alone, whose square can be searched in full; a cube of three would take too long."""
 
 HALVINGS = 9
-"""Of the square of a whole turn each way: down to 0.7 deg, where a UR3's pieces move by about 2 mm."""
+"""Halvings of the square of a whole turn each way: down to 0.7 deg, where a UR3's pieces move by about 2 mm."""
 
 QUARTERS = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
 """Where the middles of a square's quarters lie, in half sides of the square."""

@@ -80,7 +80,7 @@ class StateChecker(Protocol):
 
     @property
     def tool(self) -> Tool:
-        """What the flange carries."""
+        """The tool on the flange."""
 
     @property
     def swept(self) -> SweptBodies:

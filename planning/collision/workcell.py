@@ -92,7 +92,7 @@ def _placing_key(case: Case) -> str:
 
 
 def home_configuration(case: Case) -> Floats:
-    """Where the arm waits, shape (6,), rad: the case's, or arm up and wrist down.
+    """Joints of the waiting arm, shape (6,), rad: the case's, or arm up and wrist down.
 
     Raises:
         InputError: It is beyond the arm's limits.
@@ -161,7 +161,7 @@ def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
 
 
 def _crossings(start: Floats, end: Floats, z: float) -> Floats:
-    """Where segments between points (n, 3) pass through the plane of a height, shape (m, 3)."""
+    """Points where segments between points (n, 3) pass through the plane of a height, shape (m, 3)."""
     passing = (start[:, 2] < z) != (end[:, 2] < z)
     a, b = start[passing], end[passing]
     return np.asarray(a + ((z - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a))

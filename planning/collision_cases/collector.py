@@ -41,10 +41,10 @@ from puncture_twin.planning.search.explain import Explanation, reason_text
 from puncture_twin.planning.search.windows import Windows, find_windows, nearest_row
 
 DIGIT = 0.1
-"""Of a tolerance: a rewritten number keeps the rest of it."""
+"""Fraction of a tolerance: a rewritten number keeps the rest of it."""
 
 LEAST_DIGIT_MM, CHANCE_DIGIT = 0.01, 0.01
-"""To which a rewritten least clearance (mm) and a rewritten chance (of itself) are rounded."""
+"""Steps of a rewritten least clearance (mm) and of a rewritten chance (relative)."""
 
 
 def direction_finding(check: CheckSection, found: Explanation) -> Finding:
@@ -109,7 +109,7 @@ def _number(new: NewNumber) -> NewNumber | None:
 
 
 DIGIT_SQUARE_DEG = 1.0
-"""To which a rewritten area is rounded."""
+"""Step of a rewritten area."""
 
 MOST_SHOWN = 6
 """Windows."""
@@ -246,7 +246,7 @@ class CollisionItem(pytest.Item):
         return True
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """What differs, in a few lines."""
+        """The differences, in a few lines."""
         if isinstance(excinfo.value, InputError):
             return Finding((Difference(str(excinfo.value)),)).text(self._table.expected.why)
         if isinstance(excinfo.value, CollisionMismatchError):

@@ -82,12 +82,12 @@ def write_changes(config: pytest.Config) -> bool:
 
 
 def rewritten_lines(config: pytest.Config) -> list[str]:
-    """What was rewritten, one line a number."""
+    """Lines on the rewritten numbers, one a number."""
     return session_of(config).lines
 
 
 ARM_PROPERTY = "arm"
-"""Of a test's report: it comes back from other processes too, and into JUnit's file."""
+"""Name of a property of a test's report: it comes back from other processes too, and into JUnit's file."""
 
 CHECKED = "checked"
 
@@ -257,7 +257,7 @@ class Finding:
     last: str = ""
 
     def text(self, why: str) -> str:
-        """What differs, why it was expected, and what was found, in `MOST_LINES` lines."""
+        """Differences, why other values were expected, and what was found, in `MOST_LINES` lines."""
         lines = [difference.line for difference in self.differences]
         if len(lines) > MOST_DIFFERENCES:
             lines[MOST_DIFFERENCES - 1 :] = [f"and {len(lines) - MOST_DIFFERENCES + 1} more that differ"]

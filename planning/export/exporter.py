@@ -38,7 +38,8 @@ SMALLEST_BLEND_MM = 1.0
 """Radii are halved down to this; then the arm stops at the waypoint."""
 
 LARGEST_FRACTION = 0.45
-"""Of each segment, so that two blends never meet: the controller skips a waypoint whose blend overlaps the next."""
+"""Fraction of each segment, so that two blends never meet: the controller skips a waypoint whose blend overlaps the
+next."""
 
 SAMPLES = 400
 """Along a segment, to find where the tip comes within the radius."""

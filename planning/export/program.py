@@ -37,7 +37,7 @@ STREAM_S = SAMPLE_S
 """Period of a streamed approach: that of a CB3 controller, and four of an e-Series one."""
 
 MOST_SAMPLES = 200_000
-"""Of one phase: 27 minutes of a stream. The straight move is looked at in no more steps, however slow it is."""
+"""Samples of one phase: 27 minutes of a stream. The straight move is checked in no more steps, however slow it is."""
 
 
 class JointMove(NamedTuple):
@@ -48,7 +48,7 @@ class JointMove(NamedTuple):
     speed: float
     """Peak speed of the joint that turns farthest, rad/s."""
     acceleration: float
-    """Of the same joint, rad/s^2."""
+    """Peak acceleration of the same joint, rad/s^2."""
     blend_mm: float
     """Radius about its end within which the tip may round the corner; 0 stops there."""
 

@@ -219,11 +219,12 @@ def _versor(v: Floats, where: str) -> Floats:
 
 
 MAX_STORED_BYTES = 4096
-"""Of one list of numbers: twelve doubles are 96; compressed ones cannot grow to more than a thousand times of this."""
+"""Bytes of one list of numbers: twelve doubles are 96; compressed ones cannot grow to more than a thousand times of
+this."""
 MAX_NUMBERS = 64
-"""Of one list: more than any linear transform has."""
+"""Numbers of one list: more than any linear transform has."""
 HEAP_HEAD_BYTES = 16
-"""Of a collection, and of each object in it."""
+"""Bytes of the head of a collection, and of each object in it."""
 _GROUP, _TYPE = "TransformGroup", "TransformType"
 _PARAMETERS = ("TransformParameters", "TranformParameters")
 _FIXED = ("TransformFixedParameters", "TranformFixedParameters")
@@ -282,7 +283,7 @@ def _own(h5py: Any, parent: Any, name: str, kind: type, where: str) -> Any:
 
 
 class _Members:
-    """What one transform's group holds."""
+    """The members of one transform's group."""
 
     def __init__(self, h5py: Any, group: Any, content: bytes, where: str) -> None:
         self._h5py, self._group, self._content, self._where = h5py, group, content, where

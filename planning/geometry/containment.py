@@ -178,7 +178,7 @@ SAME_CROSSING_MM = 1e-6
 """Crossings of one ray closer than this are one: the ray runs through an edge or a corner."""
 
 USUAL_CROSSINGS = 4
-"""Of a ray: room for so many is made before they are counted; where there are more, they are found once again."""
+"""Crossings of a ray that space is made for before they are counted; for more, they are computed once again."""
 
 CONE_SLACK = 1e-9
 """Radians by which a bounding cone is widened against rounding."""
@@ -357,7 +357,7 @@ def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _length(x, y, z):  # type: ignore[no-untyped-def]  # numba infers
-    """Of a vector."""
+    """Length of a vector."""
     return np.sqrt(x * x + y * y + z * z)
 
 

@@ -18,7 +18,7 @@ triangles given both ways round, or wound against each other, it keeps less: the
 
 
 def split_at_creases(mesh: TriangleMesh) -> TriangleMesh:
-    """The same surface with one vertex for each smooth fan of triangles about a point.
+    """A surface with one vertex for each smooth fan of triangles about a point.
 
     A normal that is blended from the triangles of a vertex then never mixes two sides of a box, and mixes the
     triangles of a smooth surface even where the file stores each with corners of its own (as STL does). The order of

@@ -32,7 +32,7 @@ NOT_HIGHER = 1 + 1e-12
 """A cost that rises by no more than rounding has not risen."""
 
 MOST_DAMPINGS = 30
-"""Of one step; from 1e-6 by tens, far beyond any step that moves the estimate."""
+"""Dampings of one step; from 1e-6 by tens, far beyond any step that moves the estimate."""
 
 UNSEEN = 1e-6
 """Relative length of a column outside of the model's own below which the data cannot show it."""
@@ -123,7 +123,7 @@ class _Normal(NamedTuple):
         return np.asarray(-self.axes @ (np.where(self.known, 1.0 / damped, 0.0) * self.pull))
 
     def gain(self) -> float:
-        """By how much the undamped step would lower the cost, were the problem linear."""
+        """Decrease of the cost by the undamped step, were the problem linear."""
         return float(np.sum(self.pull[self.known] ** 2 / self.values[self.known]))
 
 
@@ -153,13 +153,13 @@ class Lacking(NamedTuple):
     sd: Floats
     """Shape (k,): their standard deviations, by the residuals that they leave."""
     probability: float
-    """Of residuals that they explain so well, where all are zero: F(k, freedom)."""
+    """Chance of residuals that they explain so well, where all are zero: F(k, freedom)."""
     freedom: int
     """Residuals less p and k."""
     variance: float
-    """Of one residual, with them."""
+    """Variance of one residual, with them."""
     variance_without: float
-    """Of one residual, as the model without them has it."""
+    """Variance of one residual, in the model without them."""
 
 
 def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> Lacking | None:

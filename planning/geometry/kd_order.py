@@ -98,7 +98,7 @@ def _select(records, rows, sample, low, high, middle, axis):  # type: ignore[no-
 
 @nb.njit(cache=True, nogil=True)
 def _expected(records, sample, low, high, middle, axis):  # type: ignore[no-untyped-def]  # numba infers
-    """What a sample of a range, sorted by insertion, has where the middle is: one of the range's own values."""
+    """Median of a sample of a range, sorted by insertion: one of the range's own values."""
     many = min(MOST_SAMPLED, 3 + (high - low) // SAMPLED)
     step = (high - low) // many
     for k in range(many):

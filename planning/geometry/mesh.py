@@ -22,7 +22,7 @@ MIXED = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], n
 """Odd numbers without a pattern: weights of a place's coordinates, as bits, in a sum that tells nearly all apart."""
 
 BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-"""Of the unit cube about the origin, shape (8, 3)."""
+"""Corners of the unit cube about the origin, shape (8, 3)."""
 BOX_SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 """Its sides: corners in order, seen from outside to the left."""
 BOX_FACES = np.array([triangle for a, b, c, d in BOX_SIDES for triangle in ((a, b, c), (a, c, d))])
@@ -57,7 +57,7 @@ class TriangleMesh:
                 object.__setattr__(self, name, array)
 
     def known(self, *, closed: bool, wound_alike: bool) -> TriangleMesh:
-        """The same mesh, of which `closed` and `wound_alike` have been found before and need not be found again."""
+        """A mesh whose `closed` and `wound_alike` were found before and need not be found again."""
         vars(self).update(closed=closed, wound_alike=wound_alike)
         return self
 
@@ -142,7 +142,7 @@ class TriangleMesh:
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
     def transformed(self, T_b_a: NDArray[np.float64]) -> TriangleMesh:
-        """The same surface in frame b.
+        """The surface in frame b.
 
         Args:
             T_b_a: Shape (4, 4), maps coordinates of this mesh's frame a to frame b, mm.

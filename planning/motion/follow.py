@@ -34,14 +34,14 @@ STANDSTILL_RAD = 1e-12
 """A segment on which no joint turns farther is no motion: rounding."""
 
 SAME_STEP = 1e-9
-"""Of a sample: a duration that is a whole number of samples but for this is one."""
+"""Fraction of a sample: a duration that is a whole number of samples but for this is one."""
 
 TIP_STEP_RAD = 0.005
-"""Of the samples at which the tip's speed along a path is looked at; between two of them it rises by at most 5e-5 of
-what the arm's whole reach would have: h^2 / 8 times the second derivative."""
+"""rad between the samples at which the tip's speed along a path is computed; between two of them it rises by at most
+5e-5 of what the arm's whole reach would have: h^2 / 8 times the second derivative."""
 
 TIP_FRACTION = 0.999
-"""Of the tip's speed limit that is used: what samples may miss."""
+"""Fraction of the tip's speed limit that is used: what samples may miss."""
 
 TINY = 1e-30
 """Below every rate that means anything: keeps divisions finite."""
@@ -188,7 +188,7 @@ def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slo
 
 
 def _segment_rates(model: UrModel, start: Floats, end: Floats, slow: _Slow) -> Rates:
-    """What the limits of joints and tip allow along a segment."""
+    """Highest rates along a segment by the limits of joints and tip."""
     length = float(np.linalg.norm(end - start))
     direction = (end - start) / length
     fraction = np.maximum(np.abs(direction), TINY)
@@ -199,7 +199,7 @@ def _segment_rates(model: UrModel, start: Floats, end: Floats, slow: _Slow) -> R
 
 
 def _round_speed(model: UrModel, corner: Floats, before: Floats, after: Floats, cut: float, slow: _Slow) -> float:
-    """What acceleration, jerk and tip allow past a corner; 0 where the arm stops."""
+    """Highest speed past a corner by acceleration, jerk and tip; 0 where the arm stops."""
     if cut == 0.0:
         return 0.0
     turn = max(TINY, float(np.abs(after - before).max()))
@@ -310,7 +310,7 @@ LENGTH_SLACK = 1e-6
 """Share of a length to spare for a change of speed: without, ruckig's rounding may miss the fit and take a detour."""
 
 BISECTIONS = 60
-"""Of an interval of speeds: to rounding."""
+"""Bisections of an interval of speeds: to rounding."""
 
 
 class Rates(NamedTuple):
@@ -337,7 +337,7 @@ class TimeLaw(NamedTuple):
 
 
 def _positions(profile: Profile, times_s: Floats) -> Floats:
-    """Where a profile of one degree of freedom is at some times (m,); as ``at_time`` says, in one go.
+    """Positions of a profile of one degree of freedom at times (m,), as ``at_time`` has them.
 
     Within each of its pieces the jerk is constant. An arm that starts above its limits brakes before them; none here
     does, and ``at_time`` knows how.

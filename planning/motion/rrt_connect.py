@@ -253,7 +253,7 @@ def seeded(seed: int) -> Iterator[None]:
 
 
 ROUNDS = 2
-"""Of shortcuts."""
+"""Rounds of shortcuts."""
 
 STEPS = 60
 """Shortcuts tried in each round. By itself OMPL tries as many as the path has vertices: few where branches are long."""

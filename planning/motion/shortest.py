@@ -28,7 +28,7 @@ from puncture_twin.planning.geometry.rigid import apply, inverse
 from puncture_twin.planning.motion.rrt_connect import Connected, Limits, SegmentContact, connect
 
 MAX_SAMPLES = 8000
-"""Of the planner, in the first run; half of them near home and goals. Next to the body tens of them do, at a gantry
+"""Samples of the first run; half of them near home and goals. Next to the body tens of them do, at a gantry
 some hundred."""
 
 NEAR_RAD = math.pi
@@ -39,7 +39,7 @@ PATIENCE, LEAST_SAMPLES = 4, 500
 """A run for a shorter path gets so many times the samples that the first one took, or at least so many."""
 
 RUNS = 3
-"""Of the planner, while it might find a path that is much shorter; see ``SHORT_ENOUGH``."""
+"""Runs of the planner, while it might find a path that is much shorter; see ``SHORT_ENOUGH``."""
 
 SHORT_ENOUGH = 1.3
 """No run seeks a path shorter than one that is this many times as long as the straight line to the nearest goal."""
@@ -168,7 +168,7 @@ CELL_RAD = np.radians(5.0)
 """Largest width of a cell: at the elbow a turn by half of it moves a UR3's upper arm by 11 mm."""
 
 MOST_POINTS = 48
-"""Of the upper arm that are looked at."""
+"""Points of the upper arm that are tested."""
 
 SLACK_MM = 0.01
 """A point must lie deeper than it moves by this: rounding, and what FCL may take for no contact."""
@@ -200,14 +200,14 @@ class Cut:
 
     @property
     def text(self) -> str:
-        """What the upper arm would have to pass through: the boxes in the cells around those of home."""
+        """Boxes that the upper arm would have to pass: those in the cells around home's."""
         around = ndimage.binary_dilation(self._parts == self._part(self._home), np.ones((3, 3)))
         named = Counter(self._boxes[box].name for box in self._blocking[around & (self._blocking >= 0)].tolist())
         return f"whatever the other joints do, {UPPER_ARM} would have to pass through " + " or ".join(sorted(named))
 
     @cached_property
     def _edges(self) -> list[Floats]:
-        """Of the cells, by joint."""
+        """Edges of the cells, by joint."""
         limits = self._model.joint_limits[:2]
         return [np.linspace(low, high, int(np.ceil((high - low) / CELL_RAD)) + 1) for low, high in limits]
 

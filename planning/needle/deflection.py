@@ -91,7 +91,7 @@ def shortest_bend(shaft: Shaft) -> float:
 
 
 def stiffest_resolved(shaft: Shaft) -> float:
-    """Of tissues whose foundation bends a shaft over `shortest_bend` or more, the stiffest, N/mm^2."""
+    """The stiffest tissue whose foundation bends a shaft over `shortest_bend` or more, N/mm^2."""
     return 4 * shaft.bending_stiffness / shortest_bend(shaft) ** 4
 
 
@@ -223,12 +223,12 @@ def _shape(found: Floats, force: float, system: tuple[Floats, Floats]) -> Shape:
 
 
 STEP_MM = 1.0
-"""Of an insertion, at most. Where `step_for` asks for less it is shorter."""
+"""Step of an insertion, at most. Where `step_for` asks for less it is shorter."""
 
 OF_BENDING, OF_LENGTH = 1 / 16, 1 / 64
-"""Of a step over the length 1/rate within which a shaft bends in the stiffest tissue, and over the shaft's own. Halving
-it then changes a path by less than 1.5 % from the sixteenth step on, and by less than 3 % before: `tests/needle`
-samples what a case may declare. With steps of 1 mm alone it was 11 % in thin needles."""
+"""Ratio of a step to the length 1/rate within which a shaft bends in the stiffest tissue, and over the shaft's own.
+Halving it then changes a path by less than 1.5 % from the sixteenth step on, and by less than 3 % before:
+`tests/needle` samples what a case may declare. With steps of 1 mm alone it was 11 % in thin needles."""
 
 
 def step_for(shaft: Shaft, stiffest: float) -> float:

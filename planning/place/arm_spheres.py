@@ -268,7 +268,7 @@ class Boxes:
 
     @classmethod
     def of(cls, boxes: Sequence[Box]) -> Boxes:
-        """Of boxes whose ``T_base_box`` is their pose in that frame."""
+        """Boxes whose ``T_base_box`` is their pose in that frame, for compiled code."""
         poses = [np.linalg.inv(box.T_base_box) for box in boxes]
         halves = [np.asarray(box.size_mm) / 2 for box in boxes]
         return cls(np.array(poses).reshape(-1, 4, 4), np.array(halves).reshape(-1, 3))

@@ -20,7 +20,7 @@ from puncture_twin.planning.place.arm_spheres import ArmSpheres, Surroundings, b
 from puncture_twin.planning.place.mounts import Site, WantedDirections
 
 STATES = 3
-"""Of an insertion, from standoff to target: enough to see most of what ends it."""
+"""States of an insertion, from standoff to target: enough to see most of what ends it."""
 
 
 class Branches(NamedTuple):

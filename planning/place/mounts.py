@@ -56,7 +56,7 @@ AXIS_DIGITS = 6
 
 @dataclass(frozen=True)
 class Region:
-    """Where a base of one kind may stand, in the bed frame about the target.
+    """A region for bases of one kind, in the bed frame about the target.
 
     Attributes:
         mount: "floor", "rail", "ceiling" or "side".

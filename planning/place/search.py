@@ -279,7 +279,7 @@ class _Refiner:
         return len(self._hoped)
 
     def refine(self, seeds: Sequence[Site], step_mm: float) -> list[tuple[Site, ReachEstimate]]:
-        """Where each seed ends, with its estimate; each end once."""
+        """End of each seed's walk, with its estimate; each end once."""
         ends = list(seeds)
         for halving in range(1, HALVINGS + 1):
             ends = self._leaders([[end, *_neighbours(end, step_mm / 2**halving)] for end in ends])
@@ -506,7 +506,7 @@ COLUMNS = (
     *("rank", "placement", "along_mm", "across_mm", "height_mm", "share", "held", "asked", "margin", "home_contact"),
     *("base_x_mm", "base_y_mm", "base_z_mm"),
 )
-"""Of ``placements.csv``; the base's coordinates are in the case's space."""
+"""Columns of ``placements.csv``; the base's coordinates are in the case's space."""
 
 EXPECTED = "expected_error_mm"
 """A further column where the case declares errors and has markers."""

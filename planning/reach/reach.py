@@ -258,7 +258,7 @@ ROLL_BODIES = frozenset({"wrist_3", "tool"})
 
 
 class Blocked(NamedTuple):
-    """Where a motion ends early, and whether another roll on the same branch would touch the same."""
+    """Depth at which a motion ends early, its reason, and whether another roll on the same branch has it too."""
 
     depth_mm: float
     detail: str
@@ -329,7 +329,7 @@ def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
 
 
 def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
-    """By how much upper arm and forearm are too short (or too long, folded) to reach each flange pose.
+    """Length by which upper arm and forearm are too short (or too long, folded) for each flange pose.
 
     Args:
         model: The arm.

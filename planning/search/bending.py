@@ -85,7 +85,7 @@ class Insertion(NamedTuple):
 
     @property
     def tip_mm(self) -> float:
-        """By how much the tip misses a straight line, to the side to which the bevel points."""
+        """Deviation of the tip from a straight line, to the side to which the bevel points, mm."""
         return float(self.path.cut_mm[-1])
 
     def lines(self, greatest_mm: float) -> list[str]:

@@ -245,7 +245,7 @@ class Candidates(Columns):
 
     @property
     def safe_text(self) -> str:
-        """What a person reads for a safe candidate: never "safe" alone with an unchecked arm, or a breath."""
+        """Text for a safe candidate: never "safe" alone with an unchecked arm, or a breath."""
         safe = "safe" if self.arm_checked else "safe for the organs"
         return safe if self.breathing is None else f"{safe} {self.breathing.safe_when}"
 

@@ -171,7 +171,7 @@ class CaseContext:
             return cross_check(distances, meshes, case.target_ct, outward, length, count=count, rng=rng)
 
     def provenance(self) -> dict[str, Any]:
-        """Where a result comes from: case, inputs, version, grid."""
+        """Provenance of a result: case, inputs, version, grid."""
         return {
             "case": self.case.name,
             "inputs": inputs_document(self.case.inputs),

@@ -24,13 +24,14 @@ LEAST_OPEN = 0.1
 """Open fraction of a side's solid angle below which it is no side to puncture from."""
 
 LEAST_SEARCHED = 0.4
-"""Of a side's: a grid about the front holds half of what is to the right and to the left."""
+"""Fraction of a side's directions from which on a grid covers it: a grid about the front holds half of what is to the
+right and to the left."""
 
 ROUND_ABOUT = ("front", "back", "right", "left")
 """The sides that are reported; through feet and head no image shows skin."""
 
 NOT_SHOWN = "lies on what no image shows"
-"""Of the back of a patient without a CT, while the front is open."""
+"""Reason for the closed back of a patient without a CT, while the front is open."""
 
 AXES = {"front": "anterior", "back": "posterior", "right": "right", "left": "left", "feet": "feet", "head": "head"}
 FRONT, BACK, WHOLE = '"bed"', '{ z = "posterior", x = "head" }', (0.0, 180.0)

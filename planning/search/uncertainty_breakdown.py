@@ -62,7 +62,7 @@ class Goal:
         return f"{self.limit:g} to {f'touch {self.structure}' if self.structure else 'hit'}"
 
     def text(self) -> str:
-        """What would have to shrink, in one sentence."""
+        """One sentence on the errors that would have to shrink."""
         if not self.remedies:
             if self.all_sources is None:
                 return f"{self.claim} cannot be had, however small the errors"

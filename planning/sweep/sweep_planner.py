@@ -38,7 +38,7 @@ MOST_JOINT_STEP = 0.2
 """A joint that turns more from one direction to the next jumps, rad."""
 
 SWEEP_SPEED_MM_S = 30.0
-"""Of the needle's tip, in the air."""
+"""Speed of the needle's tip, in the air."""
 
 
 class _SweepPath(NamedTuple):
@@ -131,7 +131,7 @@ def _place(angles: Floats) -> str:
 
 
 def _farthest(context: CaseContext, point: Floats, directions: Floats, route: _SweepPath) -> tuple[Floats, str]:
-    """Of all rolls and branches at the first direction the one that goes farthest, shape (k, 6), and why not on."""
+    """The path that goes farthest among all rolls and branches at the first direction, (k, 6), and why it ends."""
     assert context.reach is not None
     if not len(directions):
         return np.empty((0, 6)), route.stopped

@@ -39,19 +39,19 @@ SPREAD = 2
 """So many free poses are wanted for each that is taken: else they lean to one side."""
 
 RADII = (0.6, 0.8, 0.45)
-"""Of where the flange is tried above a place, in the arm's reach without its wrist, from the shoulder."""
+"""Distances from the shoulder at which the flange is tried, over the arm's reach without its wrist."""
 
 HEIGHTS = (0.0, 0.3, -0.3, 0.6)
-"""The same along the direction up."""
+"""Heights above the shoulder at which it is tried, likewise."""
 
 SIDES = 12
 """Directions from the base in which they lie."""
 
 ROLLS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3)
-"""Of the flange about the needle, added to each tilt: they tell how far the tip is off the flange's axis."""
+"""Rolls of the flange about the needle, added to each tilt: they tell how far the tip is off the flange's axis."""
 
 RIDGE = 1e-6
-"""Of A'A, so that fewer poses than unknowns can be compared."""
+"""Added to A'A, so that fewer poses than unknowns can be compared."""
 
 
 def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, seed: int, progress: Count) -> TouchTour:

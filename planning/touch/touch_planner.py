@@ -40,7 +40,7 @@ PLANNED_PADDING_MM = 4.0
 """Kept between the shaft of a touching needle and the patient where the markers are believed: they lie elsewhere."""
 
 TOUCHING_PADDING_MM = 1.0
-"""The same when the line was set onto the marker."""
+"""Padding when the line was set onto the marker."""
 
 ALLOWED = "a case with [errors] and markers, which say where to touch and how sure that is"
 

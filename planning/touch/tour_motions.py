@@ -90,7 +90,7 @@ class TouchPlan(TouchTour):
 
 
 RESOLUTION = 1e-9
-"""Of costs, in their unit: sums of whole multiples are exact."""
+"""Rounding of costs, in their unit: sums of whole multiples are exact."""
 
 
 class NoMotionError(NoAnswerError):
@@ -182,7 +182,7 @@ PAST_MM = 5.0
 """So far beyond its believed place a marker is felt for; then the touch is given up."""
 
 TIP_MM = 8.0
-"""Of the needle that may be nearer than its padding to the patient: the marker sits on their skin."""
+"""Length of the needle that may be nearer than its padding to the patient: the marker sits on their skin."""
 
 STEP_MM = 0.5
 """Between two configurations of the line."""

@@ -110,7 +110,7 @@ def _with_unknown_size(rays: TargetRays, inverse: Floats, freedom: int) -> Float
 
 
 QUANTILES = 64
-"""Of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
+"""Quantiles of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
 
 
 def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
@@ -258,7 +258,8 @@ def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, su
 
 
 SURFACES = 32
-"""Of a surface that lies off, at the middles of equal chances: however sharply it decides, P errs by half of one."""
+"""Positions of a surface that lies off, at the middles of equal chances: however sharply it decides, P errs by half of
+one."""
 
 GRAZING = 0.2
 """Least cosine between ray and normal: a crossing that a surface moves farther than this says is not moved by it."""
@@ -398,7 +399,7 @@ def touch_bound(
     surface_mm: Floats | float,
     freedom: int | None = None,
 ) -> Floats:
-    """What the chance would be if the nearest point were the axis' most doubtful one, to first order, shape (n, k).
+    """Bound of the first-order chance if the nearest point were the axis' least certain one, shape (n, k).
 
     A needle that leans may touch a structure far from where it is nearest, which first order does not see. No point of
     the axis is nearer than the nearest, and none is more doubtful than the worse end: the variance is convex in depth.

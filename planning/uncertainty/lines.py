@@ -267,7 +267,7 @@ WIDEST = 4.0
 """Standard deviations across which a line may lie: what lies beyond has a chance of .003 and less to matter."""
 
 SIZES = 16
-"""Of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
+"""Quantiles of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,7 +347,7 @@ def _balanced(cov: Floats) -> Floats:
 
 @cache
 def error_sizes(freedom: int) -> Floats:
-    """By how much the errors' true size may exceed the estimate: sqrt(nu / chi-squared) at equal chances."""
+    """Factors of the errors' true size over the estimate: sqrt(nu / chi-squared) at equal chances."""
     return np.asarray(np.sqrt(freedom / chdtri(freedom, (np.arange(SIZES) + 0.5) / SIZES)))
 
 
@@ -425,7 +425,7 @@ LITTLE = 0.01
 """A walk ends where what is left of its normal is this part of what it has: all that is left counts as touched."""
 
 NUDGE_MM = 1e-6
-"""By which a tip's path is moved aside, so that it does not run through an edge of a face."""
+"""mm by which a tip's path is moved aside, so that it does not run through an edge of a face."""
 
 ROOT_HALF = math.sqrt(0.5)
 

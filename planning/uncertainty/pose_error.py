@@ -184,7 +184,7 @@ def pose_error(case: Case, registration: Registration | None) -> PoseError | Non
 
 @dataclass(frozen=True, eq=False)
 class ErrorBudget:
-    """Where the tip's expected error comes from.
+    """The tip's expected error and the fraction of each source.
 
     Attributes:
         rms_mm: Tip to the point that was meant, rms.

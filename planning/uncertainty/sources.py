@@ -40,7 +40,7 @@ def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
 
 
 def _unknown_contours(case: Case) -> list[str]:
-    """Of meshes, of which nobody says how far they may lie off: those to avoid, and the one that is to be hit."""
+    """Text on the meshes without a declared surface error: those to avoid, and the target's."""
     if case.errors is None or case.errors.surface_mm is not None:
         return []
     hit = case.target_structure if case.hit_radius_mm is None else None

@@ -66,7 +66,7 @@ TABLE_4: Mapping[str, Point] = MappingProxyType(
 
 
 NAMES = tuple(TABLE_1)
-"""Of all points, in the order of the rows below."""
+"""Names of all points, in the order of the rows below."""
 
 READ: Floats = np.array(list(TABLE_1.values()), dtype=np.float64)
 """Table 1, shape (8, 3): what was read in the CT."""
@@ -79,7 +79,7 @@ TRIADS = ((0, "ABC", "L"), (0, "ABC", "M"), (0, "ABC", "H"), (1, "ABC", "M"), (1
 """Setup, markers and lesion of Tables 3 and 5."""
 
 AFFINE = ((1, "ABCE", "M"), (1, "ABCDE", "M"))
-"""Of Table 6, where least squares of twelve parameters are meant."""
+"""Numbers of Table 6, where least squares of twelve parameters are meant."""
 
 
 def rows_of(names: str) -> list[int]:
@@ -140,7 +140,7 @@ STRAINS: Mapping[str, tuple[int, int]] = MappingProxyType(
 
 
 def rigid_residuals(touched: tuple[Floats, ...]) -> tuple[Floats, ...]:
-    """Of each setup: touched minus fitted by all its points, CT axes, shape (n, p, 3), from touches (n, 8, 3), mm."""
+    """Residuals of each setup: touched minus fitted by its points, CT axes, (n, p, 3), from touches (n, 8, 3), mm."""
     found = []
     for names, points in zip(POINTS, touched, strict=True):
         rows = rows_of(names)
@@ -156,7 +156,7 @@ def axis_squares(residuals: tuple[Floats, ...]) -> Floats:
 
 
 def chi_squared(residuals: tuple[Floats, ...], declaration: Declaration) -> Floats:
-    """Of both setups against a declaration, shape (n,); `FREEDOM` degrees. Both touch one carton: C is not diagonal.
+    """Chi-squared of both setups against a declaration, (n,); `FREEDOM` degrees. One carton: C is not diagonal.
 
     With z the stacked residuals in CT axes, A the motion's design and C the declaration's covariance:
 
@@ -418,7 +418,7 @@ class Declaration:
         return np.asarray(true + rng.normal(0.0, 1.0, true.shape) * self.touch_mm)
 
     def carton_covariance(self, read: Floats) -> Floats:
-        """Of true points against their readings (p, 3), shape (3 p, 3 p), mm^2; skews to first order."""
+        """Covariance of true points about their readings (p, 3), shape (3 p, 3 p), mm^2; skews to first order."""
         cov = np.diag(np.tile(self._cell() ** 2 / 12 + self.reading_mm**2, len(read)))
         for first, second in PLANES:
             moved = np.zeros(read.shape)

@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 SHEATH_HU, WATER_HU, CORE_HU = 100.0, 0.0, 3000.0
-"""Of plastic, of what flows in it, and of thin wires of copper with the plastic between; ours."""
+"""Hounsfield units of plastic, of what flows in it, and of thin wires of copper with the plastic between; ours."""
 
 
 class OutsideObjects(NamedTuple):
@@ -108,7 +108,7 @@ def arms(outline: Outline, kind: Arms, at_mm: float, rng: np.random.Generator) -
 
 
 class _Line(NamedTuple):
-    """Of an arm: joints (4, 3), a finer line (n, 3) through them with how far along each is, and the hand's back."""
+    """Line of an arm: joints (4, 3), a finer line (n, 3) with how far along each point is, and the hand's back."""
 
     joints: Floats
     points: Floats
@@ -235,7 +235,7 @@ Ends = tuple[float, float]
 BEYOND_MM = 400.0
 """So far a bed goes on beyond the skin at head and feet."""
 SHELL_HU, FOAM_HU, COVER_HU, MATTRESS_HU, PAD_HU = 60.0, -930.0, -120.0, -960.0, 20.0
-"""Of a table's shell and core, a mattress's cover and foam, and a pad of gel; ours."""
+"""Hounsfield units of a table's shell and core, a mattress's cover and foam, and a pad of gel; ours."""
 COVER_MM, CURVED_MM = 2.0, 30.0
 """How thick a mattress's cover and a curved table are; ours."""
 
@@ -288,7 +288,7 @@ def _curved(at: tuple[float, float], radius: float, half: float, shell: float, e
 TUBE_SIDES = 24
 """Corners of a round section: at a radius of 50 mm the sides lie within 0.5 mm of the circle."""
 END_RINGS = 4
-"""Of a round end."""
+"""Rings of a round end."""
 
 
 class Part(NamedTuple):

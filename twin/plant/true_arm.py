@@ -20,15 +20,15 @@ class ArmErrors(NamedTuple):
     """Deviations of an arm from its nominal model: standard deviations, normal, and the width of the play."""
 
     link_mm: float = 0.0
-    """Of every Denavit-Hartenberg length a_i and d_i."""
+    """Deviation of every Denavit-Hartenberg length a_i and d_i."""
     twist_rad: float = 0.0
-    """Of every twist alpha_i: axes that should be parallel or square and are not quite."""
+    """Deviation of every twist alpha_i: axes that should be parallel or square and are not quite."""
     joint_rad: float = 0.0
-    """Of every joint's zero."""
+    """Deviation of every joint's zero."""
     backlash_rad: float = 0.0
     """Full width of the play of every joint, not random."""
     repeatability_rad: float = 0.0
-    """Of every joint, drawn anew at each arrival."""
+    """Deviation of every joint, drawn anew at each arrival."""
 
 
 class TrueArm(NamedTuple):

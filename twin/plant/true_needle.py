@@ -19,7 +19,8 @@ from puncture_twin.twin.world.client import to_m, to_mm
 from puncture_twin.twin.world.control import Push, Tip
 
 NEWTON_STEPS = 4
-"""Of a tip moved onto a point: errors of an arm are millimetres, and each step squares what is left of them."""
+"""Newton steps of a tip moved onto a point: errors of an arm are millimetres, and each step squares what is left of
+them."""
 
 
 class TrueNeedle(NamedTuple):
@@ -73,7 +74,7 @@ def joints_at_points(model: UrModel, points_base: Floats, q_start: Floats, eta: 
 
 
 SHIFT_MM = 0.1
-"""By which friction gives way elastically before it slides: the samples of the force are as far apart."""
+"""mm by which friction gives way elastically before it slides: the samples of the force are as far apart."""
 
 
 class StraightPath(NamedTuple):
@@ -163,7 +164,7 @@ class TissueForce(NamedTuple):
 
 
 NO_TISSUE_FORCE = "no force of tissue: the case declares none ([tissue])"
-"""Of an insertion through tissue that nobody described."""
+"""Text for an insertion without declared tissue."""
 
 
 @dataclass(frozen=True, eq=False)

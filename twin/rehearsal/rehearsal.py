@@ -176,7 +176,7 @@ DWELL_S = 1.0
 """Pause at the end, before the tip is measured."""
 
 ROUNDING = 1e-6
-"""Of a time over the physics step: a whole number of steps must not fall short of itself."""
+"""Tolerance of a time over the physics step: a whole number of steps must not fall short of itself."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,10 +54,10 @@ from puncture_twin.twin.world.execution import touches
 from puncture_twin.twin.world.workcell import SimulatedWorkcell, load_box, open_workcell, remove, soften
 
 TOUCH_SPEED_MM_S = 2.0
-"""Of the last millimetres."""
+"""Tip speed over the last millimetres."""
 
 NEAR_SPEED_MM_S = 25.0
-"""Of the straight line before them, and back."""
+"""Tip speed on the straight line before them, and back."""
 
 CONTACT_N = 0.5
 """Force along the needle, N, that counts as contact."""
@@ -69,8 +69,8 @@ FORCE_NOISE_N = 0.1
 """Standard deviation of the force sensor, per reading."""
 
 SPRING = Stiffness(translation_n_m=1e3, rotation_nm_rad=100.0, integral_per_s=5.0)
-"""Of the tip while it feels for a marker. The integral, which stands still in contact, takes away what the arm's masses
-err by: with a tenth of them wrong the tip would come down .6 mm aside."""
+"""Spring at the tip while it approaches a marker. The integral, which stands still in contact, takes away what the
+arm's masses err by: with a tenth of them wrong the tip would come down .6 mm aside."""
 
 PAD_N_M = 1e5
 """Stiffness of a marker on skin; a rigid one's first peak would be momentum over the time step."""

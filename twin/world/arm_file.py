@@ -27,12 +27,12 @@ NEEDLE_DENSITY_KG_M3 = 7900.0
 
 
 KEPT_TAGS = ("visual", "collision", "inertial")
-"""Of a link; other programs' additions would be taken for friction and the like."""
+"""Elements of a link that are kept; other programs' additions would be taken for friction and the like."""
 
 NO_WEIGHT = ET.fromstring(
     '<inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
 )
-"""Of a link that states nothing: PyBullet would take 1 kg, and 1 kg m^2 about each axis."""
+"""Inertia of a link that states none: PyBullet would take 1 kg, and 1 kg m^2 about each axis."""
 
 
 def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:

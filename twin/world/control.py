@@ -126,7 +126,7 @@ def _controller(rigid: RigidModel, control: TipControl, q_path: Floats) -> Contr
 
 
 MOST_DECAY = 2.0
-"""Of D dt / M: from there on the explicit step of the virtual mass overshoots more than it takes away."""
+"""Limit of D dt / M: from there on the explicit step of the virtual mass overshoots more than it takes away."""
 
 
 @dataclass(frozen=True)
@@ -234,10 +234,10 @@ def rotation_error(R_reference: Floats, R: Floats) -> Floats:
 
 
 MOST_RATIO = 0.8
-"""Of sqrt(K / m) dt over every mode of the tip: five sixths of where the loop diverges."""
+"""Limit of sqrt(K / m) dt over every mode of the tip: five sixths of where the loop diverges."""
 
 STEPS_S = (RECORD_S / 17, RECORD_S / 34, RECORD_S / 68)
-"""Of a controller, the longest first: about 1, .5 and .25 ms, and records fall on steps."""
+"""Time steps of a controller, the longest first: about 1, .5 and .25 ms, and records fall on steps."""
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ CONTACT_MARGIN_M = 0.0
 """Bullet grows concave shapes by this; contact shall begin at the surface itself."""
 
 CONTACT_DAMPING_NS_M = 100.0
-"""Of bodies that yield."""
+"""Damping of bodies that yield."""
 
 
 def load_surface(

@@ -24,7 +24,7 @@ MM_PER_M = 1000.0
 """URDFs speak metres."""
 
 MOST_BYTES = 10_000_000
-"""Of a URDF: the largest of a whole humanoid has a tenth of it."""
+"""Bytes of a URDF: the largest of a whole humanoid has a tenth of it."""
 
 MOST_LINKS = 1000
 """Of a URDF: an arm has ten."""

@@ -26,7 +26,8 @@ SQUARE_RAD = 1e-4
 """How far an axis may be from where a UR has it: 1.5708 for a right angle is off by 4e-6, 1.57 by 8e-4."""
 
 OFF_MM = 0.05
-"""The same for an axis' place and the flange's: what a UR repeats. Rounded angles leave 0.005 mm at a metre."""
+"""mm by which an axis' place and the flange's may be off: what a UR repeats. Rounded angles leave 0.005 mm at a
+metre."""
 
 DIGITS_MM = 6
 """Decimals of a length: a URDF's right angles are rounded, so that its chain gives 89.15899999999999."""
@@ -177,7 +178,7 @@ MOST_RAD_S = 4.0 * math.pi
 """Twice as fast as any joint of a UR: beyond, a speed is in degrees."""
 
 ROUNDING_RAD = 1e-4
-"""By which a stated limit may exceed the URDF's: 6.2832 for a whole turn."""
+"""rad by which a stated limit may exceed the URDF's: 6.2832 for a whole turn."""
 
 
 class JointLimits(NamedTuple):

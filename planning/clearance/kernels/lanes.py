@@ -20,7 +20,7 @@ intrinsic: Any = extending.intrinsic
 
 @intrinsic  # type: ignore[untyped-decorator]  # numba's own types
 def bare(typing_context: Any, array: Any) -> Any:
-    """The same array without its reference count, which numba would touch at every call in a loop.
+    """The array without its reference count, which numba would touch at every call in a loop.
 
     Only for arguments of a function called from Python: the caller holds them until it returns.
     """
@@ -88,7 +88,7 @@ class Vector:
         return self._call("llvm.sqrt")
 
     def choose(self, yes: Vector, no: Vector | Number) -> Vector:
-        """Of a comparison: ``yes`` in the lanes where it holds, else ``no``."""
+        """Lane by lane ``yes`` where this comparison holds, else ``no``."""
         return Vector(self.builder, self.builder.select(self.value, yes.value, yes._like(no)))
 
     def _like(self, other: Vector | Number) -> Any:

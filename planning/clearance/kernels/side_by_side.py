@@ -18,7 +18,7 @@ from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.segment_triangle import CONTACT_MM, LEAST, STACK, axis_triangle
 
 ROWS = 12
-"""Of a buffer of pairs: nine coordinates, squared distance, depth, length of the axis."""
+"""Rows of a buffer of pairs: nine coordinates, squared distance, depth, length of the axis."""
 
 UNDECIDED, BEYOND = -1.0, -2.0
 """In place of a squared distance: `axis_triangle` must be asked; the triangle lies wholly beyond the axis' top."""
@@ -186,7 +186,7 @@ class Found(NamedTuple):
 
 
 class NeedleAxes(NamedTuple):
-    """Where all axes start and how long they are, and two float32 numbers.
+    """Start and length of all axes, and two float32 numbers.
 
     Attributes:
         target: Three numbers, mm.

@@ -33,7 +33,8 @@ from puncture_twin.planning.collision.kernels.proofs import (
 )
 
 KEPT = 0.8
-"""Of the clearance at the nearer end of a segment, what all of it is to keep: bounds are loose by up to a tenth."""
+"""Fraction of the clearance at the nearer end of a segment that all of it is to keep: bounds are loose by up to a
+tenth."""
 
 
 @allocation_free()
@@ -286,7 +287,7 @@ PARTS = 256
 
 
 class Answer(NamedTuple):
-    """What a segment came to, filled by :func:`segments.check_segment`."""
+    """Result of a segment's check, filled by :func:`segments.check_segment`."""
 
     status: Ints
     """Shape (4,)."""

@@ -203,7 +203,7 @@ def against_triangle(hulls, hull, M, triangle, line, room):
 
 @allocation_free()
 def on_skin(skin, hulls, hull, T, room):
-    """What the round body in a hull at ``T`` (4, 4) comes to against each triangle of the skin.
+    """Result of the round body in a hull at ``T`` (4, 4) against each triangle of the skin.
 
     It touches as soon as one triangle of the skin does. What the CT shows besides counts where all of the skin is
     clear.
@@ -243,7 +243,7 @@ def on_skin(skin, hulls, hull, T, room):
 
 @allocation_free()
 def settled(scene, work, room, at, frames, gap):
-    """What a check comes to whose bound ``gap`` proves nothing, the arm standing at ``frames`` (7, 4, 4).
+    """Result of a check whose bound ``gap`` proves nothing, the arm at ``frames`` (7, 4, 4).
 
     Of a bound that is ``TOUCHING``, ``work`` is as the bound has left it.
     """
@@ -255,7 +255,7 @@ def settled(scene, work, room, at, frames, gap):
 
 @allocation_free()
 def settled_at(scene, work, room, at, frames):
-    """What a check comes to, the arm standing at ``frames`` (7, 4, 4)."""
+    """Result of a check, the arm at ``frames`` (7, 4, 4)."""
     gap = near_gap(scene, work, at, frames, MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
     return CLEAR if gap > MIN_GAP_MM else settled(scene, work, room, at, frames, gap)
 

@@ -39,7 +39,7 @@ UNMEASURED_HU = -2000.0
 
 @dataclass(frozen=True, eq=False)
 class _Series:
-    """What the headers of all files say together."""
+    """Facts of the headers of all files together."""
 
     stack: Stack
     grid: StraightGrid
@@ -68,7 +68,7 @@ class CtSeries:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was left out, and what was done to the slices."""
+        """Notes on what was left out, and what was done to the slices."""
         notes = list(self.aside)
         if (tilt := self._series.grid.tilt_deg) > 0:
             notes.append(
@@ -100,7 +100,7 @@ class CtSeries:
 
     @cached_property
     def grid(self) -> VolumeGrid:
-        """Where the voxels of `volume` lie, LPS mm.
+        """Grid of the voxels of `volume`, LPS mm.
 
         Raises:
             InputError: Headers that cannot be trusted, or that make no volume.

@@ -23,7 +23,7 @@ from puncture_twin.planning.formats.dicom.encoding_check import whole_length
 from puncture_twin.planning.formats.dicom.storage import BIG_ENDIAN, DEFLATED, IMPLICIT, META_START, is_dicom
 
 MAX_INFLATED_BYTES = 1 << 26
-"""Of one deflated file: two slices of the largest size, or 128 of the usual one; a bomb ends here."""
+"""Bytes of one inflated file at most: two slices of the largest size, or 128 of the usual one; a bomb ends here."""
 ALLOWED = "a complete DICOM file"
 
 

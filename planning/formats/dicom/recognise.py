@@ -44,7 +44,7 @@ from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 MAX_FILES = 50_000
 """In one folder; the longest series have some 5,000 slices."""
 NO_SLICES = frozenset(("LOCALIZER", "SCOUT", "TOPOGRAM", "SCREEN SAVE", "DOSE_INFO", "DOSE", "SUMMARY", "PROTOCOL"))
-"""Of ImageType: scouts, and pages of text that are stored among the slices."""
+"""Values of ImageType that are no slices: scouts, and pages of text that are stored among the slices."""
 _TAGS = [
     tag_for_keyword(keyword) or 0
     for keyword in (
@@ -84,7 +84,7 @@ class DicomFile:
 
 
 def recognise(path: Path) -> DicomFile | None:
-    """What a file is; None if it is no DICOM file.
+    """The kind of a file by its header; None if it is no DICOM file.
 
     Raises:
         InputError: It begins as DICOM, and its header is damaged.

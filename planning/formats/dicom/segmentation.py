@@ -48,7 +48,7 @@ from puncture_twin.planning.formats.volumes.volume_source import Content
 MAX_SLICES = 20_000
 """Between the first and the last frame."""
 ON_GRID = 0.05
-"""Of a voxel, by which a segmentation's grid may miss the CT's and still be on it."""
+"""Fraction of a voxel by which a segmentation's grid may miss the CT's and still be on it."""
 HALF = 0.5
 """From this fraction on, a voxel of a fractional segment belongs to it."""
 

@@ -24,7 +24,8 @@ from puncture_twin.planning.formats.dicom.storage import CLASSIC_CT
 from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, MAX_SPACING_MM, MIN_SPACING_MM
 
 UNIT_TOLERANCE = 1e-3
-"""Of an axis' length, and of the cosine between two: positions are written with six digits, some with four."""
+"""Tolerance of an axis' length, and of the cosine between two: positions are written with six digits, some with
+four."""
 HOUNSFIELD = ("HU", "US", "")
 """Types of rescaled values that are Hounsfield units in a CT, where the standard's default is HU."""
 WITH_RESCALE = (
@@ -192,13 +193,13 @@ def _types(item: Dataset, label: str) -> tuple[str, ...]:
 
 
 AXES_TOLERANCE = 1e-3
-"""By which the axes of two slices may differ: 0.25 mm at the corner of a slice, below a pixel; cosines are rounded."""
+"""Tolerance between the axes of two slices: 0.25 mm at the corner of a slice, below a pixel; cosines are rounded."""
 PLACE_TOLERANCE_MM = 0.1
-"""By which a slice may lie off its place in the stack: positions that are rounded to a tenth are within 0.05."""
+"""Tolerance of a slice's place in the stack: positions that are rounded to a tenth are within 0.05."""
 PLACE_TOLERANCE = 0.1
-"""The same as a fraction of the step, where that is less."""
+"""Tolerance of its place as a fraction of the step, where that is less."""
 SPACING_TOLERANCE = 1e-4
-"""By which the pixels of two slices may differ in size, as a fraction."""
+"""Relative tolerance between the pixel sizes of two slices."""
 ONE_PLACE_MM = 1e-3
 """No two slices of any scanner are so near."""
 SHOWN = 4
@@ -305,11 +306,11 @@ def _tolerance(step: float) -> float:
 
 
 NO_TILT_MM = 0.05
-"""Of shift from the first slice to the last: less is the rounding of positions."""
+"""mm of shift from the first slice to the last: less is the rounding of positions."""
 MAX_TILT_DEG = 45.0
 """Gantries tilt to 30 degrees; beyond, the slices are no stack."""
 WHOLE_PIXEL = 1e-6
-"""Of a pixel: a shift so near to a whole number of pixels needs no interpolation."""
+"""Fraction of a pixel: a shift so near to a whole number of pixels needs no interpolation."""
 
 
 @dataclass(frozen=True, eq=False)

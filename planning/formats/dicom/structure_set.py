@@ -42,7 +42,7 @@ from puncture_twin.planning.geometry.rigid import apply
 CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
 """Contours that enclose an area; one within another leaves it out."""
 ON_SLICE = 0.1
-"""Of the step, by which a contour may miss its slice."""
+"""Fraction of the step by which a contour may miss its slice."""
 MAX_CONTOUR_POINTS = 100_000
 """In one contour: an image of 1000 pixels has 4000 around it."""
 MAX_LENGTH = 5_000_000
@@ -200,7 +200,7 @@ def _is_every_so_many(contours: tuple[Contour, ...]) -> bool:
 
 
 def _slice_mask(contours: list[Contour], shape: tuple[int, int]) -> Bools:
-    """What contours enclose, and the pixels along what is too narrow to enclose a centre.
+    """Pixels inside contours, and those along what is too narrow to enclose a centre.
 
     A contour within another is a hole if a pixel of the other is left all around it. Copies of a contour, and contours
     that overlap in part, enclose what any of them does: by an odd count they would erase each other.

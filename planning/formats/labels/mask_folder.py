@@ -76,7 +76,7 @@ def is_mask(entry: Entry) -> bool:
 
 
 def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError:
-    """What lies in a folder of masks, or of meshes, and would be passed over: its organ would count as free."""
+    """Entries of a folder of masks or meshes that would be passed over: their organs would count as free."""
     return InputError(
         f"beside the {among} lies what is not read, and may be an organ: {first_few([one.said for one in left])}",
         where=where,

@@ -22,7 +22,8 @@ from puncture_twin.planning.geometry.rigid import apply
 LEAST_RULES = 3
 """With fewer that can be checked, chance decides."""
 MOST_BROKEN, LEAST_BROKEN = 0.1, 0.15
-"""Of the rules: so few may be broken in the right naming (curved spines, moved organs), so many are in the wrong."""
+"""Fractions of the rules: so few may be broken in the right naming (curved spines, moved organs), so many are in the
+wrong."""
 
 LEAST_WRONG = 2
 """One rule alone may be broken by a patient."""

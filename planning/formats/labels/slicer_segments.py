@@ -24,7 +24,7 @@ from puncture_twin.planning.formats.volumes.volume_source import Content
 from puncture_twin.planning.formats.volumes.voxels import decoded
 
 SEGMENT_ENDING = ".nrrd"
-"""Of segmentations that Slicer saves, in lower case: their header and voxels are one file."""
+"""Ending of segmentations that Slicer saves, in lower case: their header and voxels are one file."""
 ALLOWED = "a .seg.nrrd as Slicer saves it, with names, label values and layers of its segments"
 
 

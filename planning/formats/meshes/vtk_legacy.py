@@ -121,7 +121,7 @@ def _cells(cursor: _Cursor, words: list[str], *, offsets: bool, where: str) -> _
 
 
 def _find_starts(table: NDArray[np.int64], starts: NDArray[np.int64], where: str) -> None:
-    """Where each cell begins: with the count of its corners, which says where the next one does."""
+    """Start of each cell: at the count of its corners, which gives the next start."""
     at = 0
     for cell in range(len(starts)):
         if not 0 <= at < len(table) or table[at] < 1:

@@ -30,7 +30,7 @@ BLUR_MM = 1.5
 """So far from its voxels a piece of metal still blurs into others; beyond, they show what it lies in."""
 
 EDGE_MM = 1.5
-"""By which the edges of wide metal stand out of the balls that fit into it."""
+"""mm by which the edges of wide metal protrude from the balls that fit into it."""
 
 SOLID_HU = 8000.0
 """Assumed of a voxel that is wholly metal, whose value the range of the image clips. It only decides at which part of

@@ -33,7 +33,7 @@ SHAFT_MM = 12.0
 WIDE_MM = 3.0
 """About the axis of a needle, so far; of a wide rod half of its width."""
 WIDEST_SLICE = 0.6
-"""Of a slice's thickness: one slice at least is so near to the axis."""
+"""Fraction of a slice's thickness: one slice at least is so near to the axis."""
 SLENDER = 8.0
 """Length over width: a rib is bent, and so wider."""
 BLUR_SIGMA_MM = 0.5

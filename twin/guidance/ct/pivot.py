@@ -25,10 +25,10 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.registration.marker_noise import reading_noise
 
 MOST_OFF_MM = 50.0
-"""By which a stated tip may be wrong: more is another needle."""
+"""mm by which a stated tip may be wrong: more is another needle."""
 
 SLACK_MM = 5.0
-"""By which an arm that nobody calibrated may miss one place."""
+"""mm by which an arm that nobody calibrated may miss one place."""
 
 LEAST_POSES = 3
 """Two leave the tip free along a line."""
@@ -37,7 +37,7 @@ LARGE = 2.0
 """Residuals so many times the expected ones are not the declared noise: the arm's own errors, or a tip that slipped."""
 
 WORST_FACTOR = 30.0
-"""Of the noise in the worst direction of the tip: poses that turn too little magnify it so."""
+"""Magnification of the noise in the worst direction of the tip: poses that turn too little magnify it so."""
 
 
 def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, *, where: str) -> None:

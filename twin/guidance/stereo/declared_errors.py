@@ -32,10 +32,10 @@ DEFAULT_BACKLASH_DEG = 0.0
 """The gears of these arms have no play worth naming."""
 
 DEFAULT_MEASURING_MM = 0.01
-"""Of a coordinate measuring arm."""
+"""Deviation of a coordinate measuring arm."""
 
 DEFAULT_MARKER_MM = 0.3
-"""Of a marker's centre in an image with voxels of a millimetre: 1 / sqrt(12)."""
+"""Deviation of a marker's centre in an image with voxels of a millimetre: 1 / sqrt(12)."""
 
 
 ANGLES = ("twist", "joint", "backlash", "repeatability", "needle_direction", "head_turn")

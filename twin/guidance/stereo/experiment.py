@@ -38,14 +38,14 @@ class TargetRow(NamedTuple):
     needle_open_loop: NeedleOutcome | None = None
     """The needle where the robot alone brought it, predicted and realised; None where there is no prediction."""
     needle_servoed: NeedleOutcome | None = None
-    """Likewise at the last look of the servo."""
+    """The needle at the last image of the servo, predicted and realised."""
 
 
 class DeclarationTest(NamedTuple):
     """Test whether the measurements are as far apart as the declared errors make them."""
 
     chi_squared: float
-    """Of the joint estimate's residuals."""
+    """Chi-squared of the joint estimate's residuals."""
     freedom: int
 
     @property
@@ -66,7 +66,7 @@ class ServoTrial(NamedTuple):
     refused: str
     """Why the session failed as a whole; empty when it did not."""
     declaration: DeclarationTest | None = None
-    """Of everything that was measured; None where the joint estimate does not settle."""
+    """Test of everything that was measured; None where the joint estimate does not settle."""
 
 
 class NeedleStatistics(NamedTuple):

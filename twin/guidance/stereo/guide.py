@@ -23,7 +23,7 @@ class Known(NamedTuple):
     """Knowledge of a session when the servo begins, and the workcell for its images."""
 
     workcell: StereoWorkcell
-    """Of which only the images are used."""
+    """The workcell, of which only the images are used."""
     calibration: RobotCalibration
     mapping: Mapping
     markers: list[Detections]

@@ -64,7 +64,7 @@ class Reached(NamedTuple):
     before_mm: float
     """True ball to true target where the robot alone brought it; the whole distance if it could not start."""
     after_mm: float
-    """The same at the end."""
+    """True ball to true target at the end."""
     servo_only_mm: float
     """True ball to estimated target at the end: what the servo answers for."""
     unseen: NeedleOutcome | None = None

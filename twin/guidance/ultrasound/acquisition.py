@@ -41,7 +41,7 @@ class ProbeShot(NamedTuple):
     turn_probe: Floats
     """Direction in which each of its joints last rotated, shape (6,): 1, -1, or 0."""
     turn_needle: Floats
-    """The same of the needle's arm."""
+    """Directions of the needle arm's joints, shape (6,)."""
     image: Pixels
     found: Detection | Missed
     true_needle: NeedleInImage
@@ -239,7 +239,7 @@ def _too_few(
 
 
 JOG_STEPS = 4
-"""Of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""
+"""Steps of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""
 
 
 class MovingArm(Protocol):

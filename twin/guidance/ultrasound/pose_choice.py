@@ -241,7 +241,7 @@ class _Design(NamedTuple):
     """Information held beforehand, shape (p, p)."""
 
     def information(self, index: int) -> Floats:
-        """Of one candidate, shape (p, p)."""
+        """Information of one candidate, shape (p, p)."""
         return np.asarray(self.rows[index].T @ self.rows[index])
 
 

@@ -18,7 +18,7 @@ from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 
 AIM_STEPS = 3
-"""Of the command that counts the needle arm's errors: each leaves a thousandth of what was left before."""
+"""Iterations of the command that counts the needle arm's errors: each leaves a thousandth of what was left before."""
 
 LESION_MM = 4.0
 """Radius of the lesion that is drawn about the target in an image."""

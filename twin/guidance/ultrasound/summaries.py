@@ -41,7 +41,7 @@ class Choice:
 
     chosen_mm: float
     random_mm: tuple[float, ...]
-    """Of random choices of as many poses."""
+    """Bounds of random choices of as many poses."""
 
     @property
     def median_random_mm(self) -> float:

@@ -33,7 +33,7 @@ METAL_HU = 8000.0
 SOFT_TISSUE_HU = 20.0
 """What fills the skin between the structures: fat and muscle, mixed; ours. Also of a name that no line knows."""
 SHELL_HU, FOAM_HU, SHELL_MM = 60.0, -930.0, 3.0
-"""Of a table, and of every obstacle in the CT's frame: a shell so thick about foam; ours."""
+"""Material of a table, and of every obstacle in the CT's frame: a shell so thick about foam; ours."""
 
 HU_OF_GROUP = MappingProxyType(
     {
@@ -315,7 +315,7 @@ TABLE_MM = 100.0
 MOST_VOXELS = 200_000_000
 """A whole trunk at 0.8 x 0.8 x 0.6 mm; each voxel takes some ten bytes while it is made."""
 DECIMALS = 4
-"""Of positions in mm, so that DICOM's decimal strings hold them whole."""
+"""Decimals of positions in mm, so that DICOM's decimal strings hold them whole."""
 
 
 def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator) -> VolumeGrid:

@@ -114,7 +114,7 @@ def _slice(corners, owners, fills, labels, cuts, empty, values, marks):  # type:
 
 @nb.njit(cache=True, nogil=True)
 def _segments(corners, owners, z, segments, whose):  # type: ignore[no-untyped-def]
-    """Where a plane cuts triangles: (x, y) from the edge that rises through it to the edge that falls."""
+    """Cuts of a plane with triangles: (x, y) from the edge that rises through it to the edge that falls."""
     count = 0
     for t in range(len(corners)):
         below = 0
@@ -139,7 +139,7 @@ def _segments(corners, owners, z, segments, whose):  # type: ignore[no-untyped-d
 
 @nb.njit(cache=True, nogil=True)
 def _crossings(segments, whose, ny, subs, within):  # type: ignore[no-untyped-def]
-    """Where the lines of a plane cross its segments, line by line; a turn is the solid's number + 1, with its sign."""
+    """Crossings of a plane's lines with its segments, line by line; a turn is the solid's number + 1, with its sign."""
     lines = ny * subs
     starts = np.zeros(lines + 2, np.int64)
     for s in range(len(segments)):

@@ -135,7 +135,7 @@ def _stored(
 SAMPLE_VOXELS = 0.4
 """At most so far apart are samples of a surface."""
 MOST_SAMPLES = 1_000_000
-"""Of triangles that are sampled together."""
+"""Samples of triangles that are taken together."""
 
 
 def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
@@ -187,7 +187,7 @@ def _samples(corners: Floats) -> Iterator[Floats]:
 
 
 SIDES = 64
-"""Of a round body: its volume is that of the circle to 1.6e-3."""
+"""Sides of a round body: its volume is that of the circle to 1.6e-3."""
 
 
 class Solid(NamedTuple):

@@ -116,7 +116,7 @@ MM = 2
 SCANNER = 1
 """``sform_code``: the scanner's own coordinates."""
 FAST = 1
-"""Of gzip: noise does not get smaller by trying harder."""
+"""Level of gzip: noise does not get smaller by trying harder."""
 
 
 def write_nifti(path: Path, values: NDArray[Any], T_ct_index: Floats) -> Path:

@@ -26,7 +26,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_ax
 STEP_PX = 0.25
 """Between two readings on a spoke: a quarter of the narrowest edge."""
 SMOOTHING_PX = 0.8
-"""Of the derivative: as wide as the edge itself is the best against noise; wider sees the ball's shading."""
+"""Width of the derivative: as wide as the edge itself is the best against noise; wider sees the ball's shading."""
 EDGE_WIDTH_PX = 0.8
 """Blur and pixel together; turns the steepest slope into the step's height."""
 
@@ -67,7 +67,7 @@ class Spokes(NamedTuple):
     direction: Floats
     """Shape (3,), unit."""
     half_angle: float
-    """Of the outline, rad."""
+    """Half angle of the outline, rad."""
     number: int
     reach_px: float
     """How far to both sides of the outline."""

@@ -289,7 +289,7 @@ def _to_pixels(cells: Floats) -> Floats:
 
 
 def _length(vectors: Floats) -> Floats:
-    """Of vectors (..., 3), shape (...); three times as fast as numpy's norm over a short axis."""
+    """Lengths of vectors (..., 3), shape (...); three times as fast as numpy's norm over a short axis."""
     return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))
 
 

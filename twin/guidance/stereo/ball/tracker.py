@@ -35,7 +35,7 @@ Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low
 MARGIN_PX = 8.0
 """Beyond search region and ball: what edges and their smoothing need."""
 HOUGH_SIGMA_PX = 0.4
-"""Of a centre by Hough alone, per axis (measured: benchmarks/ball.py)."""
+"""Deviation of a centre by Hough alone, per axis (measured: benchmarks/ball.py)."""
 CLOSER = 2
 """Times that the edges are read again around the measured circle: the second moves it by less than 0.001 px."""
 KEPT_AWAY = 2
@@ -94,7 +94,7 @@ class LostBall(NamedTuple):
 
     reason: Reason
     inliers: int = 0
-    """Of the best circle."""
+    """Edges on the best circle."""
 
 
 def find_ball(

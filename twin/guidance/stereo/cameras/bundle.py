@@ -85,7 +85,7 @@ class Bundle:
         return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
 
     def camera_covariance(self, camera: int) -> Floats:
-        """Of one camera's 14 parameters, shape (14, 14)."""
+        """Covariance of one camera's 14 parameters, shape (14, 14)."""
         rows = slice(14 * camera, 14 * camera + 14)
         return self.covariance[rows, rows]
 

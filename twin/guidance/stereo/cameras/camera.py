@@ -134,11 +134,11 @@ class Camera:
         return np.asarray(self.jacobian(self.center_c + direction_c) @ tangent_axes(direction_c))
 
     def moved(self, T_c_other: Floats) -> Camera:
-        """The same camera known in another frame: ``T_camera_other = T_camera_c T_c_other``."""
+        """The camera in another frame: ``T_camera_other = T_camera_c T_c_other``."""
         return replace(self, T_camera_c=self.T_camera_c @ T_c_other)
 
     def pinhole(self) -> Camera:
-        """The same camera with a perfect lens."""
+        """The camera with a perfect lens."""
         return replace(self, distortion=np.zeros(4))
 
 

@@ -399,7 +399,7 @@ def bound(observed: Observed, guess: Guess, truth: Unknowns) -> Adjusted:
 
 
 FLANGE_ERRORS = PARAMETERS["joint"].stop
-"""Of these move the flange: 23."""
+"""How many of these move the flange: 23."""
 
 N_ROD = PARAMETERS["tip_offset"].stop
 """a1..a6, d1, d3..d6, alpha1..alpha6, six zeros of the joints, the ball on the flange: what moves the ball."""

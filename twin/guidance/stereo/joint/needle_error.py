@@ -226,7 +226,7 @@ class NeedleOutcome(NamedTuple):
     offset_mm: float
     """The part of it that is known: the tip believed, to the target."""
     half_axes_mm: tuple[float, float, float]
-    """Of the 95 % ellipsoid about the tip believed, longest first."""
+    """Half axes of the 95 % ellipsoid about the tip believed, longest first."""
     lateral_mm: float
     """Deviation across the needle."""
     depth_mm: float
@@ -239,9 +239,9 @@ class NeedleOutcome(NamedTuple):
     """True tip to true target."""
     realised_direction_deg: float
     square: float
-    """Of the tip's error about what is believed, in deviations: chi-squared of 3."""
+    """Squared size of the tip's error about what is believed, in deviations: chi-squared of 3."""
     square_of_pose: float
-    """Likewise of tip and rotation together: chi-squared of 6."""
+    """Squared size of the error of tip and rotation together: chi-squared of 6."""
     hit: bool | None
     """Whether the tip is within the radius."""
 

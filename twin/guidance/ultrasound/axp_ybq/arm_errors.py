@@ -40,13 +40,13 @@ class DeclaredArm(NamedTuple):
 
     model: UrModel
     link_mm: float
-    """Of every Denavit-Hartenberg length."""
+    """Deviation of every Denavit-Hartenberg length."""
     twist_rad: float
-    """Of every twist."""
+    """Deviation of every twist."""
     joint_rad: float
-    """Of every joint's zero."""
+    """Deviation of every joint's zero."""
     arrival_rad: float
-    """Of every joint, anew at each arrival."""
+    """Deviation of every joint, anew at each arrival."""
     play_rad: float = 0.0
     """Half the width of every joint's play: how far it stops short of where it was sent; no deviation."""
 

@@ -54,7 +54,7 @@ def structures(problem: Problem, fit: RobustFit) -> dict[str, Floats]:
 
 
 STEPS = 12
-"""Of the parts' sizes between two fits, by likelihood; each comes within a few percent in half as many."""
+"""Steps of the parts' sizes between two fits, by likelihood; each comes within a few percent in half as many."""
 
 LEAST_PART_FREEDOM = 3.0
 """Residuals minus unknowns of one part of the tip's noise below which both parts are found together."""
@@ -173,7 +173,7 @@ def _tip_parts(problem: Problem, at_fit: Fitted, fit: RobustFit) -> tuple[float,
 
 
 def _direction_part(at_fit: Fitted, fit: RobustFit, column: int, spread: Floats) -> float:
-    """Of one of the direction's two residuals, rad: what its spread (n,), whose mean square is 1, is multiplied by."""
+    """Size of one of the direction's two residuals, rad: the factor of its spread (n,), whose mean square is 1."""
     used = fit.direction_kept
     r, J, expected = at_fit.residuals[used, column], at_fit.jacobian[used, column], at_fit.sigma[used, column, column]
     freedom = len(r) - float((((J @ at_fit.covariance) * J).sum(axis=1) / expected).sum())
@@ -196,7 +196,7 @@ class SmallSample(NamedTuple):
     covariance: Floats
     """Shape (p, p), with the uncertainty of the noise in it."""
     freedom: float
-    """Of Fisher's F's denominator."""
+    """Degrees of freedom of Fisher's F's denominator."""
     factor: float
     """What e^T C^-1 e / p is multiplied by to follow that F."""
 

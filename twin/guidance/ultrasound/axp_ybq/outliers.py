@@ -38,7 +38,7 @@ class Block(NamedTuple):
     rows: slice
     median: float
     limit: float
-    """Of the squared studentised residual, for a recording of this size."""
+    """Limit of the squared studentised residual, for a recording of this size."""
     least: float
     """Variance over the expected one, at least: stated noise is present; less than rounding is not."""
 

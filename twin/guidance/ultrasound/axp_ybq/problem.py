@@ -35,14 +35,14 @@ LEAST_MM = 1e-9
 
 
 class Spread(NamedTuple):
-    """The same spread for every pose; with equal parts inside and across the image this is unweighted least squares."""
+    """One spread for every pose; with equal parts inside and across the image this is unweighted least squares."""
 
     inside_mm: float
-    """Of the tip's residual along each axis of the image."""
+    """Deviation of the tip's residual along each axis of the image."""
     across_mm: float
-    """Of the tip's residual across the image, where the image itself measures nothing."""
+    """Deviation of the tip's residual across the image, where the image itself measures nothing."""
     direction_rad: float
-    """Of the direction's residual inside the image."""
+    """Deviation of the direction's residual inside the image."""
 
 
 UNWEIGHTED = Spread(1.0, 1.0, 1.0)

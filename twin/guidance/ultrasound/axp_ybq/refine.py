@@ -49,7 +49,7 @@ class Whitening(NamedTuple):
     """C^-1/2, applied to residuals and slopes."""
 
     own: Floats
-    """Of each pose alone, shape (n, k, k)."""
+    """Whitener of each pose alone, shape (n, k, k)."""
     shared: Floats | None
     """S, shape (n k, m); None where nothing is shared."""
     inner: Floats
@@ -73,11 +73,11 @@ class Whitening(NamedTuple):
         return cls(own, shared, (V / (s * (s + 1.0))) @ V.T)
 
     def residuals(self, r: Floats) -> Floats:
-        """Of residuals (n, k): shape (n k,)."""
+        """Whitened residuals (n, k), shape (n k,)."""
         return self._coupled((self.own @ r[:, :, None]).reshape(-1))
 
     def slopes(self, J: Floats) -> Floats:
-        """Of slopes (n, k, p): shape (n k, p)."""
+        """Whitened slopes (n, k, p), shape (n k, p)."""
         return self._coupled((self.own @ J).reshape(-1, J.shape[2]))
 
     def _coupled(self, x: Floats) -> Floats:
@@ -109,11 +109,11 @@ class Fitted(NamedTuple):
     white: Floats
     """The residuals of the poses that were used, over their spread, shape (n, k)."""
     covariance: Floats
-    """Of the free parameters and the shared errors together, shape (p + m, p + m)."""
+    """Covariance of the free parameters and the shared errors together, shape (p + m, p + m)."""
     shared: Floats
     """The shared errors' posterior mean, in standard deviations, shape (m,)."""
     whitener: Floats
-    """Of each pose's own noise, shape (n, k, k)."""
+    """Whitener of each pose's own noise, shape (n, k, k)."""
 
     @property
     def chi_squared(self) -> float:
@@ -207,12 +207,12 @@ class ImageErrors(NamedTuple):
     """
 
     names: tuple[str, ...]
-    """Of those that were tested: ``scale_u``, ``scale_v``, ``skew``, ``turn``."""
+    """Names of those that were tested: ``scale_u``, ``scale_v``, ``skew``, ``turn``."""
     found: Floats
     """Shape (k,): a, b, k (per mm) and w (rad)."""
     sd: Floats
     probability: float
-    """Of residuals so well explained where there are none: F(k, freedom)."""
+    """Chance of residuals so well explained where there are none: F(k, freedom)."""
     rms_mm: float
     """What they leave at the recorded tips, whatever the calibration does to make up for them."""
 

@@ -80,7 +80,7 @@ def _search(field, inclinations):  # type: ignore[no-untyped-def]
 
 
 MEAN_OVER_MEDIAN = float(np.sqrt(np.pi / 2.0) / np.sqrt(2.0 * np.log(2.0)))
-"""Of a Rayleigh amplitude."""
+"""Mean over median of a Rayleigh amplitude."""
 
 COARSE = 2
 """The background is taken, and the segment searched, in an image this many times smaller."""
@@ -99,7 +99,7 @@ EXPECTED = 0.4
 """What a sample must exceed the background by to lengthen a segment."""
 
 STEP_MM = 0.1
-"""Of the samples along and across the line."""
+"""Step of the samples along and across the line."""
 
 ACROSS_MM = 2.0
 """How far across the line the ridge is looked for."""
@@ -108,13 +108,13 @@ WINDOWS_MM = (0.8, 0.5, 0.4, 0.4)
 """Standard deviations of the window about the line, one per iteration; the first holds the search's own error."""
 
 SHAFT_MM = 8.0
-"""Of shaft before the tip whose median is its level."""
+"""Length of shaft before the tip whose median is its level."""
 
 NEAR_TIP_MM = 1.0
-"""Of shaft that is left out of its level: the tip is brighter."""
+"""Length of shaft that is left out of its level: the tip is brighter."""
 
 TIP_ROUNDS = 3
-"""Of shaft's level and shaft's end in turn."""
+"""Rounds of the shaft's level and end in turn."""
 
 SEEK_MM = 3.0
 """How far from the shaft's coarse end the tip is looked for."""
@@ -126,7 +126,7 @@ RIDGE_MM = 0.8
 """Width of the ridge that a profile along the line averages."""
 
 SHAFT_PERCENTILE = 70.0
-"""Of the profile along a segment: the shaft's level, though a part of the segment may be no shaft."""
+"""Percentile of the profile along a segment: the shaft's level, though a part of the segment may be no shaft."""
 
 
 class Missed(StrEnum):
@@ -175,7 +175,7 @@ class Detection(NamedTuple):
     contrast_db: float
     """Amplitude of the last piece of shaft over the background."""
     shaft_mm: float
-    """Of shaft that shows: the more, the better its direction is known."""
+    """Length of shaft that shows: the more, the better its direction is known."""
 
 
 def detect(image: Pixels, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
@@ -244,7 +244,7 @@ class _Line(NamedTuple):
 
 
 class _Tip(NamedTuple):
-    """Where the shaft ends on its line, and by how much the amplitude falls there."""
+    """End of the shaft on its line, and how much the amplitude falls there."""
 
     s: float
     step: float
