@@ -154,8 +154,8 @@ def error_jacobian(model: UrModel, q: Floats, tip_mm: float) -> Floats:
     frames = link_poses(model, q)
     R_flange = frames[..., 6, :3, :3]
     tip = frames[..., 6, :3, 3] + tip_mm * R_flange[..., 2]
-    x, at_x = np.moveaxis(frames[..., 1:, :3, 0], -2, -1), frames[..., 1:, :3, 3]
-    z, at_z = np.moveaxis(frames[..., :6, :3, 2], -2, -1), frames[..., :6, :3, 3]
+    x, at_x = np.moveaxis(frames[..., 1:, :3, 0], -2, -1), frames[..., 1:, :3, 3]  # of the frame behind each joint
+    z, at_z = np.moveaxis(frames[..., :6, :3, 2], -2, -1), frames[..., :6, :3, 3]  # of the frame before it
     J = np.zeros((*np.shape(q)[:-1], 6, N_PARAMETERS))
     J[..., :3, 0:6] = x
     J[..., :3, 6:11] = z[..., list(FREE_D)]

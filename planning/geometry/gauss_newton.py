@@ -114,12 +114,12 @@ class _Normal(NamedTuple):
         information = system.information
         if not np.isfinite(information).all():
             raise np.linalg.LinAlgError("the normal equations are not finite")
-        values, axes = np.linalg.eigh(information)
+        values, axes = np.linalg.eigh(information)  # ascending
         return cls(values, axes, axes.T @ (system.slopes.T @ system.residuals), values > NO_PIVOT * values[-1])
 
     def step(self, damping: float) -> Floats:
         """The step under a damping, shape (p,)."""
-        damped = np.where(self.known, self.values + damping * self.values[-1], 1.0)
+        damped = np.where(self.known, self.values + damping * self.values[-1], 1.0)  # 1 only avoids a division by 0
         return np.asarray(-self.axes @ (np.where(self.known, 1.0 / damped, 0.0) * self.pull))
 
     def gain(self) -> float:
@@ -140,7 +140,7 @@ def _descend(
             step = normal.step(damping)
             after = moved(estimate, step)
             if system.cost(after) <= before * NOT_HIGHER:
-                return step, after, damping / 10 if damping > 1e-9 else 0.0
+                return step, after, damping / 10 if damping > 1e-9 else 0.0  # trust the model more again
             damping = max(10 * damping, 1e-6)
     return np.zeros(len(normal.values)), estimate, damping
 
@@ -172,7 +172,7 @@ def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> 
         count: How many residuals count, where others have next to no weight; None for all.
     """
     basis, values, _ = np.linalg.svd(A, full_matrices=False)
-    basis = basis[:, values > UNSEEN * values[0]]
+    basis = basis[:, values > UNSEEN * values[0]]  # columns that depend on others count once
     outside, left = more - basis @ (basis.T @ more), z - basis @ (basis.T @ z)
     (m, k), p = more.shape, basis.shape[1]
     m = m if count is None else count
@@ -185,6 +185,6 @@ def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> 
         return None
     found = np.asarray(np.linalg.lstsq(outside, left, rcond=None)[0], dtype=np.float64)
     before, after = float(left @ left), float(np.sum((left - outside @ found) ** 2))
-    f = np.inf if after == 0.0 else (before - after) / k / (after / freedom)
+    f = np.inf if after == 0.0 else (before - after) / k / (after / freedom)  # explained over left, by degree
     sd = np.sqrt(after / freedom * np.diag(np.linalg.inv(outside.T @ outside)))
     return Lacking(found, sd, float(fdtrc(k, freedom, max(f, 0.0))), freedom, after / freedom, before / (m - p))

@@ -113,7 +113,7 @@ def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction:
         Shape (m, 6), rad.
     """
     covered = fraction**3 - fraction**4 / 2.0  # of f, from 0 to the fraction
-    along, across = -1.0 + 2.0 * (fraction - covered), 2.0 * covered
+    along, across = -1.0 + 2.0 * (fraction - covered), 2.0 * covered  # of the two directions, over the cut
     return np.asarray(corner + cut * (along[:, None] * before + across[:, None] * after))
 
 
@@ -132,7 +132,7 @@ def follow(
         waypoints: Shape (k, 6), rad.
         cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there. None
             stops at all of them.
-        speed_scale: Share of the speed limits to use, above 0, at most 1.
+        speed_scale: Fraction of the speed limits to use, above 0, at most 1.
         tip: How fast the needle's tip may move; None for as fast as the joints take it.
 
     Returns:
@@ -144,8 +144,8 @@ def follow(
     waypoints = _checked_rows(waypoints)
     if not 0.0 < speed_scale <= 1.0:
         raise InputError(f"speed_scale = {speed_scale}", where="trajectory", allowed="above 0, at most 1")
-    cuts = np.zeros(max(0, len(waypoints) - 2)) if cuts is None else np.asarray(cuts, dtype=np.float64)
-    if not cuts.any():
+    cuts = np.zeros(max(0, len(waypoints) - 2)) if cuts is None else np.asarray(cuts, dtype=np.float64)  # one a corner
+    if not cuts.any():  # every waypoint is a stop: those without motion between go
         waypoints = waypoints[np.append(True, np.abs(np.diff(waypoints, axis=0)).max(axis=1) > STANDSTILL_RAD)]
         cuts = np.zeros(max(0, len(waypoints) - 2))
     if len(waypoints) == 1:
@@ -162,7 +162,7 @@ def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
     if not (fits and (straight >= -STANDSTILL_RAD).all()):
         allowed = "one a corner, two of them no longer than the segment between"
         raise InputError(f"cuts {cuts.tolist()} of {len(lengths)} segments", where="trajectory", allowed=allowed)
-    return np.asarray(straight.clip(0.0))
+    return np.asarray(straight.clip(0.0))  # two cuts may use a segment up, but for rounding
 
 
 def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slow: _Slow) -> Iterator[list[_Stretch]]:
@@ -177,7 +177,7 @@ def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slo
     speeds = _corner_speeds(round_speeds, straight, rates)
     run: list[_Stretch] = []
     for at, (direction, length) in enumerate(zip(directions, straight, strict=True)):
-        start = waypoints[at] + (cuts[at - 1] if at else 0.0) * direction
+        start = waypoints[at] + (cuts[at - 1] if at else 0.0) * direction  # behind the rounding before it
         if length > STANDSTILL_RAD:
             run.append(_Straight(start, direction, time_law(float(length), rates[at], speeds[at], speeds[at + 1])))
         if speeds[at + 1] == 0.0:
@@ -193,7 +193,7 @@ def _segment_rates(model: UrModel, start: Floats, end: Floats, slow: _Slow) -> R
     direction = (end - start) / length
     fraction = np.maximum(np.abs(direction), TINY)
     limits = (slow.speed_scale * model.max_speeds, model.max_acceleration, MAX_JERK)
-    rates = Rates(*(float((limit / fraction).min()) for limit in limits))
+    rates = Rates(*(float((limit / fraction).min()) for limit in limits))  # the slowest joint decides
     along = np.linspace(0.0, 1.0, math.ceil(length / TIP_STEP_RAD) + 1)[:, None]
     return rates._replace(speed=min(rates.speed, slow.by_tip(model, start + along * (end - start), direction)))
 
@@ -202,7 +202,7 @@ def _round_speed(model: UrModel, corner: Floats, before: Floats, after: Floats, 
     """Highest speed past a corner by acceleration, jerk and tip; 0 where the arm stops."""
     if cut == 0.0:
         return 0.0
-    turn = max(TINY, float(np.abs(after - before).max()))
+    turn = max(TINY, float(np.abs(after - before).max()))  # |w - u| of the joint that changes most
     by_acceleration = math.sqrt(model.max_acceleration * cut / (0.75 * turn))
     by_jerk = (MAX_JERK * cut * cut / (1.5 * turn)) ** (1.0 / 3.0)
     x = np.linspace(0.0, 1.0, math.ceil(2.0 * cut / TIP_STEP_RAD) + 2)
@@ -219,7 +219,7 @@ def _corner_speeds(round_speeds: list[float], straight: Floats, rates: list[Rate
         speeds[at + 1] = min(
             speeds[at + 1], reachable_speed(speeds[at], speeds[at + 1], float(straight[at]), rates[at])
         )
-    for at in range(len(straight) - 1, -1, -1):
+    for at in range(len(straight) - 1, -1, -1):  # backwards: what can be braked from
         speeds[at] = min(speeds[at], reachable_speed(speeds[at + 1], speeds[at], float(straight[at]), rates[at]))
     return speeds
 
@@ -231,7 +231,7 @@ def _sampled(waypoints: Floats, runs: Iterable[list[_Stretch]]) -> Trajectory:
         ends = np.cumsum([stretch.duration_s for stretch in run])
         steps = _steps(float(ends[-1]))
         times = ends[-1] * np.arange(1, steps + 1) / steps
-        which = np.minimum(np.searchsorted(ends, times), len(run) - 1)
+        which = np.minimum(np.searchsorted(ends, times), len(run) - 1)  # the last time may round beyond its end
         for at, stretch in enumerate(run):
             begin = ends[at] - stretch.duration_s
             rows.append(stretch.at((times[which == at] - begin).clip(0.0, stretch.duration_s)))
@@ -292,10 +292,10 @@ def _tip_rates(model: UrModel, spline: scipy.interpolate.CubicSpline, max_tip_sp
     if not slope.any():
         raise InputError("no joint moves", where="trajectory", allowed="a motion")
     speed = min(max_tip_speed_mm_s, float((model.max_speeds / np.maximum(slope, TINY)).min()))
-    speed = min(speed, math.sqrt(model.max_acceleration / 2.0 / max(bend, TINY)))
-    speed = min(speed, (MAX_JERK / 3.0 / max(twist, TINY)) ** (1.0 / 3.0))
-    acceleration = model.max_acceleration / 2.0 / float(slope.max())
-    acceleration = min(acceleration, MAX_JERK / 9.0 / max(bend * speed, TINY))
+    speed = min(speed, math.sqrt(model.max_acceleration / 2.0 / max(bend, TINY)))  # half the limit to q2 v^2
+    speed = min(speed, (MAX_JERK / 3.0 / max(twist, TINY)) ** (1.0 / 3.0))  # a third to q3 v^3
+    acceleration = model.max_acceleration / 2.0 / float(slope.max())  # the other half to q1 a
+    acceleration = min(acceleration, MAX_JERK / 9.0 / max(bend * speed, TINY))  # a third of the jerk to 3 q2 v a
     return Rates(speed, acceleration, MAX_JERK / 3.0 / float(slope.max()))
 
 
@@ -307,7 +307,7 @@ def _checked_rows(q: Floats) -> Floats:
 
 
 LENGTH_SLACK = 1e-6
-"""Share of a length to spare for a change of speed: without, ruckig's rounding may miss the fit and take a detour."""
+"""Fraction of a length to spare for a change of speed: without, ruckig's rounding may miss the fit and take a detour."""
 
 BISECTIONS = 60
 """Bisections of an interval of speeds: to rounding."""

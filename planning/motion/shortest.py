@@ -104,7 +104,7 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
     best = _straight(task.contact_of, task.home, task.goals, away)
     for run in range(RUNS):
         enough = math.inf if best is None else best.length
-        sought = [goal for goal, straight in enumerate(away) if straight * SHORT_ENOUGH < enough]
+        sought = [goal for goal, straight in enumerate(away) if straight * SHORT_ENOUGH < enough]  # worth a run
         if not sought:
             break
         found = _run(task._replace(goals=task.goals[sought]), best, seed + run, max_samples)
@@ -134,7 +134,7 @@ def _straight(contact_of: SegmentContact, home: Floats, goals: Floats, away: lis
 def _run(task: Task, best: Path | None, seed: int, max_samples: int) -> Connected:
     """One run: where a path shorter than the best can lie; without one near home and goals first, then anywhere."""
     if best is not None:
-        spare = (best.length - np.abs(task.goals - task.home)).max(axis=0) / 2.0
+        spare = (best.length - np.abs(task.goals - task.home)).max(axis=0) / 2.0  # there and back along one joint
         limits = Limits(_box(task, spare.clip(0.0)), max_samples, best.length)
         return connect(task.contact_of, task.home, task.goals, limits, seed=seed, clear_of=task.clear_of)
     near = Limits(_box(task, NEAR_RAD), max_samples // 2)
@@ -190,7 +190,7 @@ class Cut:
 
     def __init__(self, model: UrModel, boxes: Sequence[Box], points: Floats, home: Floats, goals: Floats) -> None:
         self._model, self._boxes, self._home, self._goals = model, boxes, home, goals
-        self._points = points[:: max(1, -(-len(points) // MOST_POINTS))]
+        self._points = points[:: max(1, -(-len(points) // MOST_POINTS))]  # rounded up: at most that many
 
     @cached_property
     def off(self) -> Bools:

@@ -65,7 +65,7 @@ class DeflectionBound:
         """
         length = np.asarray(path_length, dtype=np.float64)
         row = np.searchsorted(self.depth_mm, np.nan_to_num(length))
-        found = np.append(self.bevel_mm, np.inf)[np.minimum(row, len(self.bevel_mm))] + self.sag_mm
+        found = np.append(self.bevel_mm, np.inf)[np.minimum(row, len(self.bevel_mm))] + self.sag_mm  # inf past the end
         return np.asarray(np.where(np.isnan(length), np.nan, found))
 
 
@@ -155,7 +155,7 @@ class Beam:
             tip_load: Lateral force on a free tip, N.
         """
         bands, load = self._bands(foundation), self._load(foundation, rest)
-        load[-2] += tip_load
+        load[-2] += tip_load  # the last two unknowns are the tip's w and w'
         free = bands[:, 2:]  # the first node is clamped
         right = load[2:].copy()
         if tip_mm is None:
@@ -170,7 +170,7 @@ class Beam:
         clamped[0, at], right[at] = 1.0, tip_mm
         found = scipy.linalg.solveh_banded(clamped, right, lower=True, check_finite=False)
         row = sum(free[below, at - below] * found[at - below] for below in range(1, BANDS))
-        force = row + free[0, at] * found[at] + free[1, at] * found[at + 1] - load[-2]
+        force = row + free[0, at] * found[at] + free[1, at] * found[at + 1] - load[-2]  # the row that was replaced
         return _shape(found, float(force), (bands, load))
 
     def _bands(self, foundation: Floats) -> Floats:
@@ -199,7 +199,7 @@ class Beam:
         for row in range(4):
             for column in range(row, 4):
                 each = bending[row, column] + foundation * bedding[row, column]
-                bands[column - row, row : row + 2 * self.elements : 2] += each
+                bands[column - row, row : row + 2 * self.elements : 2] += each  # two unknowns a node
         return bands
 
     def _load(self, foundation: Floats, rest: Floats) -> Floats:
@@ -275,12 +275,12 @@ def bevel_path(shaft: Shaft, stiffness: Floats, alpha: Floats, step_mm: float) -
         step_mm: Length of a step: see `step_for`.
     """
     count = len(stiffness)
-    elements = max(round(shaft.length_mm / step_mm), count)
+    elements = max(round(shaft.length_mm / step_mm), count)  # the path may be as long as the shaft
     beam = Beam(shaft.bending_stiffness, step_mm, elements)
     cut, force, largest, holder, moment = np.zeros((5, count + 1))
     before, slope, shape = 0.0, 0.0, None
     for done in range(count):
-        ahead = 1.5 * slope - 0.5 * before
+        ahead = 1.5 * slope - 0.5 * before  # Adams and Bashforth, two steps
         cut[done + 1] = cut[done] + step_mm * (ahead + alpha[done])
         shape = _inserted(beam, stiffness[: done + 1], cut[: done + 2])
         before, slope, force[done + 1] = slope, float(shape.slope[-1]), shape.tip_force

@@ -78,7 +78,7 @@ def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Fl
     if freedom is None:
         return chance_within(values, np.full((len(cov), 1), radius_mm))[:, 0]
     parts = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    radii = radius_mm * np.sqrt(chdtri(freedom, parts) / freedom)
+    radii = radius_mm * np.sqrt(chdtri(freedom, parts) / freedom)  # a larger error is a smaller radius
     return np.asarray(chance_within(values, np.broadcast_to(radii, (len(cov), QUANTILES))).mean(axis=1))
 
 
@@ -102,7 +102,7 @@ def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) ->
 
 
 def _with_unknown_size(rays: TargetRays, inverse: Floats, freedom: int) -> Floats:
-    squares = np.einsum("ia,nab,ib->ni", rays.directions, inverse, rays.directions)
+    squares = np.einsum("ia,nab,ib->ni", rays.directions, inverse, rays.directions)  # m_i^2
     weights = squares**-1.5
     within = fdtr(3, freedom, rays.depth**2 * squares[:, rays.ray] / 3)
     found = (rays.sign * np.sign(rays.depth) * within * weights[:, rays.ray]).sum(axis=1) / weights.sum(axis=1)
@@ -196,7 +196,7 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     """Cast the directions once; the mesh is closed."""
     directions = _fibonacci(DIRECTIONS)
     found = crossings(mesh, target_ct, directions)
-    from_last = (found.first + found.count - 1)[found.ray] - np.arange(len(found.ray))
+    from_last = (found.first + found.count - 1)[found.ray] - np.arange(len(found.ray))  # 0 for a ray's last
     sign = np.where(from_last % 2 == 0, 1.0, -1.0)
     area = _areas(mesh)[found.face]
     facing = np.abs(np.einsum("ca,ca->c", area, directions[found.ray])) / (
@@ -209,7 +209,7 @@ def _fibonacci(count: int) -> Floats:
     """Unit vectors spread evenly over the ball, shape (n, 3)."""
     number = np.arange(count)
     z = 1 - (2 * number + 1) / count
-    angle = number * np.pi * (3 - np.sqrt(5))
+    angle = number * np.pi * (3 - np.sqrt(5))  # golden angle
     across = np.sqrt(1 - z**2)
     return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
 
@@ -223,10 +223,10 @@ def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
     """
     directions = _fibonacci(DIRECTIONS)
     along = directions @ offset
-    inside = along**2 - offset @ offset + radius_mm**2
+    inside = along**2 - offset @ offset + radius_mm**2  # below 0 the ray misses the ball
     half = np.sqrt(np.maximum(inside, 0.0))
     depth, sign = np.concatenate([half - along, -half - along]), np.repeat([1.0, -1.0], DIRECTIONS)
-    ahead = (np.tile(inside, 2) > 0) & (depth > 0)
+    ahead = (np.tile(inside, 2) > 0) & (depth > 0)  # behind the tip there is no ray
     ray = np.tile(np.arange(DIRECTIONS), 2)
     return TargetRays(directions, ray[ahead], depth[ahead], sign[ahead])
 

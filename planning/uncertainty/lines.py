@@ -101,7 +101,7 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
             uncertainty = replace(pose, surface_mm=surface_mm) if surface_mm > 0 else pose
             length, threshold = float(around.length[row, column]), float(threshold_mm[column])
             reach = uncertainty.reach(length, threshold)
-            if needles.near.distance[row, column] > max(reach):
+            if needles.near.distance[row, column] > max(reach):  # no line leads so far
                 continue
             faces = near_faces(around.blocks[column], around.target_ct, outward, length, reach)
             if len(faces):
@@ -135,7 +135,7 @@ def line_chance(
     sigma = math.hypot(float(np.linalg.norm(slope)), uncertainty.surface_mm)
     likeliest, alone = likeliest_slope(problem, uncertainty, slope, _slack(problem))
     steep = math.hypot(float(np.linalg.norm(likeliest)), uncertainty.surface_mm)
-    if not steep > 0.0:
+    if not steep > 0.0:  # nothing moves the needle against the structure
         return math.nan
     basis = line_basis(likeliest, uncertainty.surface_mm / steep, float(np.linalg.norm(likeliest)) / steep)
     first = -_slack(problem) / max(sigma, 1e-12)
@@ -161,7 +161,7 @@ def chance_by_rules(
     surface = uncertainty.surface_mm > 0.0
     rules = [many_lines(surface, count, uncertainty.freedom) for count in (MANY_LINES, MOST_LINES)]
     if alone and uncertainty.freedom is None:
-        rules.insert(0, few_lines(surface))
+        rules.insert(0, few_lines(surface))  # exact enough only about one smooth nearest surface
     for lines in rules:
         mean, spread = by_lines(problem, uncertainty, basis, lines, first)
         if spread <= DISAGREE:
@@ -226,7 +226,7 @@ def many_lines(surface: bool, count: int, freedom: int | None) -> Lines:
     normal = ndtri(np.clip(drawn[:, : 4 + mixed], 1e-12, 1 - 1e-12))
     length = np.linalg.norm(normal, axis=1)[:, None]
     offsets = np.zeros((count, 5))
-    offsets[:, : 4 + mixed] = normal * np.minimum(1.0, WIDEST / length)
+    offsets[:, : 4 + mixed] = normal * np.minimum(1.0, WIDEST / length)  # farther ones are pulled in
     sizes = np.ones(count) if freedom is None else error_sizes(freedom)[(drawn[:, -1] * SIZES).astype(np.int64)]
     return Lines(offsets, sizes, np.full(count, 1.0 / count))
 
@@ -249,7 +249,7 @@ def line_basis(slope: Floats, by_surface: float, by_pose: float) -> Floats:
     """Orthonormal rows (6, 6) of six normals (five of the pose, the surface's): a, four across, the mixed one."""
     size = float(np.linalg.norm(slope))
     down = -slope / size if size > 0.0 else np.eye(5)[0]
-    frame = np.linalg.qr(np.column_stack([down, np.eye(5)]))[0]
+    frame = np.linalg.qr(np.column_stack([down, np.eye(5)]))[0]  # its first column is down, up to its sign
     basis = np.zeros((6, 6))
     basis[0, :5], basis[0, 5] = by_pose * down, -by_surface
     basis[1:5, :5] = frame[:, 1:5].T
@@ -568,7 +568,7 @@ def likeliest_slope(
     if not np.isfinite(radii[best]) or radii[best] <= 0.0 or radii[0] < radii[best] + PREFERRED:
         best = 0
     flat = np.full(len(radii), np.inf)
-    towards = directions @ directions[best]
+    towards = directions @ directions[best]  # cosine: a plane across the best is met at radius / cosine
     np.divide(radii[best], towards, out=flat, where=towards > 0.05)
     alone = not bool(((radii < SOONER * flat) & (radii < NO_MATTER)).any())
     return (slope, alone) if best == 0 else (-directions[best] * (slack / radii[best]), alone)

@@ -44,7 +44,7 @@ def not_cancelled(fit: FitUncertainty, J: Floats, target_base: Floats) -> Floats
         Shape (n, 6, 28).
     """
     if not fit.noise.touches_known:
-        return np.asarray(np.sqrt(2.0) * J)
+        return np.asarray(np.sqrt(2.0) * J)  # as if the markers' errors were new ones of the same size
     return np.asarray(J - fit.map_at(target_base) @ fit.noise.arm_jacobian)
 
 
@@ -86,7 +86,7 @@ class PoseError:
         J, arm = error_jacobian(self.model, q, self.tip_mm), self.errors.arm
         lasting = not_cancelled(self.fit, J, self.target_base) * np.sqrt(self.fit.noise.eta_variances)
         anew = J[..., PARAMETERS["joint"]] * np.hypot(arm.drift, arm.repeatability)
-        root = self.fit.test.scale * np.concatenate([lasting, anew], axis=-1)
+        root = self.fit.test.scale * np.concatenate([lasting, anew], axis=-1)  # root @ root' is the arm's part
         straight = readings + root @ np.swapaxes(root, -1, -2)
         return straight if self.bend is None else straight + _bend_covariance(self.model, q, self.bend)
 
@@ -96,7 +96,7 @@ class PoseError:
 
     def covariance_ct(self, q: Floats) -> Floats:
         """Sigma6 in CT axes, shape (n, 6, 6)."""
-        turn = np.kron(np.eye(2), self.fit.R_base_ct)
+        turn = np.kron(np.eye(2), self.fit.R_base_ct)  # rotates shift and rotation alike
         return np.asarray(turn.T @ self.covariance(q) @ turn)
 
     def tip_covariance_ct(self, q: Floats) -> Floats:
@@ -158,7 +158,7 @@ def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
     For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h, and
     by d y with the shaft about -x; each with half the variance.
     """
-    R = flange_pose(model, q)[..., :3, :3]
+    R = flange_pose(model, q)[..., :3, :3]  # the needle lies along the flange's z
     x, y, turn = R[..., 0], R[..., 1], 1 / bend.clamped_mm
     sides = np.stack([np.concatenate([x, turn * y], axis=-1), np.concatenate([y, -turn * x], axis=-1)], axis=-1)
     return np.asarray(bend.tip_mm**2 / 2 * sides @ np.swapaxes(sides, -1, -2))
@@ -215,13 +215,13 @@ def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudg
         outward_base: Shape (3,), unit, from the target along the needle.
     """
     parts = {source: float(np.trace(cov[0, :3, :3])) for source, cov in error.parts(q[None]).items()}
-    parts["repeatability"] += parts.pop("arrival")
+    parts["repeatability"] += parts.pop("arrival")  # one key states both
     parts["target"] = float(np.trace(error.target_covariance))
     whole = error.tip_covariance(q[None])[0]
     variance, along = float(np.trace(whole)), float(outward_base @ whole @ outward_base)
     return ErrorBudget(
         rms_mm=float(np.sqrt(variance)),
-        lateral_mm=float(np.sqrt(max(variance - along, 0.0))),
+        lateral_mm=float(np.sqrt(max(variance - along, 0.0))),  # rounding may leave less than 0
         depth_mm=float(np.sqrt(along)),
         half_axes_mm=error.fit.test.region_factor * np.sqrt(np.linalg.eigvalsh(whole)[::-1]),
         fraction={source: part / variance if variance > 0 else 0.0 for source, part in parts.items()},
@@ -276,7 +276,7 @@ class AnyPose(NamedTuple):
             radius_mm: The needle's.
             surface_mm: Shape (k,), by which each structure's surface may lie off as a whole, at most.
         """
-        count = 5 + int((surface_mm > 0).any())
+        count = 5 + int((surface_mm > 0).any())  # normals: shift, lean across the axis, the surface's
         square = chdtri(count, chance) if freedom is None else count * fdtri(count, freedom, 1.0 - chance)
         z = np.sqrt(square)
         kept, deepest = 1.0 - z * self.deviation_rad, np.asarray(lengths_mm, dtype=np.float64)
@@ -306,7 +306,7 @@ def any_pose(error: PoseError) -> AnyPose:
             lasting = own + np.linalg.norm(at_touches * np.sqrt(variance), 2)
         else:
             lasting = np.sqrt(2.0) * own
-        largest = np.linalg.eigvalsh(readings[rows, rows])[-1]
+        largest = np.linalg.eigvalsh(readings[rows, rows])[-1]  # ascending: the last is the largest
         bounds.append(float(np.sqrt(largest + scale**2 * (lasting**2 + arrival**2))))
     return AnyPose(bounds[0], bounds[1])
 
@@ -314,8 +314,8 @@ def any_pose(error: PoseError) -> AnyPose:
 def _levers_mm(error: PoseError) -> Floats:
     """Bounds of distances of frame origins 0 to 6 from a tip on the target, shape (7,): the chain from either end."""
     model, target = error.model, error.target_base
-    links = np.hypot(model.a, model.d)
+    links = np.hypot(model.a, model.d)  # straight from one frame's origin to the next
     from_tip = error.tip_mm + np.append(np.cumsum(links[::-1])[::-1], 0.0)
     to_base, to_shoulder = np.linalg.norm(target), np.linalg.norm(target - model.shoulder_base)
     from_base = np.concatenate([[to_base], to_shoulder + np.concatenate([[0.0], np.cumsum(links[1:])])])
-    return np.asarray(np.minimum(from_tip, from_base))
+    return np.asarray(np.minimum(from_tip, from_base))  # each is a bound: the triangle inequality
