@@ -231,14 +231,14 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     lengths = np.sqrt(np.einsum("ij,ij->i", rays, rays))
     origin = np.array(origin, dtype=np.float64)
     room, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
-    while total > room:
+    while total > room:  # space was too small: once more, with as much as was counted
         room = total
         ray, depth, face = np.empty(room, np.int64), np.empty(room), np.empty(room, np.int64)
         way = np.empty(room, np.int64)
         binned = rays, lengths, order, starts, bins
         total = _visit(mesh.vertices, mesh.faces, origin, binned, length, ray, depth, face, way)
     ray, depth, face, way = ray[:total], depth[:total], face[:total], way[:total]
-    rows = np.lexsort((depth, ray))
+    rows = np.lexsort((depth, ray))  # by ray, then by depth
     ray, depth, face, way = ray[rows], depth[rows], face[rows], way[rows]
     fresh = np.ones(total, bool)
     fresh[1:] = (ray[1:] != ray[:-1]) | (depth[1:] - depth[:-1] > SAME_CROSSING_MM)
@@ -271,7 +271,7 @@ def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
 
     Shapes (n,) and (bins + 1,). There is about a ray a bin, as long as that gives no more than the most.
     """
-    count = min(MOST_POLAR_BINS, max(LEAST_POLAR_BINS, math.isqrt(len(directions) // 2)))
+    count = min(MOST_POLAR_BINS, max(LEAST_POLAR_BINS, math.isqrt(len(directions) // 2)))  # 2 count^2 bins
     polar = np.arccos(np.clip(directions[:, 2], -1, 1))
     azimuth = np.arctan2(directions[:, 1], directions[:, 0]) + np.pi
     row = np.minimum((polar * (count / np.pi)).astype(np.int64), count - 1)

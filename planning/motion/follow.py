@@ -213,8 +213,8 @@ def _round_speed(model: UrModel, corner: Floats, before: Floats, after: Floats, 
 
 def _corner_speeds(round_speeds: list[float], straight: Floats, rates: list[Rates]) -> list[float]:
     """The speed at each waypoint, 0 at the ends: what the corner allows, and what the segments can change it to."""
-    least_speeds = [min(before.speed, after.speed) for before, after in pairwise(rates)]
-    speeds = [0.0, *(min(pair) for pair in zip(round_speeds, least_speeds, strict=True)), 0.0]
+    slower = [min(before.speed, after.speed) for before, after in pairwise(rates)]
+    speeds = [0.0, *(min(pair) for pair in zip(round_speeds, slower, strict=True)), 0.0]
     for at in range(len(straight)):
         speeds[at + 1] = min(
             speeds[at + 1], reachable_speed(speeds[at], speeds[at + 1], float(straight[at]), rates[at])
@@ -307,7 +307,7 @@ def _checked_rows(q: Floats) -> Floats:
 
 
 LENGTH_SLACK = 1e-6
-"""Fraction of a length to spare for a change of speed: without, ruckig's rounding may miss the fit and take a detour."""
+"""Fraction of a length to spare for a change of speed: without, ruckig may miss the fit and take a detour."""
 
 BISECTIONS = 60
 """Bisections of an interval of speeds: to rounding."""

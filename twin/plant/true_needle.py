@@ -66,7 +66,7 @@ def joints_at_points(model: UrModel, points_base: Floats, q_start: Floats, eta: 
     """
     q = np.array(np.broadcast_to(q_start, (*points_base.shape[:-1], 6)))
     Jq = error_jacobian(model, q_start, tip_mm)[..., :3, PARAMETERS["joint"]]  # Newton's with the nominal arm's slope
-    back = np.linalg.pinv(Jq)
+    back = np.linalg.pinv(Jq)  # of the 6 joints the smallest change
     for _ in range(NEWTON_STEPS):
         missing = points_base - true_needle(model, q, eta, tip_mm).tip_base
         q += (back @ missing[..., None])[..., 0]

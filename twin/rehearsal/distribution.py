@@ -238,7 +238,7 @@ def _measured(context: CaseContext, query: _Query, trials: Trials, off: Floats, 
     model = chance_model(case, context.anatomy, context.engine, believed)
     assert model is not None
     chances = refined_chances(model, puncture.outward_ct[None], q, model.chances(puncture.outward_ct[None], q))
-    off_mm = off * _surfaces(model, puncture, query.truth)
+    off_mm = off * _surfaces(model, puncture, query.truth)  # drawn in deviations
     inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
     return Distribution(
@@ -282,7 +282,7 @@ def _hits(context: CaseContext, trials: Trials, off_mm: Floats) -> Bools:
     shift = np.linalg.norm(trials.tip_ct - case.target_ct, axis=1)
     for row in np.flatnonzero((off != 0) & (surface_distance(mesh, case.target_ct) - shift <= abs(off))):
         if surface_distance(mesh, trials.tip_ct[row]) <= abs(off[row]):
-            hit[row] = off[row] > 0
+            hit[row] = off[row] > 0  # within the shell that moved: inside if the surface moved out
     return hit
 
 
@@ -305,7 +305,7 @@ def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: F
     touched = np.zeros((len(trials.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):
         length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], CONTACT_MM)
-        for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):
+        for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):  # others are surely clear
             touched[row, place] = context.engine.collides(
                 int(column), trials.tip_ct[row], trials.outward_ct[row], length, float(radius[row])
             )

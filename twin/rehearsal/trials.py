@@ -108,7 +108,7 @@ def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rand
         count: Trials.
         rng: The source of all draws.
     """
-    eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))
+    eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))  # stays for all touches of a trial
     T_base_ct, residuals = _registered(puncture, errors, eta, rng)
     q, reached = _commanded(puncture, T_base_ct)
     arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.repeatability, errors.arm.drift)
@@ -119,7 +119,7 @@ def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rand
     if puncture.bend is not None:
         side = rng.uniform(0, 2 * np.pi, count)
         needle = bent(needle, puncture.bend, side)
-    outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T
+    outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T  # z points to the tip, outward away from it
     R_ct_needle = T_ct_base[:3, :3] @ needle.R_base_needle
     tip_ct, squares = apply(T_ct_base, needle.tip_base), _chi_squared(puncture, residuals)
     return Trials(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares, side)
@@ -135,7 +135,7 @@ def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
     """
     x, y = needle.R_base_needle[:, :, 0], needle.R_base_needle[:, :, 1]
     c, s = np.cos(side)[:, None], np.sin(side)[:, None]
-    turn = bend.tip_mm / bend.clamped_mm * (c * y - s * x)
+    turn = bend.tip_mm / bend.clamped_mm * (c * y - s * x)  # rotation vector: z x the side that it bends to
     return TrueNeedle(needle.tip_base + bend.tip_mm * (c * x + s * y), exp_rotation(turn) @ needle.R_base_needle)
 
 
@@ -144,7 +144,7 @@ def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:
     R, points = puncture.T_base_ct[:3, :3], apply(puncture.T_base_ct, puncture.points_ct)
     A = design(points, points.mean(axis=0))
     weights = np.asarray(np.linalg.inv(puncture.noise.covariance(R).whole), dtype=np.float64)
-    left = weights - weights @ A @ least_squares_map(A, weights)
+    left = weights - weights @ A @ least_squares_map(A, weights)  # less what the fit explains
     return np.asarray(np.einsum("na,ab,nb->n", residuals, left, residuals, optimize=True))
 
 
@@ -158,7 +158,7 @@ def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.ran
     read_ct = puncture.points_ct + _normal(rng, errors.marker_cov_ct, (count, markers))
     there = np.broadcast_to(apply(puncture.T_base_ct, puncture.points_ct), (count, markers, 3))
     q_true = joints_at_points(puncture.model, there, puncture.q_touch, eta_of, puncture.tip_mm)
-    q_encoder = q_true - rng.normal(size=q_true.shape) * errors.arm.repeatability
+    q_encoder = q_true - rng.normal(size=q_true.shape) * errors.arm.repeatability  # true minus arrival
     flange = flange_pose(puncture.model, q_encoder)
     touched = flange[..., :3, 3] + puncture.tip_mm * flange[..., :3, 2]
     touched = touched + rng.normal(size=touched.shape) * errors.touch_mm
@@ -187,12 +187,12 @@ def _commanded(puncture: Puncture, T_base_ct: Floats) -> tuple[Floats, Bools]:
     poses[:, :3, 3], poses[:, 3, 3] = target_base - puncture.tip_mm * poses[:, :3, 2], 1.0
     turns = wrap_to_pi(inverse(puncture.model, poses) - puncture.q_insertion)
     far = np.where(np.isnan(turns).any(axis=2), np.inf, np.abs(turns).max(axis=2))
-    branch = far.argmin(axis=1)
+    branch = far.argmin(axis=1)  # the planned one moves least
     rows = np.arange(len(poses))
     return puncture.q_insertion + turns[rows, branch], np.isfinite(far[rows, branch])
 
 
 def _normal(rng: np.random.Generator, cov: Floats, shape: tuple[int, ...]) -> Floats:
     """Normal vectors (..., 3) of a covariance (3, 3), which may be singular."""
-    values, axes = np.linalg.eigh(cov)
+    values, axes = np.linalg.eigh(cov)  # no Cholesky: it may be singular
     return np.asarray(rng.normal(size=(*shape, 3)) * np.sqrt(np.maximum(values, 0.0)) @ axes.T)

@@ -275,14 +275,14 @@ def damping(stiffness: Stiffness, J: Floats, M: Floats) -> Floats:
     """
     root = np.sqrt(stiffness.diagonal)
     squares, U = np.linalg.eigh(root[:, None] * (J @ np.linalg.solve(M, J.T)) * root)
-    modes = root[:, None] * U
+    modes = root[:, None] * U  # K^1/2 U
     w = np.sqrt(np.maximum(squares, SLOWEST**2 * squares[-1]))
     return np.asarray(2.0 * stiffness.damping_ratio * (modes / w) @ modes.T)
 
 
 def stability_ratio(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> float:
     """sqrt(K / m) dt of the fastest mode: the largest eigenvalue of Lambda^-1 K = J M^-1 J' K."""
-    root = np.sqrt(stiffness.diagonal)[:, None] * J
+    root = np.sqrt(stiffness.diagonal)[:, None] * J  # symmetric form: the same eigenvalues
     fastest = np.linalg.eigvalsh(root @ np.linalg.solve(M, root.T))[-1]
     return float(np.sqrt(fastest) * dt)
 
@@ -361,7 +361,7 @@ def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float
         still = np.zeros((len(times), 6))
         return _reference(model, tip_m, np.tile(trajectory.q[0], (len(times), 1)), still, still)
     spline = CubicSpline(trajectory.times_s, trajectory.q, bc_type="clamped")
-    at_rest = (times >= trajectory.duration_s)[:, None]
+    at_rest = (times >= trajectory.duration_s)[:, None]  # the spline's slopes there are rounding
     return _reference(
         model, tip_m, spline(times), np.where(at_rest, 0.0, spline(times, 1)), np.where(at_rest, 0.0, spline(times, 2))
     )

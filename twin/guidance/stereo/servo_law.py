@@ -110,7 +110,7 @@ def ball_jacobian(rod: CarriedRod, q: Floats) -> Floats:
     """The nominal Jacobian at the ball, shape (6, 6): mm and rad per rad, for q of shape (6,)."""
     J = jacobian(rod.model, q)
     lever = rod.rod_mm * flange_pose(rod.model, q)[:3, 2]
-    J[:3] += np.cross(J[3:].T, lever).T
+    J[:3] += np.cross(J[3:].T, lever).T  # v_ball = v_flange + w x r
     return J
 
 
@@ -140,9 +140,9 @@ def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits
     start, path, only_position = ball_base(rod, q), [np.asarray(q, dtype=np.float64)], False
     for piece in range(1, count + 1):
         here = path[-1]
-        turn, blind = _piece(rod, here, start + move * (piece / count) - ball_base(rod, here))
-        workcell = limits.joint_step_rad - np.abs(here - q).max()
-        fraction = min(1.0, max(workcell, 0.0) / max(float(np.abs(turn).max()), 1e-12))
+        turn, blind = _piece(rod, here, start + move * (piece / count) - ball_base(rod, here))  # with what is missing
+        slack = limits.joint_step_rad - np.abs(here - q).max()
+        fraction = min(1.0, max(slack, 0.0) / max(float(np.abs(turn).max()), 1e-12))
         there = here + fraction * turn
         stop = _refusal(rod, there, blind, limits)
         if stop is not None:
@@ -171,7 +171,7 @@ def damped(J: Floats, goal: Floats) -> Floats:
         goal: Shape (m,).
     """
     sigma = float(np.linalg.svd(J, compute_uv=False)[-1])
-    squared = DAMPING**2 * max(0.0, 1.0 - (sigma / MIN_SIGMA) ** 2)
+    squared = DAMPING**2 * max(0.0, 1.0 - (sigma / MIN_SIGMA) ** 2)  # lambda^2
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + squared * np.eye(len(J)), goal))
 
 
@@ -269,7 +269,7 @@ def map_head(
     pairs = MarkerPairs(names, np.asarray(markers_m, dtype=np.float64), seen.points_c)
     plain = register(pairs, method="rigid", target_ct=np.mean(targets_m, axis=0), where=where)
     covariances, center = seen.covariances + max(image_mm, 1e-9) ** 2 * np.eye(3), seen.points_c.mean(axis=0)
-    roots = np.linalg.inv(np.linalg.cholesky(covariances))
+    roots = np.linalg.inv(np.linalg.cholesky(covariances))  # whiten each marker's residual
 
     def linearised(T: Floats) -> System[Floats]:
         fitted = apply(T, pairs.points_ct)

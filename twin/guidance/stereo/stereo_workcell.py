@@ -115,8 +115,8 @@ class StereoWorkcell:
         toward = point_c - camera.center_c
         across = tangent_axes(toward / np.linalg.norm(toward))
         angles = [(r * radius_mm, 2 * np.pi * k / n) for r, n in LINE_OF_SIGHT_RINGS for k in range(n)]
-        detections = np.array([r * (np.cos(a) * across[:, 0] + np.sin(a) * across[:, 1]) for r, a in angles])
-        rays = toward + detections
+        ends = np.array([r * (np.cos(a) * across[:, 0] + np.sin(a) * across[:, 1]) for r, a in angles])
+        rays = toward + ends
         lengths = np.linalg.norm(rays, axis=1)
         nearby = self._head_about(camera.center_c, toward / np.linalg.norm(toward), radius_mm)
         if nearby is None:

@@ -160,8 +160,8 @@ class _Problem:
         self.start = _Iterate(cameras, T_c_bodies, points)
         self.seen = seen
         self.sigma = np.concatenate([np.ravel(part) for part in spreads])
-        self.free = self.sigma > 0
-        self.prior = np.isfinite(self.sigma[self.free])
+        self.free = self.sigma > 0  # a deviation of 0 fixes
+        self.prior = np.isfinite(self.sigma[self.free])  # an infinite one has no prior row
         each = np.broadcast_to(seen.covariance, (len(seen.pixels), 2, 2))
         self.whitening = np.linalg.inv(np.linalg.cholesky(each))
         self.first_body = 14 * len(cameras)
@@ -191,7 +191,7 @@ class _Problem:
     def errors(self, x: Floats) -> Floats:
         miss = self.at(x).predicted(self.seen) - self.seen.pixels
         white = np.einsum("nij,nj->ni", self.whitening, miss)
-        return np.concatenate([white.ravel(), (x / self.sigma[self.free])[self.prior]])
+        return np.concatenate([white.ravel(), (x / self.sigma[self.free])[self.prior]])  # pixels, then priors
 
     def jacobian(self, x: Floats) -> Floats:
         every, state, seen = self._all(x), self.at(x), self.seen

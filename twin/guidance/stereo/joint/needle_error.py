@@ -105,11 +105,11 @@ def servoed_error(found: Adjusted, stay: int, target_m: Floats) -> NeedleError:
     K = variance * Jq[:3].T @ np.linalg.inv(variance * Jq[:3] @ Jq[:3].T + FLOOR_MM**2 * np.eye(3))
     rows = np.zeros((6, len(found.covariance)))
     start = x.span("balls_c").start + 3 * stay
-    rows[:3, start : start + 3] = np.eye(3)
+    rows[:3, start : start + 3] = np.eye(3)  # the tip follows the ball that was seen
     rows[3:] = rod.rows[3:] + Jq[3:] @ K @ slopes[0]
     again = np.zeros((6, 6))
-    again[3:, 3:] = Jq[3:] @ (variance * (np.eye(6) - K @ Jq[:3])) @ Jq[3:].T
-    R_c_flange = exp_rotation(Jq[3:] @ K @ miss[0]) @ rod.R_c_flange
+    again[3:, 3:] = Jq[3:] @ (variance * (np.eye(6) - K @ Jq[:3])) @ Jq[3:].T  # of this arrival, given r
+    R_c_flange = exp_rotation(Jq[3:] @ K @ miss[0]) @ rod.R_c_flange  # by its mean, K r
     return frame.needle(found, x.balls_c[stay], R_c_flange, rows, again)
 
 
@@ -183,9 +183,9 @@ class _Anatomy:
     def needle(self, found: Adjusted, ball_c: Floats, R_c_flange: Floats, rows: Floats, again: Floats) -> NeedleError:
         """The needle against this target; ``again`` (6, 6), C, is what errs besides the unknowns."""
         errors, R = found.model.observed.errors, self.T_c_m[:3, :3]
-        rows = rows - self.rows
+        rows = rows - self.rows  # tip minus target
         rotated = np.kron(np.eye(2), R_c_flange)
-        tool = np.repeat([errors.tip_offset_mm, errors.needle_direction, 0.0], [3, 2, 1]) ** 2
+        tool = np.repeat([errors.tip_offset_mm, errors.needle_direction, 0.0], [3, 2, 1]) ** 2  # no roll
         cov_c = rows @ found.covariance @ rows.T + again + (rotated * tool) @ rotated.T
         turn = np.kron(np.eye(2), R)
         covariance = turn.T @ cov_c @ turn + self._moved(found)

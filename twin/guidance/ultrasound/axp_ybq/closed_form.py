@@ -97,7 +97,7 @@ class Estimate(NamedTuple):
 
 def tangent_basis(direction: Floats) -> Floats:
     """Two unit vectors across a direction (3,) and each other, as columns, shape (3, 2)."""
-    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]  # farthest from parallel
     first = skew(direction) @ helper
     first /= np.linalg.norm(first)
     return np.column_stack([first, skew(direction) @ first])
@@ -119,11 +119,11 @@ def closed_form(recording: Recording, *, known_tip: Floats | None = None, scale:
         scale: Whether mm per unit of P is unknown.
     """
     A, B = recording.A, recording.B
-    p = recording.P / (np.abs(recording.P).max() if scale else LENGTH_MM)
+    p = recording.P / (np.abs(recording.P).max() if scale else LENGTH_MM)  # columns of one size
     system, t_A = _probe_columns(A, p), A[:, :3, 3] / LENGTH_MM
     if known_tip is None:
         z = _solve(np.concatenate([system, _needle_columns(B)], axis=2), t_A)
-        R_Y = nearest_rotation(z[36:45].reshape(3, 3).T)
+        R_Y = nearest_rotation(z[36:45].reshape(3, 3).T)  # column-major vec
     else:
         z = _solve(np.concatenate([system, _tip_columns(B, known_tip)], axis=2), t_A)
         R_Y = nearest_rotation(z[9:18].reshape(3, 3).T)
@@ -179,6 +179,6 @@ def _translations(
     right = B[:, :3, 3] @ R_Y.T - np.einsum("nij,nj->ni", R_A @ R_X[:, :2], recording.P * unit) - A[:, :3, 3]
     system = np.concatenate([R_A, np.tile(-np.eye(3), (n, 1, 1)), -R_YB], axis=2)
     if known_tip is not None:
-        right, system = right + R_YB @ known_tip, system[:, :, :6]
+        right, system = right + R_YB @ known_tip, system[:, :, :6]  # its columns are known
     z = _solve(system, right)
     return z[:3], z[3:6], z[6:9] if known_tip is None else np.array(known_tip, dtype=np.float64)

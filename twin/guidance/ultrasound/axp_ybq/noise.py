@@ -77,10 +77,10 @@ def by_likelihood(problem: Problem, fit: RobustFit) -> ResidualSpreads:
 def _step(problem: Problem, fit: RobustFit, at_fit: Fitted, found: ResidualSpreads) -> ResidualSpreads:
     """Each part times the root of its residuals over their expectation."""
     W = at_fit.whitener
-    own = W.transpose(0, 2, 1) @ W
-    q = own @ at_fit.residuals[:, :, None]
+    own = W.transpose(0, 2, 1) @ W  # C_i^-1
+    q = own @ at_fit.residuals[:, :, None]  # P r at the fit
     pulled = own @ at_fit.jacobian
-    E = own - pulled @ at_fit.covariance @ pulled.transpose(0, 2, 1)
+    E = own - pulled @ at_fit.covariance @ pulled.transpose(0, 2, 1)  # diagonal blocks of P
     sides = {
         name: (float((q.transpose(0, 2, 1) @ D @ q).sum()), float(np.einsum("nij,nji->", D, E)))
         for name, D in structures(problem, fit).items()
@@ -99,7 +99,7 @@ def _step(problem: Problem, fit: RobustFit, at_fit: Fitted, found: ResidualSprea
 
 def _moved_tip_parts(spread: Spread, inside: tuple[float, float], across: tuple[float, float]) -> tuple[float, float]:
     if min(inside[1] * spread.inside_mm**2, across[1] * spread.across_mm**2) < LEAST_PART_FREEDOM:
-        both = _growth((inside[0] + across[0], inside[1] + across[1]))
+        both = _growth((inside[0] + across[0], inside[1] + across[1]))  # too few residuals to part them
         return max(spread.inside_mm * both, LEAST_MM), max(spread.inside_mm * both, LEAST_MM)
     sizes = spread.inside_mm * _growth(inside), spread.across_mm * _growth(across)
     least = max(*sizes, LEAST_MM) / WIDEST_RATIO
@@ -107,7 +107,7 @@ def _moved_tip_parts(spread: Spread, inside: tuple[float, float], across: tuple[
 
 
 def _growth(sides: tuple[float, float]) -> float:
-    return float(np.sqrt(sides[0] / max(sides[1], 1e-300)))
+    return float(np.sqrt(sides[0] / max(sides[1], 1e-300)))  # of a deviation: variances grow by the ratio
 
 
 SPREAD_ROUNDS = 2

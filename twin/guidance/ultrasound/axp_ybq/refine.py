@@ -40,7 +40,7 @@ def whitener(sigma: Floats, weights: Floats) -> Floats:
         sigma: Shape (n, k, k).
         weights: Shape (n, k): one per residual; 0 sets it aside.
     """
-    spread = 1.0 / np.sqrt(np.maximum(weights, LEAST_WEIGHT))
+    spread = 1.0 / np.sqrt(np.maximum(weights, LEAST_WEIGHT))  # a weight divides the variance
     scaled = sigma * spread[:, :, None] * spread[:, None, :]
     return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)))
 
@@ -69,7 +69,7 @@ class Whitening(NamedTuple):
             return cls(own, None, np.zeros((0, 0)))
         shared = (own @ slopes).reshape(-1, slopes.shape[2])
         squared, V = np.linalg.eigh(shared.T @ shared)
-        s = np.sqrt(1.0 + np.maximum(squared, 0.0))
+        s = np.sqrt(1.0 + np.maximum(squared, 0.0))  # s^2 = 1 + d^2
         return cls(own, shared, (V / (s * (s + 1.0))) @ V.T)
 
     def residuals(self, r: Floats) -> Floats:
