@@ -366,7 +366,7 @@ def _of_each(counts: Sequence[int], stored: Arrays) -> tuple[Order, ...]:
 
 
 COORDINATE_SLACK = 1e-6
-"""Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
+"""Fraction of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
 
 
 @dataclass(frozen=True, eq=False)

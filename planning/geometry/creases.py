@@ -13,7 +13,7 @@ CREASE = np.radians(60.0)
 """Two triangles that meet at more are faces of a thing with an edge. Steps of a meshed voxel mask stay below (55)."""
 
 COHERENT = 0.5
-"""Share of the areas about a corner that their sum keeps at least, where they are one side of a smooth surface. Of
+"""Fraction of the areas about a corner that their sum keeps at least, where they are one side of a smooth surface. Of
 triangles given both ways round, or wound against each other, it keeps less: their blend is no normal."""
 
 

@@ -125,7 +125,7 @@ class PlaceSearch:
         T_ct_bed: Shape (4, 4), mm: the frame of the sites.
         coarse: Every site of the first lattice with its estimate.
         refined: How many more were estimated.
-        possible: Share of the directions, 0..1, in which the needle itself may stand at standoff; none can hold more.
+        possible: Fraction of directions, 0..1, in which the needle itself may stand at standoff; none can hold more.
         rated: Best first; the case's own placement is not among them.
         own: The case's own placement, checked; None where it has none.
     """

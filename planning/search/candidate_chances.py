@@ -108,7 +108,7 @@ def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidate
     assert chances is not None
     if not np.isfinite(limits).any():
         return candidates
-    greatest = np.fmax(chances.touch, _touch_bounds(candidates, model))
+    greatest = np.fmax(chances.touch, _touch_bounds(candidates, model))  # first order may be too low
     rows = np.flatnonzero((greatest >= REFINED_FROM * limits).any(axis=1) & np.isfinite(chances.hit))
     return with_refined(candidates, model, rows) if len(rows) else candidates
 
@@ -116,7 +116,7 @@ def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidate
 def _touch_bounds(candidates: Candidates, model: ChanceModel) -> Floats:
     """Shape (n, k), of the safe candidates' chances to touch; NaN for others."""
     error, columns = model.error, model.columns
-    surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])
+    surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])  # in the worst direction
     bounds, rows = np.full((len(candidates), len(columns)), np.nan), np.flatnonzero(candidates.safe)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
         length = float(own_lengths(model.case, model.anatomy, candidates.outward_ct[part])[:, columns].max())
@@ -193,7 +193,7 @@ def joint_touch_chance(
     chances = np.empty(len(cov_ct))
     for row, cov in enumerate(cov_ct):
         values, axes = np.linalg.eigh(cov)
-        root = axes * np.sqrt(np.maximum(values, 0.0))
+        root = axes * np.sqrt(np.maximum(values, 0.0))  # a covariance may be singular
         change = sizes[:, None] * (draws @ (near.gradient[row] @ root).T + off * surfaces[row])
         chances[row] = np.mean(np.any(change < threshold_mm - near.distance[row], axis=1))
     return chances

@@ -352,7 +352,7 @@ LEAST_MM = 0.1
 
 def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
     moves = body.moves_mm(gap.low, gap.high)[gap.columns]
-    least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]
+    least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]  # no clearance falls faster than it moves
     short = (least < 0) & (moves > 0) & (verdict.reason[gap.rows] == Reason.NONE.value)[:, None]
     rows, columns = short.any(axis=1), short.any(axis=0)
     if not rows.any():

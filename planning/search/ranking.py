@@ -123,9 +123,9 @@ def rank(
         ],
         axis=1,
     )
-    terms = np.clip(np.nan_to_num(terms, nan=1.0), 0, 1)
+    terms = np.clip(np.nan_to_num(terms, nan=1.0), 0, 1)  # what is not known counts as worst
     factors = np.array([getattr(weights, term) for term in TERMS])
-    cost = terms @ factors / max(factors.sum(), np.finfo(float).tiny)
+    cost = terms @ factors / max(factors.sum(), np.finfo(float).tiny)  # all weights may be 0
     order = np.argsort(np.round(cost, TIE_DIGITS), kind="stable")
     ranks = np.empty(len(cost), np.int32)
     ranks[order] = np.arange(1, len(cost) + 1)
@@ -137,7 +137,7 @@ def _risk(min_clearance: Floats, touch_chance: Floats | None) -> Floats:
     by_clearance = 1 - np.clip(min_clearance, 0, COMFORT_MM) / COMFORT_MM
     if touch_chance is None:
         return np.asarray(by_clearance)
-    decades = np.log10(np.maximum(touch_chance, NO_RISK) / NO_RISK) / -np.log10(NO_RISK)
+    decades = np.log10(np.maximum(touch_chance, NO_RISK) / NO_RISK) / -np.log10(NO_RISK)  # 0 at 1e-6, 1 at 1
     return np.where(np.isnan(touch_chance), by_clearance, np.minimum(decades, 1.0))
 
 

@@ -141,9 +141,9 @@ def inside_length(structure: Structure, target_ct: Floats, outward_ct: Floats, p
     crossing = crossings(structure.mesh, target_ct, outward_ct)
     starts_inside = contains(structure.mesh, target_ct)
     limit = np.nan_to_num(path_length, nan=0.0)
-    number = np.arange(len(crossing.ray)) - crossing.first[crossing.ray]
+    number = np.arange(len(crossing.ray)) - crossing.first[crossing.ray]  # 0 for a ray's first crossing
     sign = np.where((number % 2 == 0) == starts_inside, 1.0, -1.0)
-    signed = sign * np.minimum(crossing.depth, limit[crossing.ray])
+    signed = sign * np.minimum(crossing.depth, limit[crossing.ray])  # what is beyond the skin cancels
     inside = np.bincount(crossing.ray, weights=signed, minlength=len(outward_ct))
     ends_inside = (crossing.count % 2 == 0) == starts_inside
     return np.asarray(np.maximum(inside + np.where(ends_inside, limit, 0.0), 0.0))

@@ -86,7 +86,7 @@ def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
     nearest = (outward @ np.array([ANATOMICAL_LPS[axis] for axis in AXES.values()]).T).argmax(axis=1)
     paths, within = skin_paths(anatomy.skin, case.target_ct, outward, case.needle.length_mm), _within(case, outward)
     closed = _closed(case, anatomy, paths, outward)
-    free = ~np.any([rows for _, rows in closed], axis=0)
+    free = ~np.any([rows for _, rows in closed], axis=0)  # open for every reason
     sides = []
     for number, name in enumerate(AXES):
         side = nearest == number
@@ -148,24 +148,24 @@ def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
         sides: As `sides_of` found them.
         searched: Whether the case's grid counts: what it does not hold is named.
     """
-    spoken = [side for side in sides if side.name in ROUND_ABOUT]
-    here = [side.name for side in spoken if side.is_open and (not searched or side.searched >= LEAST_SEARCHED)]
+    reported = [side for side in sides if side.name in ROUND_ABOUT]
+    here = [side.name for side in reported if side.is_open and (not searched or side.searched >= LEAST_SEARCHED)]
     parts = [_listed(here) or "no side"]
-    for why in dict.fromkeys(side.why for side in spoken if not side.is_open):
-        names = [side.name for side in spoken if side.why == why]
+    for why in dict.fromkeys(side.why for side in reported if not side.is_open):
+        names = [side.name for side in reported if side.why == why]
         are = why.replace("is ", "are ", 1).replace("lies ", "lie ", 1)
         parts.append(f"the {_listed(names)} {why if len(names) == 1 else are}")
-    missed = [side for side in spoken if searched and side.is_open and side.name not in here]
+    missed = [side for side in reported if searched and side.is_open and side.name not in here]
     parts += [f"not the {side.name}, where skin is {side.nearest_mm:.0f} mm away" for side in missed]
     return "; ".join(parts)
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Two sides merged into one.
+    """Names as a list in a sentence, right and left together as "sides".
 
     >>> _listed(["front", "right", "left"])
     'front and sides'
     """
     both = {"right", "left"} <= set(names)
-    said = [*(one for one in names if not (both and one in {"right", "left"})), *(["sides"] if both else [])]
-    return " and ".join([", ".join(said[:-1]), said[-1]] if len(said) > 1 else said)
+    names = [*(one for one in names if not (both and one in {"right", "left"})), *(["sides"] if both else [])]
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

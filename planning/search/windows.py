@@ -83,7 +83,7 @@ def find_windows(candidates: Candidates) -> Windows:
     """The windows of ranked candidates; without a grid every candidate is one of its own, without area."""
     label = _connected(candidates.grid, candidates.safe)
     ranked = candidates.ranked
-    firsts = ranked[np.sort(np.unique(label[ranked], return_index=True)[1])]
+    firsts = ranked[np.sort(np.unique(label[ranked], return_index=True)[1])]  # best of each set, by rank
     number = np.zeros(len(candidates), np.int64)
     for one, row in enumerate(firsts, start=1):
         number[(label == label[row]) & candidates.safe] = one
@@ -95,7 +95,7 @@ def find_windows(candidates: Candidates) -> Windows:
 
 def nearest_row(candidates: Candidates, outward_ct: Floats) -> int | None:
     """Row of the grid nearest to a direction, shape (3,); None where it is beyond the grid by a step."""
-    row = int(np.argmax(candidates.outward_ct @ outward_ct))
+    row = int(np.argmax(candidates.outward_ct @ outward_ct))  # largest cosine
     near = candidates.outward_ct[row]
     apart = float(np.arctan2(np.linalg.norm(np.cross(near, outward_ct)), near @ outward_ct))
     return None if candidates.grid is None or apart > candidates.grid.step else row
@@ -116,7 +116,7 @@ def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
         least, ends = np.minimum(label[one], label[other]), (label[one], label[other])
         for end in ends:
             np.minimum.at(label, end, least)
-        label = label[label]
+        label = label[label]  # pointer jumping
     return label
 
 

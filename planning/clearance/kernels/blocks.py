@@ -106,7 +106,7 @@ def _fill(vertices, faces, order, triangles):  # type: ignore[no-untyped-def]  #
 
 
 PARALLEL = 1e-6
-"""Share of its triangles' area below which a block's mean normal says nothing."""
+"""Fraction of its triangles' area below which a block's mean normal says nothing."""
 
 FAINT = 1e-140
 """Length, mm^2, below which a mean normal says nothing: its square nears the least number, and is not its length's."""

@@ -14,10 +14,11 @@ from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, least
 from puncture_twin.planning.clearance.kernels.side_by_side import PAIRS, bring_into_frame, measure_beside, measure_other
 
 ROUNDING = np.float32(4e-6)
-"""Share of its corners' distance from the line by which a float32 distance may err (docs/concepts/fast-search.md)."""
+"""Fraction of its corners' distance from the line by which a float32 distance may err
+(docs/concepts/fast-search.md)."""
 
 AREA_ROUNDING = np.float32(2e-6)
-"""Share of that distance's square by which a float32 edge function may err."""
+"""Fraction of that distance's square by which a float32 edge function may err."""
 
 SINGLE = np.float32(2e-7)
 """Chord of one direction: what float32 takes from a unit vector."""

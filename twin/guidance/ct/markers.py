@@ -73,7 +73,7 @@ def wide_metal(volume: Volume, diameter_mm: float) -> Bools:
     """
     metal, spacing = volume.values > METAL_HU, spacing_mm(volume)
     radius = diameter_mm / 2 + BLUR_MM
-    core = ndimage.distance_transform_edt(np.pad(metal, 1), spacing)[1:-1, 1:-1, 1:-1] > radius
+    core = ndimage.distance_transform_edt(np.pad(metal, 1), spacing)[1:-1, 1:-1, 1:-1] > radius  # erosion
     if not core.any():
         return np.zeros_like(metal)
     return np.asarray(ndimage.distance_transform_edt(~core, spacing) <= radius + EDGE_MM + BLUR_MM)
@@ -108,10 +108,10 @@ def metal_parts(volume: Volume, metal: Metal) -> Floats:
         return np.asarray(metal.voxels, dtype=np.float64)
     nearest = ndimage.distance_transform_edt(~outside, spacing, return_distances=False, return_indices=True)
     background = _smooth(values, outside)[tuple(nearest)]
-    parts = (values - background) / (SOLID_HU - background)
+    parts = (values - background) / (SOLID_HU - background)  # linear partial volume
     others = every & ~metal.voxels
     mine = ndimage.distance_transform_edt(~metal.voxels, spacing)
-    strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)
+    strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)  # nearer to another piece
     return np.where(outside | strange | (parts < LEAST_PART), 0.0, parts)
 
 

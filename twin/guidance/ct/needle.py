@@ -166,9 +166,9 @@ def _axis(volume: Volume, metal: Metal, target_ct: Floats) -> _Line:
     heavy = weights[tuple(at.T)]
     points = apply(volume.T_ct_index, at + np.array([axis.start for axis in metal.box], dtype=float))
     middle = centroid(weights, metal.box, volume.T_ct_index)
-    spread = (points - middle) * np.sqrt(heavy / heavy.sum())[:, None]
+    spread = (points - middle) * np.sqrt(heavy / heavy.sum())[:, None]  # weighted for the SVD
     _, sizes, axes = np.linalg.svd(spread, full_matrices=False)
-    forward = axes[0] if (target_ct - middle) @ axes[0] > 0 else -axes[0]
+    forward = axes[0] if (target_ct - middle) @ axes[0] > 0 else -axes[0]  # toward the target
     return _Line(middle, forward, float(np.hypot(sizes[1], sizes[2])))
 
 
@@ -203,7 +203,7 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
     across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
     reach = WIDE_MM + WIDEST_SLICE * float(spacing_mm(volume).max())
     near = (across <= reach) & (along > -FITTED_MM) & (along < SHAFT_MM) & ~hidden[tuple(index.T)]
-    side = np.linalg.svd(line.forward[None])[2][1:]
+    side = np.linalg.svd(line.forward[None])[2][1:]  # two unit vectors across the axis
 
     def rod(change: Floats) -> tuple[Floats, Floats]:
         forward = line.forward + change[3:] @ side

@@ -342,12 +342,12 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
         NoAnswerError: No branch holds all points freely; says what the best one lacks.
     """
     every = inverse(rod.model, flange_poses(rod, points_base))
-    workcell = np.nan_to_num(singularity(rod.model, every).least(), nan=0.0).min(axis=0)
+    least = np.nan_to_num(singularity(rod.model, every).least(), nan=0.0).min(axis=0)
     why = f"a {rod.model.name} cannot hold the ball on all {len(points_base)} points on one branch"
     elbow = np.nan_to_num(link_poses(rod.model, every[0])[:, ELBOW, :3, 3] @ -rod.R_base_flange[:, 2])
-    ranks = np.column_stack([np.round(workcell, TIE_DIGITS), np.round(elbow, ELBOW_DIGITS)])
+    ranks = np.column_stack([np.round(least, TIE_DIGITS), np.round(elbow, ELBOW_DIGITS)])
     order = sorted(range(len(ranks)), key=lambda branch: (branch != first, *-ranks[branch]))
-    for branch in (branch for branch in order if workcell[branch] >= LEAST_SINGULARITY):
+    for branch in (branch for branch in order if least[branch] >= LEAST_SINGULARITY):
         q = nearest_within_limits(rod.model, every[:, branch], REFERENCE_RAD)
         if np.isnan(q).any():
             continue

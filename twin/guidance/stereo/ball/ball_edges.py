@@ -77,7 +77,7 @@ def grey_part(pixels: NDArray[np.uint8], offset: Floats) -> Grey:
     """Prepare a part of an image; its noise is the median of second differences, which edges hardly touch."""
     grey = pixels.astype(np.float64)
     second = grey[:, :-2] - 2 * grey[:, 1:-1] + grey[:, 2:]
-    noise = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6.0) if second.size else 0.0
+    noise = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6.0) if second.size else 0.0  # 1 + 4 + 1
     return Grey(pixels, np.asarray(spline_filter(grey, 3)), offset, noise)
 
 
@@ -98,7 +98,7 @@ def find_edges(grey: Grey, camera: Camera, spokes: Spokes) -> Edges:
     peak, height, inside = _peaks(slope)
     edge = spokes.half_angle + (peak * STEP_PX - half) / scales
     width = np.hypot(SMOOTHING_PX, EDGE_WIDTH_PX)
-    points = 2 * np.tan(edge / 2)[:, None] * across.T
+    points = 2 * np.tan(edge / 2)[:, None] * across.T  # stereographic
     return Edges(points, scales, -height * width * np.sqrt(2 * np.pi), inside & seen.all(axis=1))
 
 
@@ -137,7 +137,7 @@ def _peaks(slope: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     middle = np.clip(best, 1, slope.shape[1] - 2)
     before, here, after = (np.abs(slope[rows, middle + side]) for side in (-1, 0, 1))
     bend = before - 2 * here + after
-    shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+    shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)  # a parabola's peak
     return middle + np.clip(shift, -1, 1), slope[rows, middle], best == middle
 
 
@@ -190,7 +190,7 @@ def consensus(points: Floats, valid: NDArray[np.bool_], scales: Floats, toleranc
     misses = np.abs(distances - radii[:, None]) * scales
     misses[:, ~valid] = np.inf
     misses[~np.isfinite(radii)] = np.inf
-    score = np.sum(1 - np.clip(misses / tolerance_px, 0, 1) ** 2, axis=1)
+    score = np.sum(1 - np.clip(misses / tolerance_px, 0, 1) ** 2, axis=1)  # MSAC: near edges count more
     best = int(np.argmax(score))
     return Circle(centers[best], float(radii[best])) if np.isfinite(radii[best]) else None
 
@@ -224,7 +224,7 @@ def refit(points: Floats, scales: Floats, start: Circle, tolerance_px: float) ->
         distance = np.linalg.norm(outward, axis=1)
         miss = (distance - radius) * scales
         ratio = np.clip(np.abs(miss) / (TUKEY * spread), 0, 1)
-        root_weight = 1 - ratio**2
+        root_weight = 1 - ratio**2  # Tukey's weight is its square
         J = np.column_stack([outward / distance[:, None], np.ones(len(points))]) * scales[:, None]
         step = np.linalg.lstsq(J * root_weight[:, None], miss * root_weight, rcond=None)[0]
         center, radius = center + step[:2], radius + step[2]

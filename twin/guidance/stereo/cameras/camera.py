@@ -265,7 +265,7 @@ def undistort(points: Floats, coefficients: Floats) -> Floats:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             step[..., 0] = (slope[..., 1, 1] * miss[..., 0] - slope[..., 0, 1] * miss[..., 1]) / determinant
             step[..., 1] = (slope[..., 0, 0] * miss[..., 1] - slope[..., 0, 1] * miss[..., 0]) / determinant
-            found += step
+            found += step  # a 2 x 2 system by Cramer's rule
         if not np.any(np.abs(step) > CONVERGED):
             break
     r2 = np.sum(found**2, axis=-1)
@@ -283,7 +283,7 @@ def fold(coefficients: Floats) -> float:
     square = 9 * k1 * k1 - 20 * k2
     if square < 0:
         return float("inf")
-    q = -(3 * k1 + math.copysign(math.sqrt(square), k1)) / 2
+    q = -(3 * k1 + math.copysign(math.sqrt(square), k1)) / 2  # without cancellation
     roots = [1 / q if q else 0.0, q / (5 * k2) if k2 else 0.0]
     squares = [root for root in roots if root > 0]
     return float(np.sqrt(min(squares))) if squares else float("inf")

@@ -94,7 +94,7 @@ def _lateral_blur(field: Complexes, pixel_mm: float, sigma: Floats) -> Complexes
     """Each row blurred with its own width, by its transform; unit energy."""
     frequency = np.fft.fftfreq(field.shape[1], pixel_mm)
     transfer = np.exp(-2.0 * (np.pi * frequency[None, :] * sigma[:, None]) ** 2)
-    transfer /= np.sqrt(np.mean(transfer**2, axis=1, keepdims=True))
+    transfer /= np.sqrt(np.mean(transfer**2, axis=1, keepdims=True))  # unit energy (Parseval)
     return np.asarray(np.fft.ifft(np.fft.fft(field, axis=1) * transfer.astype(np.float32), axis=1))
 
 
@@ -236,7 +236,7 @@ def render(
     signal = blurred_speckle(imager.rows, imager.columns, imager.pixel_mm, imager.spread, reflectivity, rng)
     if needle is not None:
         signal = signal + needle_signal(imager, needle, echo, rng)
-    hiss = 10.0 ** (-imager.noise_db / 20.0) / np.sqrt(2.0)
+    hiss = 10.0 ** (-imager.noise_db / 20.0) / np.sqrt(2.0)  # each of the two parts
     signal = signal + hiss * (rng.standard_normal(size) + 1j * rng.standard_normal(size))
     return imager.grey(np.abs(signal))
 
@@ -252,7 +252,7 @@ def needle_signal(imager: Imager, needle: NeedleInImage, echo: NeedleEcho, rng: 
     source = source * np.where(s < echo.tip_length_mm, echo.tip_gain, 1.0)
     source = source * _brightness(imager, needle, echo) * np.exp(2j * np.pi * rng.uniform())
     signal = np.zeros(size, dtype=np.complex128)
-    bounced = echo.reverberation_gain * float(1.0 - needle.direction_image[1] ** 2)
+    bounced = echo.reverberation_gain * float(1.0 - needle.direction_image[1] ** 2)  # squared cosine of the tilt
     for bounce in range(echo.reverberations + 1):
         below = points + [0.0, bounce * echo.reverberation_mm, 0.0]
         phase = np.exp(2j * np.pi * rng.uniform()) if bounce else 1.0
