@@ -281,7 +281,7 @@ def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> 
     Args:
         model: The arm.
         q: Shape (n, 6), rad; rows may be NaN, not all of them.
-        elbow_towards: Shape (3,), base frame: where there is room for the elbow.
+        elbow_towards: Shape (3,), base frame: where there is space for the elbow.
 
     Returns:
         Shape (6,), rad.
@@ -332,7 +332,7 @@ class SpeedLimits(NamedTuple):
 
 
 DEFAULT_SPEEDS = SpeedLimits()
-"""Where nobody says how fast."""
+"""Speeds where none are stated."""
 
 HIGHEST = SpeedLimits(1000.0, 100.0, 1.0, 1.0)
 """The highest speeds that a case may state: a UR's usual tool speed, a needle that is pushed briskly, and all that the
@@ -398,7 +398,7 @@ FITS_MM = 1.5
 """Another model whose joints put the tool so near to where it was is the arm that was recorded."""
 
 LEVER_MM = 95.0
-"""A flange's axes are held against joints by points so far out: 3 degrees move them by 5 mm."""
+"""A flange's axes are compared with joints by points so far out: 3 degrees move them by 5 mm."""
 
 
 def check_arm(

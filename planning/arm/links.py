@@ -32,7 +32,7 @@ LINK_NAMES = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", 
 SLABS: Mapping[str, int] = MappingProxyType({"base": 3, "upper_arm": 3, "forearm": 4})
 """Into how many slabs along its longest side a link is cut before the hulls are taken; the others stay whole.
 
-One hull of the whole forearm bulges over the wrist and meets wrist 2 in 21 % of random configurations of a UR3 where
+One hull of the whole forearm bulges over the wrist and touches wrist 2 in 21 % of random configurations of a UR3 where
 the mesh itself never does; with these slabs 73.3 % of them are free against 73.8 % for the open meshes themselves.
 """
 
@@ -189,7 +189,7 @@ def _thickness_mm(points: Floats) -> float:
 def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[TriangleMesh, ...]]:
     """For each link the pin that closes the gap to the next one along their joint's axis, if the meshes leave one.
 
-    The UR5's leave up to 3 mm, and a flat surface passing there would meet neither link.
+    The UR5's leave up to 3 mm, and a flat surface passing there would touch neither link.
     """
     poses = link_poses(model, np.zeros(6))
     pins: list[tuple[TriangleMesh, ...]] = []

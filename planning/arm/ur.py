@@ -115,7 +115,7 @@ class UrModel:
 
     @property
     def shoulder_base(self) -> NDArray[np.float64]:
-        """The shoulder point, where axes 1 and 2 meet, base frame, shape (3,), mm."""
+        """The shoulder point, where axes 1 and 2 intersect, base frame, shape (3,), mm."""
         return np.array([0.0, 0.0, self.d1])
 
     def within_limits(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -174,7 +174,7 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     Args:
         out: The cohort's folder, with its plan.
         request: Which part, and how.
-        watcher: Whoever shows progress, in cases.
+        watcher: Shows progress, in cases.
         elsewhere: Runs the cases; None runs them in processes of this machine.
 
     Raises:

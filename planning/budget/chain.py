@@ -131,7 +131,7 @@ class Chain:
         target_ct: Shape (3,), mm.
         q_insertion: Shape (6,), rad, the tip on the target.
         path: Of a needle that bends; None for a straight one.
-        breath: None where nobody declares it.
+        breath: None where it is not declared.
         aim: The insertion that a joint registration is corrected for.
     """
 

@@ -84,7 +84,7 @@ def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tupl
     Args:
         chain: As it is.
         skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
-        bed_ct: Shape (3,), unit, across the CT's slices; None where nobody says, and slices are left out.
+        bed_ct: Shape (3,), unit, across the CT's slices; None where it is not stated, and slices are left out.
     """
     return (
         *([] if bed_ct is None else _slices(chain, bed_ct)),

@@ -77,7 +77,7 @@ class Cells:
 
         Args:
             radius: Of the cells, shape (n,), rad.
-            size: The angular diameter that is wanted, rad: where one half is about as small, no quarters are made.
+            size: The wanted angular diameter, rad: where one half is about as small, no quarters are made.
         """
         tall = self.theta[:, 1] - self.theta[:, 0]
         widest = np.clip(np.pi / 2, self.theta[:, 0], self.theta[:, 1])

@@ -56,7 +56,7 @@ def zones(corners: Floats, limit: Floats | float) -> Zones:
 
     Args:
         corners: Shape (m, 3, 3), mm from the target.
-        limit: Shape (m,) or a number; 0 for the directions that meet the triangle, mm.
+        limit: Shape (m,) or a number; 0 for the directions that hit the triangle, mm.
     """
     limits = np.ascontiguousarray(np.broadcast_to(np.asarray(limit, dtype=np.float64), len(corners)))
     return Zones(*_zones(np.ascontiguousarray(corners), limits, np.cos(ZONE_PAD_RAD), np.sin(ZONE_PAD_RAD)))

@@ -51,7 +51,7 @@ class PlainSkin:
         """Everything about the triangles ``rows`` over the cone of half-angle ``rho`` about ``u``, mm and rad.
 
         Args:
-            rows: Triangles among which are all that the cone meets.
+            rows: Triangles among which are all that the cone intersects.
             u: Shape (3,), unit.
             rho: Less than π/2.
             ray: Shape (3,), a direction inside the cell.
@@ -64,7 +64,7 @@ class PlainSkin:
         hit = ((edges.min(axis=0) <= rho) | (_pierced(self.corners[rows], u) == 1)) & (near <= length)
         rows, near, far, edges = rows[hit], near[hit], far[hit], edges[:, hit]
         pierced = _pierced(self.corners[rows], ray)
-        touched = np.less_equal(edges, rho).T  # which edges the cone meets
+        touched = np.less_equal(edges, rho).T  # which edges the cone intersects
         changes = (far >= length) | (self._folds[rows] & touched).any(axis=1) | (pierced < 0)
         bare = ~self.cut[rows]
         entry = bare & (near <= longest)
@@ -127,7 +127,7 @@ def _folds(mesh: TriangleMesh, corners: Floats) -> Bools:
 
 
 def _depths(corners: Floats, u: Floats, rho: float) -> tuple[Floats, Floats]:
-    """Least and largest depth at which rays of the cone can meet each triangle: by its plane, and by its corners."""
+    """Least and largest depth at which rays of the cone can hit each triangle: by its plane, and by its corners."""
     farthest = np.linalg.norm(corners, axis=2).max(axis=1)
     centre = corners.mean(axis=1)
     nearest = np.linalg.norm(centre, axis=1) - np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)

@@ -27,9 +27,9 @@ class AxisDistances:
     """Distances of n needle axes from k structures, mm.
 
     Attributes:
-        distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they meet.
+        distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they intersect.
         depth: Shape (n, k), distance from the target, along the axis, of the axis point nearest to the structure;
-            where they meet, of the first meeting point.
+            where they intersect, of the first point of intersection.
         nearest: Shape (n, k), a triangle of the structure that is as near, a row of the engine's `triangles`.
     """
 

@@ -59,7 +59,7 @@ LONGEST_MM = 1e9
 class FastEngine:
     """Exact distances by bundles of directions over trees of discs; FCL where a verdict hangs on rounding.
 
-    Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, wanted any
+    Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, measured from any
     target.
 
     Args:

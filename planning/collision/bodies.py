@@ -291,7 +291,7 @@ def enclosing_sphere(points: Floats) -> BoundingSphere:
 
 @nb.njit(cache=True)
 def _walk_to_centre(points, steps, best):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``best`` (3,) with the best centre met for points (n, 3); the radius that it needs."""
+    """Fill ``best`` (3,) with the best centre visited for points (n, 3); the radius that it needs."""
     x, y, z = [(points[:, i].min() + points[:, i].max()) / 2.0 for i in range(3)]
     least = math.inf
     for step in range(1, steps + 1):

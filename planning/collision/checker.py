@@ -59,8 +59,8 @@ APART_MM = 1.0
 def joined_pieces(model: UrModel) -> Mapping[tuple[str, str], Bools]:
     """Which pieces of neighbouring links lie together at every angle of the joint between them.
 
-    These are built into one another and never tested. Any other two of neighbouring links meet at some angles alone,
-    as a camera on wrist 3 may meet wrist 2, or a folded forearm the upper arm: for these each state is asked.
+    These are built into one another and never tested. Any other two of neighbouring links touch at some angles alone,
+    as a camera on wrist 3 may touch wrist 2, or a folded forearm the upper arm: for these each state is tested.
 
     Args:
         model: An arm with a URDF of its own.
@@ -147,8 +147,8 @@ class CellChecker:
         outside: What is not to be touched besides (a table), likewise: the base may touch it, and contacts with it are
             named ``outside_body``.
         padding_mm: How much fuller the arm is for contacts with patient and boxes (not for distances, nor with itself):
-            room for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
-            more than 2 mm prove that the path between them meets neither patient nor box.
+            slack for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
+            more than 2 mm prove that the path between them touches neither patient nor box.
 
     Raises:
         InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, the base

@@ -177,7 +177,7 @@ def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
 def check_gantry(case: Case, skin: TriangleMesh) -> None:
     """Refuse a gantry that does not go around the patient.
 
-    The skin alone is held against it. What the CT shows outside of the skin is not: a bed goes through the bore, and
+    The skin alone is tested against it. What the CT shows outside of the skin is not: a bed goes through the bore, and
     beyond the image its surface goes on by assumption.
 
     Args:

@@ -32,13 +32,13 @@ GRID_MM = MAX_SWEEP_MM / 2.0
 """In two directions: no state of the triangle is farther from a checked one than half of ``MAX_SWEEP_MM``."""
 
 LARGEST_BLEND_MM = 5.0
-"""The first radius tried: enough not to stop, small against the room that a plan leaves."""
+"""The first radius tried: enough not to stop, small against the space that a plan leaves."""
 
 SMALLEST_BLEND_MM = 1.0
 """Radii are halved down to this; then the arm stops at the waypoint."""
 
 LARGEST_FRACTION = 0.45
-"""Fraction of each segment, so that two blends never meet: the controller skips a waypoint whose blend overlaps the
+"""Fraction of each segment, so that two blends never overlap: the controller skips a waypoint whose blend overlaps the
 next."""
 
 SAMPLES = 400
@@ -49,7 +49,7 @@ def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
     """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut.
 
     Args:
-        checker: Judges contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
+        checker: Checks contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
         waypoints: Shape (k, 6), rad.
 
     Returns:

@@ -19,7 +19,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.text_names import check_name
 
 MAX_COORDINATE_MM = 100_000.0
-"""Farthest from the origin: no room is 100 m wide; beyond, a sentinel value or a broken float is likely."""
+"""Farthest from the origin: no workcell is 100 m wide; beyond, a sentinel value or a broken float is likely."""
 ROTATION_TOLERANCE = 1e-5
 """Largest entry of |R^T R - I|: files write 6 to 7 digits; at 500 mm this still is only 0.005 mm."""
 

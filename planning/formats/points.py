@@ -44,7 +44,7 @@ class NamedPoints:
     Attributes:
         names: Shape (n,), in the order of the file.
         points: Shape (n, 3), mm, read-only, in ``space``.
-        space: LPS for patient data, LOCAL for a frame of its own, None where nobody said (such as a robot's base).
+        space: LPS for patient data, LOCAL for a frame of its own, None where it is not stated (such as a robot's base).
         kinds: Shape (n,), what each point is, where the file says so ("marker", "lesion").
         joints: Shape (n, 6), rad, read-only: how the robot stood at the touch of each, where the file says so.
     """

@@ -24,7 +24,7 @@ from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 RAYS, SEED = 5, 3
-"""Random directions that vote, always the same: where one of them happens to meet an edge, the others do not."""
+"""Random directions that vote, always the same: where one of them happens to hit an edge, the others do not."""
 
 
 class Side(Enum):
@@ -284,7 +284,7 @@ def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
 
 @allocation_free()
 def _visit(vertices, faces, origin, binned, length, ray, depth, face, way):  # type: ignore[no-untyped-def]  # numba infers
-    """Count the crossings; write them too where the output arrays have room."""
+    """Count the crossings; write them too where the output arrays have space."""
     rays, lengths, order, starts, bins = binned
     found, per_radian = 0, bins / np.pi
     for f in range(len(faces)):

@@ -34,7 +34,7 @@ MOST_IN_ONE = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Vertices and triangles of one surface. Whoever holds one may trust that the guard has passed it.
+    """Vertices and triangles of one surface. Any instance may be trusted: the guard has passed it.
 
     Attributes:
         vertices: Shape (n, 3), float64, mm.

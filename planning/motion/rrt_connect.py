@@ -185,8 +185,8 @@ def _with_exact_ends(waypoints: Floats, home: Floats, goals: Floats) -> tuple[Fl
 
 
 SegmentContact = Callable[[Floats, Floats], Contact | None]
-"""What the straight joint segment between two states (6,) meets; None when it is free, its end included. Of a segment
-that begins at a state known to be free the check gets that state first."""
+"""Contact of the straight joint segment between two states (6,); None when it is free, its end included. Of a
+segment that begins at a state known to be free the check gets that state first."""
 
 Angles = tuple[float, ...]
 """Six joint angles, rad."""

@@ -178,7 +178,7 @@ SAME_ANGLE = 1e-9
 
 
 class Cut:
-    """Which goals are cut off from home, and by which boxes; found when it is first wanted.
+    """Which goals are cut off from home, and by which boxes; found when it is first needed.
 
     Args:
         model: The arm.

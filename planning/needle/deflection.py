@@ -121,7 +121,8 @@ BANDS = 4
 class Shape(NamedTuple):
     """Bent shape of n nodes: deflection (mm) and slope (rad), shape (n,), and forces, N and N mm.
 
-    The tip's is what held it; the clamp's are what it bears of all that presses on the shaft, a moment about itself.
+    The tip's is that of its support; the clamp's are what it bears of all that presses on the shaft, a moment about
+    itself.
     """
 
     deflection: Floats
@@ -236,7 +237,7 @@ def step_for(shaft: Shaft, stiffest: float) -> float:
 
     Args:
         shaft: The needle's.
-        stiffest: The largest k that it meets, N/mm^2; rate = (k / 4 EI)^(1/4).
+        stiffest: The largest k on its path, N/mm^2; rate = (k / 4 EI)^(1/4).
     """
     rate = (stiffest / (4 * shaft.bending_stiffness)) ** 0.25
     return float(min(STEP_MM, OF_LENGTH * shaft.length_mm, OF_BENDING / max(rate, OF_BENDING / STEP_MM)))
@@ -253,7 +254,7 @@ class BevelPath:
         tip_force_n: Shape (m + 1,), the lateral force between tip and tissue as each depth was reached.
         largest_mm: Shape (m + 1,), the greatest deflection anywhere along the shaft, up to each depth.
         holder_n: Shape (m + 1,), the lateral force of the tissue that the holder bears at each depth.
-        holder_n_mm: Shape (m + 1,), its moment about where the shaft is held.
+        holder_n_mm: Shape (m + 1,), its moment about its clamp.
     """
 
     depth_mm: Floats

@@ -376,7 +376,7 @@ def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats)
     insertion stays within the limits.
 
     Args:
-        checker: Judges contacts, in the base frame.
+        checker: Checks contacts, in the base frame.
         request: The direction.
         q_home: Shape (6,), rad.
 

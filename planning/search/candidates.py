@@ -64,7 +64,7 @@ class Verdict(Columns):
 
     @property
     def not_seen(self) -> Bools:
-        """Shape (n,), whether the reason is that nobody scanned the body there, and no structure's clearance."""
+        """Shape (n,), whether the reason is that the body was not scanned there, and no structure's clearance."""
         return (self.reason == Reason.UNKNOWN_REGION.value) & np.isnan(self.amount)
 
     @property

@@ -104,11 +104,11 @@ def choose(context: CaseContext, candidates: Candidates, choice: Choice) -> Chos
     Args:
         context: Of the case.
         candidates: The search of its grid.
-        choice: What a person wanted.
+        choice: The person's choice.
 
     Raises:
         InputError: A rank or window that there is not, or a point that is no skin entry.
-        NoAnswerError: Nothing is safe, or what was wanted is rejected: says why.
+        NoAnswerError: Nothing is safe, or the chosen direction is rejected: says why.
     """
     if not choice.of_grid:
         return choose_stated(context, choice)

@@ -66,7 +66,7 @@ class CaseContext:
 
     Attributes:
         placement: Where the patient lies for the robot, or None when the case does not say.
-        reach: Who answers for the arm, or None without a placement.
+        reach: The checker of the arm, or None without a placement.
         chance: Of the declared errors; None where the case declares none, or the arm is not checked.
         stages: How long reading took; later stages are added as they happen.
     """
@@ -200,7 +200,7 @@ def prepare(
         path: Case file, or the folder that holds ``case.toml``.
         arm: Whether the arm is checked too; None checks it where the case says where its base is.
         engine: A name of `ENGINES`.
-        watcher: Whoever shows progress.
+        watcher: Shows progress.
         target_ct: Another target than the case's, shape (3,), mm.
         options: What is stated in place of what the case file states.
         memory: What this process keeps from one case to the next; the answer is the same.

@@ -79,7 +79,7 @@ def with_breathing_reach(case: Case, anatomy: Anatomy, candidates: Candidates, r
         case: The case; nothing is done where it declares no breathing.
         anatomy: Its structures.
         candidates: Checked with the arm where the CT shows the body.
-        reach: Who checked it.
+        reach: The checker of the arm.
     """
     breathing = case.breathing
     if breathing is None:

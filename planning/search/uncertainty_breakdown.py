@@ -96,7 +96,7 @@ class UncertaintyBreakdown:
         p_touch_any: Of any, min(1, sum).
         budget: The tip's expected error and its sources.
         declaration: Whether the markers' residuals agree with the declared errors, in one sentence.
-        goals: What does not hold: the case's limits, or `WISHED_HIT` where it demands no chance to hit.
+        goals: Limits that are not satisfied: the case's, or `WISHED_HIT` where it demands no chance to hit.
         not_modelled: What these chances leave out.
     """
 

@@ -179,7 +179,7 @@ SLOW_MM = 5.0
 """From here on the tip moves at touching speed."""
 
 PAST_MM = 5.0
-"""So far beyond its believed place a marker is felt for; then the touch is given up."""
+"""So far beyond its believed place a marker is searched for by contact; then the touch is given up."""
 
 TIP_MM = 8.0
 """Length of the needle that may be nearer than its padding to the patient: the marker sits on their skin."""

@@ -325,7 +325,7 @@ class Proximity:
 
     Attributes:
         distance: Shape (n, k), of the axis from the surface, mm.
-        gradient: Shape (n, k, 6), g: what the pose's error (mm, rad) does to it; NaN where they meet.
+        gradient: Shape (n, k, 6), g: what the pose's error (mm, rad) does to it; NaN where they intersect.
         deviation: Shape (n, k), sigma, mm.
     """
 

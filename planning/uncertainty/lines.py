@@ -85,7 +85,7 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
         around: What must not be touched.
         needles: The n needles.
         threshold_mm: Shape (k,), needle radius, or that and a margin.
-        first: Shape (n, k), to first order; NaN where a needle meets a structure already.
+        first: Shape (n, k), to first order; NaN where a needle intersects a structure already.
         wanted: Shape (n, k).
 
     Returns:
@@ -278,7 +278,7 @@ class NeedleUncertainty:
         origin: Shape (3,), the tip's own place, where the axis starts.
         outward: Shape (3,), unit.
         root: Shape (6, 5), B: shift and lean of each of five standard normals.
-        surface_mm: Standard deviation of the surface, as a whole, of the structure that is asked about.
+        surface_mm: Standard deviation of the surface, as a whole, of the structure in question.
         freedom: Degrees of the errors' size where the residuals gave it.
     """
 
@@ -410,7 +410,7 @@ def gap_beyond(scene, start, ahead, beta, hint):  # type: ignore[no-untyped-def]
         origin[1] + start[1] + beta * ahead[1],
         origin[2] + start[2] + beta * ahead[2],
     )
-    enough = max(threshold - surface_mm * (start[6] + beta * ahead[6]), 0.0)  # a surface that is met is touched
+    enough = max(threshold - surface_mm * (start[6] + beta * ahead[6]), 0.0)  # a surface that is reached is touched
     distance, nearest = displaced_distance(triangles, faces, blocks, tip, along, length, enough, hint)
     return (-1.0 if distance == 0.0 else distance - enough), nearest
 
@@ -568,7 +568,7 @@ def likeliest_slope(
     if not np.isfinite(radii[best]) or radii[best] <= 0.0 or radii[0] < radii[best] + PREFERRED:
         best = 0
     flat = np.full(len(radii), np.inf)
-    towards = directions @ directions[best]  # cosine: a plane across the best is met at radius / cosine
+    towards = directions @ directions[best]  # cosine: a plane across the best is hit at radius / cosine
     np.divide(radii[best], towards, out=flat, where=towards > 0.05)
     alone = not bool(((radii < SOONER * flat) & (radii < NO_MATTER)).any())
     return (slope, alone) if best == 0 else (-directions[best] * (slack / radii[best]), alone)

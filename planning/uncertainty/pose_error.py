@@ -32,7 +32,7 @@ from puncture_twin.planning.uncertainty.sources import reading_parts
 def not_cancelled(fit: FitUncertainty, J: Floats, target_base: Floats) -> Floats:
     """G = J_f - X L J: the arm's error Jacobian without the part that the registration cancels.
 
-    Where nobody says how the arm touched the markers, sqrt(2) J_f stands for it: errors of equal size at the markers
+    Where it is not stated how the arm touched the markers, sqrt(2) J_f replaces it: errors of equal size at the markers
     and at the target, independent.
 
     Args:
@@ -65,7 +65,7 @@ class PoseError:
         target_base: Shape (3,), mm.
         errors: As declared.
         fit: What the registration makes of them; its test's scale multiplies every covariance but that of the bend.
-        bend: Of one direction's needle; None where it is straight, or what is asked is not of one direction.
+        bend: Of one direction's needle; None where it is straight, or where it is not of one direction.
     """
 
     model: UrModel

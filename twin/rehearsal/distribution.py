@@ -74,9 +74,9 @@ class Distribution:
         p_touch: Shape (k,), predicted.
         wrong_belief: Whether the truth was drawn from other errors than the belief declares, on purpose.
         budget: Where the predicted error comes from.
-        guessed_touches: Whether nobody says how the arm touched the markers, so that a posture was assumed.
+        guessed_touches: Whether it is not stated how the arm touched the markers, so that a posture was assumed.
         not_modelled: What neither the trials nor the chances contain.
-        physics: Some of the trials in the simulator, where that was wanted.
+        physics: Some of the trials in the simulator, if any.
     """
 
     seed: int
@@ -294,7 +294,7 @@ def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: F
     """Structures that each trial's needle touches, shape (n, k), by FCL's capsule where no bound excludes it.
 
     A surface that lies farther out is touched from farther; one that lies deeper than the needle is thick is touched
-    where the axis meets it as it was drawn, as in `line_chance`.
+    where the axis hits it as it was drawn, as in `line_chance`.
     """
     case, checked = context.case, context.anatomy.checked
     columns, outward_ct = demanding(checked), puncture.outward_ct[None]

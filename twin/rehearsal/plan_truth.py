@@ -39,7 +39,7 @@ def drawn_truth(puncture: Puncture, trials: Trials, row: int, seed: int, source:
     """The truth whose execution ends as one of the trials did.
 
     Args:
-        puncture: What the rooms repeat.
+        puncture: Common part of the trials.
         trials: As drawn.
         row: Which.
         seed: Of their draws.
@@ -63,7 +63,7 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
 
     Raises:
         InputError: A file of true positions that cannot be used.
-        NoAnswerError: In none of the rooms the arm reaches the pose that its registration asks for.
+        NoAnswerError: In no trial the arm reaches the pose that its registration demands.
     """
     case = context.case
     drawn = case.errors is not None and case.registration is not None and case.rehearsal.truth_base is None
@@ -143,7 +143,7 @@ def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_tar
     Args:
         context: The case.
         plan: By the registration of the touches.
-        truth: That the touches met.
+        truth: Of the touches.
         at_target: What is true on arrival.
     """
     hit = bent_truth(context, plan, puncture_truth(plan, truth, at_target))
@@ -167,9 +167,9 @@ def physics_trials(context: CaseContext, plan: Plan, found: Distribution, count:
     Args:
         context: The plan's case.
         plan: What is executed.
-        found: The rooms; the arm reached the pose in one at least.
+        found: The trials; the arm reached the pose in one at least.
         count: How many.
-        progress: Called with rooms done and all of them.
+        progress: Called with trials done and all of them.
     """
     rows = spread_rows(found, count)
     apart, contacts = np.empty(len(rows)), 0

@@ -136,8 +136,8 @@ class Rehearsal:
         truth_source: How the truth was found.
         T_base_ct_true: Shape (4, 4), true pose of the patient.
         times_s: Shape (m,), from the start of the approach.
-        q: Shape (m, 6), what the encoders said.
-        q_command: Shape (m, 6), what was asked.
+        q: Shape (m, 6), encoder angles.
+        q_command: Shape (m, 6), commanded joints.
         phase: Shape (m,), "approach", "settle", "insertion" or "hold".
         T_base_flange_true: Shape (m, 4, 4), true pose of the flange.
         tip_true_ct: Shape (m, 3), the needle's true tip in the patient.

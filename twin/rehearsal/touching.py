@@ -1,8 +1,9 @@
 """Planned touches executed in the simulator: marker after marker, and home; one that fails does not end the tour.
 
-The declared errors of arm and markers are in where each marker is met: the simulated arm is the nominal one, so a pad
-stands on its line where the erring arm's tip would be on the true marker. At the standoff somebody sets the needle's
-line onto the marker by eye; how deep it is, the arm feels. The tip is a point: the pad is square to the needle.
+The declared errors of arm and markers are in where each marker is touched: the simulated arm is the nominal one, so a
+pad stands on its line where the erring arm's tip would be on the true marker. At the standoff somebody sets the
+needle's line onto the marker by eye; how deep it is, the arm feels. The tip is a point: the pad is square to the
+needle.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Touched:
     """Readings of all touches, in their order.
 
     Attributes:
-        readings: One a marker that was felt.
+        readings: One a marker that was touched.
         failed: Marker to why it was not read, in words.
         seconds: Home to home; where the arm stopped, of the touches before that.
     """
@@ -107,7 +108,7 @@ def execute_touches(
 ) -> Touched:
     """Touch the markers at their true places. The same tour and truth give the same numbers.
 
-    A marker that is not felt where it should be is given up with its reason, and the arm goes on from its standoff.
+    A marker that is not touched where it should be is given up with its reason, and the arm goes on from its standoff.
     Where the arm or needle touched something else it stops, and what was not read by then stays unread.
 
     Args:
@@ -233,7 +234,7 @@ class _Line(NamedTuple):
     near: Floats
     """Shape (k, 6): from there past the believed marker."""
     face_base: Floats
-    """Shape (3,), mm: where the simulated tip meets the marker."""
+    """Shape (3,), mm: where the simulated tip touches the marker."""
     axis_base: Floats
     """Shape (3,), unit, toward the tip."""
     aside_mm: float

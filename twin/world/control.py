@@ -63,7 +63,7 @@ class Insertion:
         tool: What its flange carries.
         down_base: Shape (3,), unit vector of gravity, base frame.
         trajectory: From rest to rest.
-        hold_s: How long its end is held.
+        hold_s: How long its end is kept.
     """
 
     model: UrModel
@@ -93,7 +93,7 @@ def insert(
 
     Args:
         workcell: An open workcell, its arm at rest at the trajectory's start.
-        insertion: What is wanted.
+        insertion: The insertion to run.
         control: How the tip follows it.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
         start_s: Time of its first step.
@@ -190,7 +190,7 @@ class Impedance:
         model: Of the arm's masses.
         stiffness: At the tip.
         dt: Its step, s.
-        keep_compliance: Whether the integral stands still while contact is felt.
+        keep_compliance: Whether the integral stops while contact is measured.
     """
 
     def __init__(self, model: RigidModel, stiffness: Stiffness, dt: float, *, keep_compliance: bool = True) -> None:
@@ -353,7 +353,7 @@ def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float
         tip_m: Flange to tip.
         trajectory: From rest to rest.
         dt: The controller's step, s.
-        hold_s: How long its end is held.
+        hold_s: How long its end is kept.
     """
     moving = int(np.ceil(trajectory.duration_s / dt)) + 1
     times = np.minimum(dt * np.arange(moving + round(hold_s / dt)), trajectory.duration_s)
@@ -500,7 +500,7 @@ def run(
     Args:
         arm: Of an open workcell whose world is the base frame.
         controller: Its step becomes that of the physics.
-        reference: What is wanted, a row a step.
+        reference: The motion to follow, a row a step.
         tip_of: The true tip of true joints.
         around: What else acts.
     """

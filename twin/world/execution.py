@@ -31,7 +31,7 @@ class Execution:
 
     Attributes:
         times_s: Shape (m,), of each record, from the first command.
-        q_command: Shape (m, 6), rad, what was asked.
+        q_command: Shape (m, 6), rad, commanded joints.
         q: Shape (m, 6), rad, what the encoders say: true angle minus offset.
         T_base_flange: Shape (m, 4, 4), mm, true pose of the flange.
         touches: Every contact at every physics step.

@@ -39,7 +39,7 @@ class SkinTree(NamedTuple):
     tree: tuple[Floats, Floats, Floats]
     """Lowest and highest corners of its boxes and the triangles' corners: see :class:`TriangleTree`."""
     field: NDArray[np.float32]
-    """Shape (i, j, k), mm: distances of the middles of cells; NaN where nobody has computed yet."""
+    """Shape (i, j, k), mm: distances of the middles of cells; NaN where not computed yet."""
     origin: Floats
     """Shape (3,), mm: the lowest corner of the field."""
     outside: NDArray[np.bool_]

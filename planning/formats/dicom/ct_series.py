@@ -55,7 +55,7 @@ class CtSeries:
 
     Attributes:
         path: What was named: the folder, or a file in it.
-        files: Every file of the series, as the content is wanted it.
+        files: Every file of the series, by its key in ``content``.
         content: Gives the bytes of each.
         aside: What else lies in the folder, one sentence.
     """

@@ -84,7 +84,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
 
     Args:
         path: Its name.
-        file: As the content is wanted it.
+        file: Its key in ``content``.
         content: Gives its bytes.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
 

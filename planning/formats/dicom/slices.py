@@ -59,7 +59,7 @@ class Slice:
     """One slice of a CT.
 
     Attributes:
-        file: The file's name, as its bytes are wanted.
+        file: The file's key in ``content``.
         frame: Its number in the file, from 0.
         label: How a person finds it.
         plane: Where it lies.

@@ -79,7 +79,7 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
 
     Args:
         path: Its name.
-        file: As the content is wanted it.
+        file: Its key in ``content``.
         content: Gives its bytes.
         ct: The CT on which it was drawn.
 

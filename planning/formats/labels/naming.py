@@ -206,7 +206,7 @@ def select(
         names: Label to name.
         present: The labels of the map.
         avoid: Pattern to margin in mm.
-        unknown: Likewise, of what nobody knows whether a path may cross it.
+        unknown: Likewise, for which it is unknown whether a path may cross it.
         traverse: Patterns of what may be crossed.
         target: Patterns of what holds the lesion.
         ignore: Patterns of what does not count.

@@ -45,7 +45,7 @@ def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
 
     Args:
         path: Its name.
-        file: As the content is wanted it.
+        file: Its key in ``content``.
         content: Gives its bytes.
 
     Raises:

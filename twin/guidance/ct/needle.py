@@ -45,7 +45,7 @@ LEVELS_HU = (METAL_HU, 1000.0, 600.0, 400.0)
 
 
 FITTED_MM = 80.0
-"""Behind the tip, so much of a needle is held to be straight."""
+"""Behind the tip, so much of a needle is taken as straight."""
 GROWTHS = 2
 """The first line through a short piece is not yet the needle's."""
 SEEN_MM = 3.0

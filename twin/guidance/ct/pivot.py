@@ -28,7 +28,7 @@ MOST_OFF_MM = 50.0
 """mm by which a stated tip may be wrong: more is another needle."""
 
 SLACK_MM = 5.0
-"""mm by which an arm that nobody calibrated may miss one place."""
+"""mm by which an uncalibrated arm may miss one place."""
 
 LEAST_POSES = 3
 """Two leave the tip free along a line."""

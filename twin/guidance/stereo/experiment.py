@@ -92,7 +92,7 @@ class Statistics(NamedTuple):
     seeds: int
     targets: int
     refused: int
-    """Seeds whose session could not be held."""
+    """Seeds whose session failed."""
     stereo_mean: float
     stereo_max: float
     mapping_mean: float

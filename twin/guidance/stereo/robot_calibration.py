@@ -86,9 +86,9 @@ def calibrate_by_robot(
     """Move to the points, detect, measure, and fit.
 
     Args:
-        workcell: The true room.
+        workcell: The true workcell.
         detector: Takes the images.
-        checker: Judges contacts; the head is not there yet.
+        checker: Checks contacts; the head is not there yet.
         rng: For the arm's repeatability and the measuring arm.
 
     Raises:

@@ -90,7 +90,7 @@ class ToolSection(Section):
 class CalibrationSection(Section):
     """The robot's points: a 3 x 2 x 2 grid along the base's axes, about a centre; rod tilted as at the targets.
 
-    With another ``tilt_deg`` the arm's errors at the targets are not those that the calibration met.
+    With another ``tilt_deg`` the arm's errors at the targets are not those of the calibration.
     """
 
     center_mm: Vector

@@ -210,7 +210,7 @@ class Mapping:
         covariance: Shape (6, 6), of a turn (rad) about ``center_c`` and a shift (mm), axes of C.
         center_c: Shape (3,), the markers' centre, mm.
         residuals: Shape (n, 3), T_c_m markers_m - markers_c, mm.
-        conditioning: The flags of a weak marker set, at the middle of the targets.
+        conditioning: The flags of an ill-conditioned marker set, at the middle of the targets.
     """
 
     T_c_m: Floats
@@ -335,7 +335,7 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
     Args:
         rod: The arm, its rod and its orientation.
         points_base: Shape (n, 3), mm.
-        checker: Judges contacts.
+        checker: Checks contacts.
         first: Try this branch before the others.
 
     Raises:

@@ -64,7 +64,7 @@ class Task:
         max_steps: Moves at most.
         looks: Looks at most before a ball counts as lost.
         limits: What one step may do.
-        checker: Judges contacts, with the head where it is believed to stand.
+        checker: Checks contacts, with the head where it is believed to stand.
     """
 
     rod: CarriedRod
@@ -95,7 +95,7 @@ class Servoed:
         visits: Every stay at which the ball was seen, in order.
         q_command: Shape (6,), rad: the last command.
         q_true: Shape (6,), rad: true joints.
-        detail: What was met or missing, for people.
+        detail: What was touched or missing, for people.
         position_only: Whether some step gave the orientation up.
     """
 

@@ -85,7 +85,7 @@ class Session:
     Attributes:
         seed: What it was drawn from.
         workcell: The truth.
-        calibration: What the robot-held points gave.
+        calibration: Result of the robot's points.
         mapping: What the markers gave.
         stereo_mm: Shape (10,): error of the stereo at points of the calibrated volume.
         reached: One for each target.
@@ -125,7 +125,7 @@ def run_session(
         case: The case.
         seed: Of all that is drawn.
         targets: Only these; all when None.
-        detector_of: Who looks; studies of what is behind the images leave them out.
+        detector_of: Makes the detector; studies of what is behind the images leave them out.
         empty: Checker of the workcell without the head, where one is at hand.
 
     Raises:

@@ -211,7 +211,7 @@ def workcell_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
 
     Args:
         case: The case.
-        T_base_m: Where the head is believed to stand, shape (4, 4), mm; None for a room without it.
+        T_base_m: Where the head is believed to stand, shape (4, 4), mm; None for a workcell without it.
     """
     boxes = []
     for box in case.file.box:

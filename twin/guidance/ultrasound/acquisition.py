@@ -104,10 +104,10 @@ def acquire(
     """Record as many poses as the case asks for, choosing others for those in which the needle is not found.
 
     Args:
-        case: The room.
+        case: The self-calibration case.
         workcell: Its collision checker: the jog is checked too.
         candidates: Poses that can be taken.
-        truth: The true room.
+        truth: The ground truth.
         rng: For the choice, if random, the arms' repeatability, what the jog leaves, and the images.
         count: Called after every image.
 
@@ -294,7 +294,7 @@ def jog_into_slice(
     ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
 
     Args:
-        truth: The room.
+        truth: The ground truth.
         q_probe: Where the probe's joints rest, shape (6,), rad.
         q_needle: Where the needle's arm begins, shape (6,), rad.
         wanted: The needle in the image, after the jog.

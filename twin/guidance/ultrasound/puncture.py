@@ -75,11 +75,11 @@ def punctures(
     """Send the needle to the middle of the image's tip, one held-out candidate after the other.
 
     Args:
-        case: The room.
+        case: The self-calibration case.
         workcell: Its collision checker; a target at which something would touch is passed over.
         candidates: Where probe and needle can stand.
         rows: The candidates to use: none of them was recorded.
-        truth: The true room.
+        truth: The ground truth.
         calibration: What was found.
         rng: The reading of the target and the arms' repeatability.
     """
@@ -141,7 +141,7 @@ def aim(
 
 
 def expected_error_mm(calibration: Calibration, poses: Recording) -> float:
-    """Expected (rms) distance of the tip from where the image has it, over poses that hold the joints."""
+    """Expected (rms) distance of the tip from where the image has it, over poses with joints."""
     return float(np.sqrt(np.mean(np.trace(calibration.tip_covariances(poses), axis1=1, axis2=2))))
 
 

@@ -40,7 +40,7 @@ def read_recording(path: Path) -> Recording:
     where directions were measured, ``v_x, v_y`` or ``v_x, v_y, v_z``, and behind them, where it was measured too, how
     much of the shaft shows, ``shaft_mm``; and, where the joints were recorded,
     ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``; and, behind these, the direction of each joint's last rotation
-    (1, -1; 0 where nobody knows), ``A_turn1 .. B_turn6``. Lines that start with # are passed over.
+    (1, -1; 0 where unknown), ``A_turn1 .. B_turn6``. Lines that start with # are passed over.
 
     Raises:
         InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.

@@ -20,7 +20,7 @@ class SelfcalTrial:
 
     Attributes:
         seed: Of this trial.
-        truth: The room.
+        truth: The ground truth.
         acquisition: What was recorded.
         calibration: What was found.
         unseen_mm: Predicted minus true tip at poses that were not recorded, shape (k,).

@@ -33,7 +33,7 @@ STUB_MM = 1.0
 """A tool ends in a needle; the probe's handle ends in one so short that it is none."""
 
 FAR_LINKS = 5
-"""The probe's head may meet the links from the base to wrist 1; the later ones turn behind it."""
+"""The probe's head may touch the links from the base to wrist 1; the later ones turn behind it."""
 
 
 class Touching(StrEnum):
@@ -73,7 +73,7 @@ class BetweenArms:
         moved = self.T_base1_base2 @ link_poses(self._models[1], q_needle)
         for body in self.needle_bodies:
             body.place(moved)
-        ends_first = product(reversed(self.probe_bodies), reversed(self.needle_bodies))  # they meet soonest
+        ends_first = product(reversed(self.probe_bodies), reversed(self.needle_bodies))  # they touch soonest
         return not any(_meet(first, second) for first, second in ends_first)
 
 
@@ -81,7 +81,7 @@ class TwoArms:
     """FCL's verdict on both arms. Not for several threads at once: FCL's objects are moved for each question.
 
     Args:
-        case: The room.
+        case: The self-calibration case.
     """
 
     def __init__(self, case: SelfcalCase) -> None:

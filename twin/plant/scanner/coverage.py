@@ -93,7 +93,7 @@ def _slice(corners, owners, fills, labels, cuts, empty, values, marks):  # type:
     for plane in range(planes):
         z = k + (plane + 0.5) / planes - 0.5
         count = _segments(corners, owners, z, segments, whose)
-        within = (plane + 0.5) / planes  # lines of one plane lie between those of another: a face along them is met
+        within = (plane + 0.5) / planes  # lines of one plane lie between those of another: a face along them is hit
         starts, xs, turns = _crossings(segments[:count], whose[:count], ny, subs, within)
         for line in range(ny * subs):
             first, last = starts[line], starts[line + 1]

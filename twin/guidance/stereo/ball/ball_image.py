@@ -39,9 +39,9 @@ class BallScene:
         rod_c: Shape (3,): from the ball along the rod to the flange.
         rod_radius_mm: The rod is a cylinder with round ends.
         rod_length_mm: From the ball's centre.
-        light_c: Shape (3,): toward the lamp.
+        light_c: Shape (3,): toward the light.
         diffuse: Fraction of the light that comes from everywhere, 0 to 1; directed light obeys Lambert's law.
-        ball_grey: Of the ball where the lamp shines straight on it.
+        ball_grey: Of the ball where the light shines straight on it.
         rod_grey: The rod's.
         background_grey: What is behind.
         texture_grey: Standard deviation of the background's pattern.

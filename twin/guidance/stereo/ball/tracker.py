@@ -56,7 +56,7 @@ class TrackerSettings:
         radius_share: How far the radius may be from the predicted one.
         min_contrast: Grey levels between ball and surroundings that make an edge.
         noise_factor: The same in parts of the image's own noise; the larger counts.
-        model_px: Standard deviation, per axis, of what lamp, blur and rod do to the centre and the edges do not tell.
+        model_px: Standard deviation, per axis, of what light, blur and rod do to the centre and the edges do not show.
     """
 
     spokes: int = 72
@@ -139,7 +139,7 @@ def find_ball(
 
 
 def _cut(whole: GreyImage, center: Floats, half: float) -> GreyImage:
-    """The part of a picture around a pixel, as far as there is one."""
+    """The part of an image around a pixel, as far as there is one."""
     size = np.array(whole.grey.shape[::-1])
     low = np.clip(np.floor(center - half).astype(int) - whole.offset, 0, size)
     high = np.clip(np.ceil(center + half).astype(int) + 1 - whole.offset, 0, size)

@@ -67,7 +67,7 @@ class Bundle:
         points: Shape (points, 3), in the bodies' frame.
         residuals_px: Shape (n, 2), seen minus predicted.
         cost: Sum of the squared, whitened residuals, priors included.
-        free: Which of all parameters (cameras, bodies, points, in this order) were not held.
+        free: Which of all parameters (cameras, bodies, points, in this order) were not fixed.
         covariance: Shape (all, all), of all parameters, zero where held; from the covariances given, not rescaled.
     """
 

@@ -54,7 +54,7 @@ class CameraCalibration:
         camera: Refined.
         residuals_px: Shape (n, 2), found minus predicted.
         rms_px: Root mean square distance of the residuals.
-        covariance: Shape (14, 14) in the order of ``bundle.CAMERA_PARAMETERS``; zero where held.
+        covariance: Shape (14, 14) in the order of ``bundle.CAMERA_PARAMETERS``; zero where fixed.
         sigma_px: Standard deviation per axis of a pixel: given, or estimated from the residuals.
         identified: The distortion coefficients that the points tell.
     """

@@ -195,7 +195,7 @@ def stereo_pair(
         height: Pixels.
         focal_px: Pixels; 2560 shows 500 mm at 1 m on 1280 px.
         baseline_mm: Between the two centres.
-        distance_mm: From the middle of the baseline to the room's centre.
+        distance_mm: From the middle of the baseline to the workcell's centre.
         distortion: k1, k2, p1, p2 of both.
 
     Raises:

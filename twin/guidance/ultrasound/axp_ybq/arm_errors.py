@@ -64,7 +64,7 @@ class DeclaredArm(NamedTuple):
 
         Args:
             q: Joints, shape (n, 6), rad.
-            turn: Direction in which each last rotated, shape (n, 6): 1, -1, or 0 where nobody knows.
+            turn: Direction in which each last rotated, shape (n, 6): 1, -1, or 0 where unknown.
         """
         slopes = error_jacobian(self.model, q, 0.0)[..., :N_ARM] * self.deviations()
         if self.play_rad:

@@ -120,7 +120,7 @@ class _Family(NamedTuple):
     """The ill-conditioned part of a three-dimensional family of motions."""
 
     weak: int
-    """How many of its three directions are weak."""
+    """How many of its three directions are ill-conditioned."""
     weakest: Floats
     """Unit vector (3,) in the family's own coordinates."""
 
