@@ -40,19 +40,6 @@ MOST_SAMPLES = 200_000
 """Samples of one phase: 27 minutes of a stream. The straight move is checked in no more steps, however slow it is."""
 
 
-class JointMove(NamedTuple):
-    """One ``movej``: straight in joint angles."""
-
-    q: Floats
-    """Where it ends, shape (6,), rad."""
-    speed: float
-    """Peak speed of the joint that turns farthest, rad/s."""
-    acceleration: float
-    """Peak acceleration of the same joint, rad/s^2."""
-    blend_mm: float
-    """Radius about its end within which the tip may round the corner; 0 stops there."""
-
-
 @dataclass(frozen=True, eq=False)
 class Program:
     """A URScript program as numbers: mm, rad, s, the controller's base frame.
@@ -82,20 +69,24 @@ class Program:
     insertion_mm_s2: float
 
 
+class JointMove(NamedTuple):
+    """One ``movej``: straight in joint angles."""
+
+    q: Floats
+    """Where it ends, shape (6,), rad."""
+    speed: float
+    """Peak speed of the joint that turns farthest, rad/s."""
+    acceleration: float
+    """Peak acceleration of the same joint, rad/s^2."""
+    blend_mm: float
+    """Radius about its end within which the tip may round the corner; 0 stops there."""
+
+
 class _Ramp(NamedTuple):
     """Peak speed and acceleration of a trapezoid."""
 
     speed: float
     acceleration: float
-
-
-def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
-    """Rows of the approach's waypoints, both ends among them: one where nothing moves, none for a smooth approach."""
-    if np.abs(plan.approach.q - plan.approach.q[0]).max() <= STRAIGHT_RAD:
-        return np.zeros(1, dtype=np.intp)
-    rows = corner_rows(plan.approach.q)
-    straight = rests_at(plan.model, plan.approach, rows[1:-1])
-    return rows if straight else rows[:0]
 
 
 def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
@@ -132,6 +123,15 @@ def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
         insertion_mm_s=insertion.speed,
         insertion_mm_s2=insertion.acceleration,
     )
+
+
+def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
+    """Rows of the approach's waypoints, both ends among them: one where nothing moves, none for a smooth approach."""
+    if np.abs(plan.approach.q - plan.approach.q[0]).max() <= STRAIGHT_RAD:
+        return np.zeros(1, dtype=np.intp)
+    rows = corner_rows(plan.approach.q)
+    straight = rests_at(plan.model, plan.approach, rows[1:-1])
+    return rows if straight else rows[:0]
 
 
 def straight_move(model: UrModel, program: Program) -> Trajectory:

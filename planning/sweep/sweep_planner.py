@@ -31,6 +31,40 @@ from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
 
+
+@dataclass(frozen=True, eq=False)
+class SweepPlan:
+    """A motion about the virtual TCP (Chen 2019): the point on the needle's axis, a standoff before its tip.
+
+    Attributes:
+        model: The arm.
+        needle_length_mm: Flange to tip.
+        standoff_mm: Tip to virtual TCP.
+        point_base: Shape (3,), mm: where the virtual TCP stays, the target.
+        angles: Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less.
+        wanted: Theta and beta, rad, where it should have ended.
+        approach: From home to the first direction.
+        sweep: Through all of them.
+        stopped: Where and why it ends before; empty where it does not.
+    """
+
+    model: UrModel
+    needle_length_mm: float
+    standoff_mm: float
+    point_base: Floats
+    angles: Floats
+    wanted: tuple[float, float]
+    approach: Trajectory
+    sweep: Trajectory
+    stopped: str
+
+    def off_point_mm(self, T_base_flange: Floats) -> Floats:
+        """How far flange poses (m, 4, 4), mm, leave the virtual TCP from its point, shape (m,)."""
+        reach = self.needle_length_mm + self.standoff_mm
+        virtual = T_base_flange[:, :3, 3] + reach * T_base_flange[:, :3, 2]
+        return np.asarray(np.linalg.norm(virtual - self.point_base, axis=1))
+
+
 STEP = np.radians(1.0)
 """Between two directions that are checked, at most: half of the search's usual grid."""
 
@@ -39,15 +73,6 @@ MOST_JOINT_STEP = 0.2
 
 SWEEP_SPEED_MM_S = 30.0
 """Speed of the needle's tip, in the air."""
-
-
-class _SweepPath(NamedTuple):
-    """Directions that are passed one after the other, and why it ends."""
-
-    angles: Floats
-    """Shape (k, 2), rad."""
-    standoff_mm: float
-    stopped: str
 
 
 def plan_sweep(
@@ -130,6 +155,15 @@ def _place(angles: Floats) -> str:
     return f"theta {theta:.1f} deg, beta {beta % 360:.1f} deg"
 
 
+class _SweepPath(NamedTuple):
+    """Directions that are passed one after the other, and why it ends."""
+
+    angles: Floats
+    """Shape (k, 2), rad."""
+    standoff_mm: float
+    stopped: str
+
+
 def _farthest(context: CaseContext, point: Floats, directions: Floats, route: _SweepPath) -> tuple[Floats, str]:
     """The path that goes farthest among all rolls and branches at the first direction, (k, 6), and why it ends."""
     assert context.reach is not None
@@ -186,36 +220,3 @@ def _why_not(checker: CellChecker, before: Floats, q: Floats, step: float) -> st
     states = dense_states(checker, np.stack([before, q]), RESOLUTION_RAD / FINER)
     contact = checker.first_contact(states, needle_may_touch_patient=False)
     return "" if contact is None else f"{contact.contact.body} touches {contact.contact.other}"
-
-
-@dataclass(frozen=True, eq=False)
-class SweepPlan:
-    """A motion about the virtual TCP (Chen 2019): the point on the needle's axis, a standoff before its tip.
-
-    Attributes:
-        model: The arm.
-        needle_length_mm: Flange to tip.
-        standoff_mm: Tip to virtual TCP.
-        point_base: Shape (3,), mm: where the virtual TCP stays, the target.
-        angles: Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less.
-        wanted: Theta and beta, rad, where it should have ended.
-        approach: From home to the first direction.
-        sweep: Through all of them.
-        stopped: Where and why it ends before; empty where it does not.
-    """
-
-    model: UrModel
-    needle_length_mm: float
-    standoff_mm: float
-    point_base: Floats
-    angles: Floats
-    wanted: tuple[float, float]
-    approach: Trajectory
-    sweep: Trajectory
-    stopped: str
-
-    def off_point_mm(self, T_base_flange: Floats) -> Floats:
-        """How far flange poses (m, 4, 4), mm, leave the virtual TCP from its point, shape (m,)."""
-        reach = self.needle_length_mm + self.standoff_mm
-        virtual = T_base_flange[:, :3, 3] + reach * T_base_flange[:, :3, 2]
-        return np.asarray(np.linalg.norm(virtual - self.point_base, axis=1))

@@ -24,9 +24,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import settled
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import LEAST_MM, UNWEIGHTED, Problem, Spread
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Fitted, RobustFit, weighed
 
-WIDEST_RATIO = 30.0
-"""Inside and across the image are not taken to differ by more."""
-
 
 class ResidualSpreads(NamedTuple):
     """Noise as the residuals show it."""
@@ -36,88 +33,8 @@ class ResidualSpreads(NamedTuple):
     """How far the needle leans out of the measured direction's plane across the image."""
 
 
-def structures(problem: Problem, fit: RobustFit) -> dict[str, Floats]:
-    """Covariance of the residuals (n, k, k) that each found part has at size 1, by its name."""
-    image = problem.recording.A[:, :3, :3] @ fit.estimate.R_X
-    n, k = len(problem.recording), 5 if problem.with_direction else 3
-    found: dict[str, Floats] = {}
-    if isinstance(problem.noise, Spread):
-        for name, axes in (("inside", image[:, :, :2]), ("across", image[:, :, 2:])):
-            found[name] = np.zeros((n, k, k))
-            found[name][:, :3, :3] = axes @ axes.transpose(0, 2, 1)
-    if problem.with_direction:
-        rows = {"lean": 4} if not found else {"turn": 3, "lean": 4}
-        for name, row in rows.items():
-            found[name] = np.zeros((n, k, k))
-            found[name][:, row, row] = problem.recording.direction_spread**2 if name == "turn" else 1.0
-    return found
-
-
-STEPS = 12
-"""Steps of the parts' sizes between two fits, by likelihood; each comes within a few percent in half as many."""
-
-LEAST_PART_FREEDOM = 3.0
-"""Residuals minus unknowns of one part of the tip's noise below which both parts are found together."""
-
-LEAST_PART_RAD = 1e-6
-"""No direction is measured better, and none leans less."""
-
-
-def by_likelihood(problem: Problem, fit: RobustFit) -> ResidualSpreads:
-    """The parts' sizes at a fit, by restricted maximum likelihood."""
-    declared = not isinstance(problem.noise, Spread)
-    found = ResidualSpreads(problem.noise if isinstance(problem.noise, Spread) else UNWEIGHTED, problem.lean_rad)
-    for _ in range(STEPS):
-        problem = problem._replace(noise=problem.noise if declared else found.spread, lean_rad=found.lean_rad)
-        at_fit = weighed(problem, fit)
-        found = _step(problem, fit, at_fit, found)
-    return found
-
-
-def _step(problem: Problem, fit: RobustFit, at_fit: Fitted, found: ResidualSpreads) -> ResidualSpreads:
-    """Each part times the root of its residuals over their expectation."""
-    W = at_fit.whitener
-    own = W.transpose(0, 2, 1) @ W  # C_i^-1
-    q = own @ at_fit.residuals[:, :, None]  # P r at the fit
-    pulled = own @ at_fit.jacobian
-    E = own - pulled @ at_fit.covariance @ pulled.transpose(0, 2, 1)  # diagonal blocks of P
-    sides = {
-        name: (float((q.transpose(0, 2, 1) @ D @ q).sum()), float(np.einsum("nij,nji->", D, E)))
-        for name, D in structures(problem, fit).items()
-    }
-    spread, lean = found
-    if "inside" in sides:
-        inside, across = _moved_tip_parts(spread, sides["inside"], sides["across"])
-        turn = spread.direction_rad
-        if "turn" in sides:
-            turn = max(turn * _growth(sides["turn"]), LEAST_PART_RAD)
-        spread = Spread(inside, across, turn)
-    if "lean" in sides:
-        lean = max(lean * _growth(sides["lean"]), LEAST_PART_RAD)
-    return ResidualSpreads(spread, lean)
-
-
-def _moved_tip_parts(spread: Spread, inside: tuple[float, float], across: tuple[float, float]) -> tuple[float, float]:
-    if min(inside[1] * spread.inside_mm**2, across[1] * spread.across_mm**2) < LEAST_PART_FREEDOM:
-        both = _growth((inside[0] + across[0], inside[1] + across[1]))  # too few residuals to part them
-        return max(spread.inside_mm * both, LEAST_MM), max(spread.inside_mm * both, LEAST_MM)
-    sizes = spread.inside_mm * _growth(inside), spread.across_mm * _growth(across)
-    least = max(*sizes, LEAST_MM) / WIDEST_RATIO
-    return max(sizes[0], least), max(sizes[1], least)
-
-
-def _growth(sides: tuple[float, float]) -> float:
-    return float(np.sqrt(sides[0] / max(sides[1], 1e-300)))  # of a deviation: variances grow by the ratio
-
-
 SPREAD_ROUNDS = 2
 """How often the residuals' spread is found and the fit repeated with it; it settles to a few percent in two."""
-
-LEAST_FREEDOM = 15
-"""Residuals minus unknowns below which inside and across are not distinguished: their ratio would be chance."""
-
-LEAST_RAD = 1e-9
-"""The same for directions."""
 
 
 def refitted(problem: Problem, fit: RobustFit, seen: SeenDirection, *, recheck: bool) -> tuple[Problem, RobustFit]:
@@ -162,6 +79,16 @@ def found_spreads(problem: Problem, fit: RobustFit) -> ResidualSpreads:
     return ResidualSpreads(Spread(*_tip_parts(problem, at_fit, fit), turn), lean)
 
 
+LEAST_FREEDOM = 15
+"""Residuals minus unknowns below which inside and across are not distinguished: their ratio would be chance."""
+
+LEAST_RAD = 1e-9
+"""The same for directions."""
+
+WIDEST_RATIO = 30.0
+"""Inside and across the image are not taken to differ by more."""
+
+
 def _tip_parts(problem: Problem, at_fit: Fitted, fit: RobustFit) -> tuple[float, float]:
     """Spread of the tip's residuals inside and across the image, mm."""
     to_image = (problem.recording.A[:, :3, :3] @ fit.estimate.R_X).transpose(0, 2, 1)[fit.tip_kept]
@@ -188,6 +115,81 @@ def _two_parts(squares: Floats, freedom: Floats) -> tuple[float, float]:
     across = float(np.sqrt(squares[2] / freedom[2]))
     least = max(inside, across, LEAST_MM) / WIDEST_RATIO
     return max(inside, least), max(across, least)
+
+
+STEPS = 12
+"""Steps of the parts' sizes between two fits, by likelihood; each comes within a few percent in half as many."""
+
+
+def by_likelihood(problem: Problem, fit: RobustFit) -> ResidualSpreads:
+    """The parts' sizes at a fit, by restricted maximum likelihood."""
+    declared = not isinstance(problem.noise, Spread)
+    found = ResidualSpreads(problem.noise if isinstance(problem.noise, Spread) else UNWEIGHTED, problem.lean_rad)
+    for _ in range(STEPS):
+        problem = problem._replace(noise=problem.noise if declared else found.spread, lean_rad=found.lean_rad)
+        at_fit = weighed(problem, fit)
+        found = _step(problem, fit, at_fit, found)
+    return found
+
+
+LEAST_PART_FREEDOM = 3.0
+"""Residuals minus unknowns of one part of the tip's noise below which both parts are found together."""
+
+LEAST_PART_RAD = 1e-6
+"""No direction is measured better, and none leans less."""
+
+
+def _step(problem: Problem, fit: RobustFit, at_fit: Fitted, found: ResidualSpreads) -> ResidualSpreads:
+    """Each part times the root of its residuals over their expectation."""
+    W = at_fit.whitener
+    own = W.transpose(0, 2, 1) @ W  # C_i^-1
+    q = own @ at_fit.residuals[:, :, None]  # P r at the fit
+    pulled = own @ at_fit.jacobian
+    E = own - pulled @ at_fit.covariance @ pulled.transpose(0, 2, 1)  # diagonal blocks of P
+    sides = {
+        name: (float((q.transpose(0, 2, 1) @ D @ q).sum()), float(np.einsum("nij,nji->", D, E)))
+        for name, D in structures(problem, fit).items()
+    }
+    spread, lean = found
+    if "inside" in sides:
+        inside, across = _moved_tip_parts(spread, sides["inside"], sides["across"])
+        turn = spread.direction_rad
+        if "turn" in sides:
+            turn = max(turn * _growth(sides["turn"]), LEAST_PART_RAD)
+        spread = Spread(inside, across, turn)
+    if "lean" in sides:
+        lean = max(lean * _growth(sides["lean"]), LEAST_PART_RAD)
+    return ResidualSpreads(spread, lean)
+
+
+def structures(problem: Problem, fit: RobustFit) -> dict[str, Floats]:
+    """Covariance of the residuals (n, k, k) that each found part has at size 1, by its name."""
+    image = problem.recording.A[:, :3, :3] @ fit.estimate.R_X
+    n, k = len(problem.recording), 5 if problem.with_direction else 3
+    found: dict[str, Floats] = {}
+    if isinstance(problem.noise, Spread):
+        for name, axes in (("inside", image[:, :, :2]), ("across", image[:, :, 2:])):
+            found[name] = np.zeros((n, k, k))
+            found[name][:, :3, :3] = axes @ axes.transpose(0, 2, 1)
+    if problem.with_direction:
+        rows = {"lean": 4} if not found else {"turn": 3, "lean": 4}
+        for name, row in rows.items():
+            found[name] = np.zeros((n, k, k))
+            found[name][:, row, row] = problem.recording.direction_spread**2 if name == "turn" else 1.0
+    return found
+
+
+def _moved_tip_parts(spread: Spread, inside: tuple[float, float], across: tuple[float, float]) -> tuple[float, float]:
+    if min(inside[1] * spread.inside_mm**2, across[1] * spread.across_mm**2) < LEAST_PART_FREEDOM:
+        both = _growth((inside[0] + across[0], inside[1] + across[1]))  # too few residuals to part them
+        return max(spread.inside_mm * both, LEAST_MM), max(spread.inside_mm * both, LEAST_MM)
+    sizes = spread.inside_mm * _growth(inside), spread.across_mm * _growth(across)
+    least = max(*sizes, LEAST_MM) / WIDEST_RATIO
+    return max(sizes[0], least), max(sizes[1], least)
+
+
+def _growth(sides: tuple[float, float]) -> float:
+    return float(np.sqrt(sides[0] / max(sides[1], 1e-300)))  # of a deviation: variances grow by the ratio
 
 
 class SmallSample(NamedTuple):
