@@ -133,8 +133,8 @@ def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
     except Exception as error:  # whatever breaks becomes this case's row: the others go on
         if isinstance(error, OSError) and disk_is_full(error, task.out):
             raise
-        said = relative_text(f"{type(error).__name__}: {error}", planned)
-        row, inputs = blank_row(planned, PROGRAM_FAILED, said), read_inputs(json.loads(planned.inputs))
+        message = relative_text(f"{type(error).__name__}: {error}", planned)
+        row, inputs = blank_row(planned, PROGRAM_FAILED, message), read_inputs(json.loads(planned.inputs))
     return _committed(task, draft, row, inputs, stages.seconds)
 
 

@@ -174,14 +174,14 @@ def _spoken(workers: list[_Worker]) -> list[_Worker]:
 def _heard(worker: _Worker, workers: list[_Worker], queue: TaskQueue) -> Iterator[CaseEnd]:
     """Handle a worker's message and its next case; or its death."""
     try:
-        said = worker.connection.recv() if worker.connection.poll() else None
+        message = worker.connection.recv() if worker.connection.poll() else None
     except (EOFError, OSError):
-        said = None
-    if said == READY:
+        message = None
+    if message == READY:
         worker.ready = True
         worker.give(worker.task)
-    elif isinstance(said, CaseEnd):
-        yield said
+    elif isinstance(message, CaseEnd):
+        yield message
         if queue:
             worker.give(queue.next(worker.task))
         else:

@@ -169,10 +169,10 @@ def _pierced(corners: Floats, ray: Floats) -> Ints:
     a, b, c = np.moveaxis(corners, 1, 0)
     weights = np.stack([np.cross(b, c) @ ray, np.cross(c, a) @ ray, np.cross(a, b) @ ray], axis=1)
     lengths = np.linalg.norm(corners, axis=2)
-    doubt = 1e-11 * np.roll(lengths, -1, axis=1) * np.roll(lengths, -2, axis=1)
-    left, right = (weights > doubt).any(axis=1), (weights < -doubt).any(axis=1)
+    rounding = 1e-11 * np.roll(lengths, -1, axis=1) * np.roll(lengths, -2, axis=1)
+    left, right = (weights > rounding).any(axis=1), (weights < -rounding).any(axis=1)
     ahead = np.einsum("nc,nci,i->n", weights, corners, ray)
     found = np.where((ahead > 0) == left, 1, 0)
-    found[(np.abs(weights) <= doubt).any(axis=1)] = -1
+    found[(np.abs(weights) <= rounding).any(axis=1)] = -1
     found[left & right] = 0
     return found

@@ -69,7 +69,7 @@ class Entry(NamedTuple):
     what: str
 
     @property
-    def said(self) -> str:
+    def line(self) -> str:
         """Name of the entry, and why it is not read."""
         return f"{self.name} ({self.what or NOT_READ})"
 

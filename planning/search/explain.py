@@ -297,8 +297,8 @@ def decimals(structure: Structure) -> int:
 
 def _clearance_note(clearance_mm: float, short: bool) -> str:
     """Text after a clearance: too close, or crossed where it is below zero."""
-    said = ["too close"] * short + ["crossed"] * (clearance_mm < 0)
-    return f"  {', '.join(said)}" if said else ""
+    notes = ["too close"] * short + ["crossed"] * (clearance_mm < 0)
+    return f"  {', '.join(notes)}" if notes else ""
 
 
 def needle_warnings(case: Case, candidates: Candidates) -> list[str]:

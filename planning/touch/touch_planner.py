@@ -259,9 +259,9 @@ def _free(checkers: ApproachCheckers, tip_mm: float, candidates: Candidates) -> 
     """Free poses of the insertion's own branch, else of the others; and what blocks most often."""
     reasons: list[str] = []
     for q in (candidates.alike, candidates.others):
-        said = [why_not(checkers, tip_mm, one) for one in q]
-        free = q[[not reason for reason in said]]
+        blocked_by = [why_not(checkers, tip_mm, one) for one in q]
+        free = q[[not reason for reason in blocked_by]]
         if len(free):
             return free, ""
-        reasons += said
+        reasons += blocked_by
     return np.empty((0, 6)), max(set(reasons), key=reasons.count) if reasons else "out of the arm's reach"

@@ -134,7 +134,7 @@ class CtSeries:
         slices: list[Slice] = []
         layouts: dict[str, PixelLayout] = {}
         stated = set()
-        doubts = Counter[str]()
+        counts = Counter[str]()
         for file in self.files:
             data = parse_dicom(self.content(file), Path(file))
             header = described(data, Path(file))
@@ -144,14 +144,14 @@ class CtSeries:
             layouts[file] = pixel_layout(data, file)
             own = slices_of(data, file, layouts[file].frames)
             slices += own
-            doubts[LOSSY] += text(data, "LossyImageCompression", where=file) == "01"
-            doubts[CLASS_IN_META] += not text(data, "SOPClassUID", where=file)
-            doubts[SCOUTS] += layouts[file].frames - len(own)
+            counts[LOSSY] += text(data, "LossyImageCompression", where=file) == "01"
+            counts[CLASS_IN_META] += not text(data, "SOPClassUID", where=file)
+            counts[SCOUTS] += layouts[file].frames - len(own)
         series_uid, frame_of_reference = _one(stated, self.path)
         stack = stack_of(slices, self.path)
         rows, columns = _one_size(layouts, self.path)
         grid = straight_grid(stack, rows, columns, self.path)
-        notes = tuple(f"{self.path.name}: {said.format(count)}" for said, count in doubts.items() if count)
+        notes = tuple(f"{self.path.name}: {note.format(count)}" for note, count in counts.items() if count)
         return _Series(stack, grid, layouts, series_uid, frame_of_reference, notes)
 
 

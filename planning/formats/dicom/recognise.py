@@ -222,7 +222,7 @@ def choose_series(path: Path) -> SeriesFiles:
     left = unaccounted(folder, (*others, *read.values()), lambda path: path.name in read)
     if lost := [one for one in left if _may_be_slice(one, names)]:
         raise InputError(
-            f"beside the slices lies what is not read, and may be a slice: {first_few([one.said for one in lost])}",
+            f"beside the slices lies what is not read, and may be a slice: {first_few([one.line for one in lost])}",
             where=path,
             allowed="every slice of the series as a whole DICOM file (fetch it, copy it again, or move it elsewhere)",
             code="slices_not_read",
@@ -250,7 +250,7 @@ def _check_one_series(
     if not slices:
         classes = Counter(one.sop_class for one in found)
         shown = [f"{count} {name}" for name, count in classes.most_common()] or ["no DICOM file"]
-        what = f"no CT series here: {first_few([*shown, *(one.said for one in others)])}"
+        what = f"no CT series here: {first_few([*shown, *(one.line for one in others)])}"
         raise InputError(what, where=path, allowed="a folder with a CT series; folders in it are not entered")
     series: dict[str, list[DicomFile]] = {}
     for one in slices:

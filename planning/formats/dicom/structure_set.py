@@ -260,7 +260,7 @@ def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[st
         (small, "contours smaller than a pixel count for the pixels along them, in"),
         (cut, "contours that reach beyond the CT's image end there, in"),
     )
-    return [f"{where}: {said} {first_few(some)}" for some, said in findings if some]
+    return [f"{where}: {problem} {first_few(some)}" for some, problem in findings if some]
 
 
 def _is_tiny(points: Floats, shape: tuple[int, int]) -> bool:

@@ -78,7 +78,7 @@ def is_mask(entry: Entry) -> bool:
 def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError:
     """Entries of a folder of masks or meshes that would be passed over: their organs would count as free."""
     return InputError(
-        f"beside the {among} lies what is not read, and may be an organ: {first_few([one.said for one in left])}",
+        f"beside the {among} lies what is not read, and may be an organ: {first_few([one.line for one in left])}",
         where=where,
         allowed=f"{among} in formats that are read, and nothing else: convert it, fetch it, or move it elsewhere",
         code="entries_not_read",

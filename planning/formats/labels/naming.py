@@ -237,7 +237,7 @@ def select(
     unused = [p for p in patterns if not any(fnmatchcase(name, p.pattern) for name in here)]
     absent = [f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused]
     taken = tuple(rule for rule in rules if rule is not None)
-    weaker = [said for rule in taken for said in _weaker_warnings(rule, patterns, where)]
+    weaker = [warning for rule in taken for warning in _weaker_warnings(rule, patterns, where)]
     return Selection(taken, (*absent, *weaker))
 
 

@@ -104,7 +104,7 @@ def _puncture(
     if np.isnan(q_needle).any() or workcell.verdict(q_probe, q_needle) is not None:
         return None
     rest_needle = truth.needle_arm.settle(q_needle, q_needle, rng)
-    predicted = expected_error_mm(calibration, _standing(truth, q_probe, q_needle, clicked))
+    predicted = expected_error_mm(calibration, _recorded_pose(truth, q_probe, q_needle, clicked))
     ended = truth.needle_in_image(rest_probe, rest_needle)
     return Puncture(row, target, ended, predicted, case.content.truth.click_mm)
 
@@ -135,8 +135,8 @@ def aim(
         q = nearest_configuration(truth.needle_arm, command, q)
         if calibration.arms is None or np.isnan(q).any():
             break
-        standing = _standing(truth, candidates.q_probe[row], q, target_mm)
-        command = standing.B[0] @ np.linalg.inv(calibration.corrected(standing)[1][0]) @ goal
+        recorded = _recorded_pose(truth, candidates.q_probe[row], q, target_mm)
+        command = recorded.B[0] @ np.linalg.inv(calibration.corrected(recorded)[1][0]) @ goal
     return q
 
 
@@ -145,7 +145,7 @@ def expected_error_mm(calibration: Calibration, poses: Recording) -> float:
     return float(np.sqrt(np.mean(np.trace(calibration.tip_covariances(poses), axis1=1, axis2=2))))
 
 
-def _standing(truth: WorkcellTruth, q_probe: Floats, q_needle: Floats, tip_mm: Floats) -> Recording:
+def _recorded_pose(truth: WorkcellTruth, q_probe: Floats, q_needle: Floats, tip_mm: Floats) -> Recording:
     """One pose as both controllers print it, with the tip at a point of the image."""
     A, B = flange_pose(truth.probe_arm.nominal, q_probe), flange_pose(truth.needle_arm.nominal, q_needle)
     return Recording(A[None], B[None], tip_mm[None, :2], q_probe=q_probe[None], q_needle=q_needle[None])
@@ -173,8 +173,8 @@ def unseen_errors_mm(
             )
         ]
         seen = truth.needle_in_image(*rests).tip_image
-        standing = _standing(truth, candidates.q_probe[row], candidates.q_needle[row], seen)
-        A, B = calibration.corrected(standing)
+        recorded = _recorded_pose(truth, candidates.q_probe[row], candidates.q_needle[row], seen)
+        A, B = calibration.corrected(recorded)
         T_base1_image, T_base1_end2 = A[0] @ calibration.X, calibration.Y @ B[0]
         tip = T_base1_end2[:3, :3] @ calibration.tip_end2 + T_base1_end2[:3, 3]
         predicted = np.linalg.inv(T_base1_image) @ np.append(tip, 1.0)

@@ -74,7 +74,7 @@ class BetweenArms:
         for body in self.needle_bodies:
             body.place(moved)
         ends_first = product(reversed(self.probe_bodies), reversed(self.needle_bodies))  # they touch soonest
-        return not any(_meet(first, second) for first, second in ends_first)
+        return not any(_touch(first, second) for first, second in ends_first)
 
 
 class TwoArms:
@@ -110,7 +110,7 @@ class TwoArms:
         *links, head = self._between.probe_bodies
         if touch(head.bare.surface.made, self._phantom) or touch(head.full.surface.made, self._table):
             return False
-        return not any(_meet(head, link) for link in links[:FAR_LINKS])
+        return not any(_touch(head, link) for link in links[:FAR_LINKS])
 
     def needle_free(self, q: Floats) -> bool:
         """Whether the needle's arm touches neither itself, table nor, but for the needle, the phantom."""
@@ -129,7 +129,7 @@ class TwoArms:
         return None if self.apart(q_probe, q_needle) else Touching.BOTH
 
 
-def _meet(first: Body, second: Body) -> bool:
+def _touch(first: Body, second: Body) -> bool:
     """Whether ``first``, with its clearance, touches ``second``; bounding spheres first."""
     apart = np.linalg.norm(first.full.surface.pose.getTranslation() - second.bare.surface.pose.getTranslation())
     reach = max(float(np.linalg.norm(hull, axis=1).max()) for hull in first.full.hulls)

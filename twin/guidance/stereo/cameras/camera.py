@@ -152,7 +152,7 @@ DOWN_C = (0.0, 1.0, 0.0)
 
 
 def looking_at(
-    eye_c: Floats,
+    centre_c: Floats,
     target_c: Floats,
     size: tuple[int, int],
     focal_px: float,
@@ -162,16 +162,16 @@ def looking_at(
     """A camera at a place in C with a point in the middle of its image.
 
     Args:
-        eye_c: Shape (3,), mm.
+        centre_c: Shape (3,), mm.
         target_c: Shape (3,), mm.
         size: Width and height, px.
         focal_px: Focal length, px.
         distortion: k1, k2, p1, p2.
     """
-    z = np.asarray(target_c, dtype=np.float64) - eye_c
+    z = np.asarray(target_c, dtype=np.float64) - centre_c
     z = z / np.linalg.norm(z)
     R = np.ascontiguousarray(frame_along(z, np.array(DOWN_C)).T)
-    T = pose(R, -R @ np.asarray(eye_c, dtype=np.float64))
+    T = pose(R, -R @ np.asarray(centre_c, dtype=np.float64))
     width, height = size
     middle = (width - 1) / 2, (height - 1) / 2
     return Camera(width, height, focal_px, focal_px, *middle, np.asarray(distortion, dtype=np.float64), T)
@@ -206,7 +206,9 @@ def stereo_pair(
             f"baseline {baseline_mm:g} mm, distance {distance_mm:g} mm", where="stereo pair", allowed="above 0"
         )
     positions = [np.array([side * baseline_mm / 2, 0.0, -distance_mm]) for side in (-1, 1)]
-    left, right = (looking_at(eye, np.zeros(3), (width, height), focal_px, distortion=distortion) for eye in positions)
+    left, right = (
+        looking_at(centre, np.zeros(3), (width, height), focal_px, distortion=distortion) for centre in positions
+    )
     return left, right
 
 

@@ -112,15 +112,15 @@ class Calibration:
         """How often a right declaration has residuals as large as these."""
         return float(chi2.sf(self.chi_squared_ratio * self.freedom, self.freedom))
 
-    def doubts(self) -> tuple[str, ...]:
+    def warnings(self) -> tuple[str, ...]:
         """Warnings, and one where the residuals exceed what the stated noise and arms lead to expect."""
-        said = tuple(one.sentence for one in self.findings if one.severity is Severity.WARNING)
+        warnings = tuple(one.sentence for one in self.findings if one.severity is Severity.WARNING)
         ratio = self.chi_squared_ratio
         if not isinstance(self.noise, Noise) or ratio <= LARGEST_RATIO:
-            return said
+            return warnings
         chance = 100.0 * self.chi_squared_chance()
         return (
-            *said,
+            *warnings,
             f"chi-squared of the residuals is {ratio:.2f} times their freedom ({self.freedom}): noise or arms are "
             f"probably declared too small, and the stated errors with them; a right one gives this in {chance:.2g} %",
         )

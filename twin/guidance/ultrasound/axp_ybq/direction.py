@@ -169,14 +169,14 @@ def _common_axis(seen: Floats, kept: NDArray[np.bool_]) -> tuple[Floats, Floats]
 def _refuse_scattered(estimate: Estimate, recording: Recording, kept: NDArray[np.bool_], middle: float) -> None:
     """Refuse directions without a common axis, naming the slip with which they would have one."""
     assert recording.v is not None
-    said = f"the directions have no common axis in the needle's flange: they scatter by {np.degrees(middle):.0f} deg"
+    what = f"the directions have no common axis in the needle's flange: they scatter by {np.degrees(middle):.0f} deg"
     for slip, undo in SLIPS.items():
         v = np.array(recording.v)
         v[:, :2] = v[:, :2] @ undo.T
         other = float(np.median(_common_axis(directions_end2(estimate, replace(recording, v=v)), kept)[1][kept]))
         if other < min(BETTER * middle, SCATTERED_RAD):
-            said += f"; they would agree ({np.degrees(other):.1f} deg) if {slip}"
-    raise InputError(said, where="recording", allowed=ALLOWED, code="directions_scattered")
+            what += f"; they would agree ({np.degrees(other):.1f} deg) if {slip}"
+    raise InputError(what, where="recording", allowed=ALLOWED, code="directions_scattered")
 
 
 def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection) -> tuple[Finding, ...]:
@@ -188,13 +188,13 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
         seen: The needle's direction.
     """
     found = []
-    for code, rows, said, most in (
+    for code, rows, problem, most in (
         ("directions_reversed", seen.reversed, REVERSED, 0.0),
         ("directions_aside", aside & ~seen.reversed, "v disagrees with the other poses", FEW),
     ):
         if rows.any():
             severity = Severity.WARNING if rows.mean() > most else Severity.NOTE
-            text = f"{_counted(names, rows, said)}; these directions were set aside"
+            text = f"{_counted(names, rows, problem)}; these directions were set aside"
             found.append(Finding(code, severity, text, {"count": float(rows.sum())}))
     if not seen.sign_known:
         text = (
@@ -205,9 +205,9 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
     return tuple(found)
 
 
-def _counted(names: tuple[str, ...], rows: Bools, said: str) -> str:
+def _counted(names: tuple[str, ...], rows: Bools, problem: str) -> str:
     which = "" if rows.all() else f": {', '.join(np.array(names)[rows].tolist())}"
-    return f"{said} in {int(rows.sum())} of {len(names)} poses{which}"
+    return f"{problem} in {int(rows.sum())} of {len(names)} poses{which}"
 
 
 def direction_from_plane(estimate: Estimate, recording: Recording) -> Floats:

@@ -49,7 +49,7 @@ NAMED_WITHIN = 1.5
 """A family whose own ratio is up to this much larger than the limit still names an ill-conditioned motion."""
 
 
-class WeakMotion(NamedTuple):
+class IllConditionedMotion(NamedTuple):
     """One ill-conditioned motion of the unknowns."""
 
     cause: str
@@ -67,7 +67,7 @@ class Observability(NamedTuple):
     """Least over largest singular value."""
     dimensions: int
     """How many singular values are below the limit."""
-    weak: tuple[WeakMotion, ...]
+    ill_conditioned: tuple[IllConditionedMotion, ...]
     """Named; empty where the ratio is large enough."""
 
 
@@ -113,19 +113,21 @@ def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
     found = [*_orientation(estimate, recording, J, active, limit), *_tip(estimate, recording, J, active, limit)]
     found += _relative(estimate, recording, J, active, limit)
     text = "the poses leave a combination of the unknowns free that has no simple name: vary everything more"
-    return Observability(ratio, int((values < limit).sum()), tuple(found) or (WeakMotion("unnamed", 1, text),))
+    return Observability(
+        ratio, int((values < limit).sum()), tuple(found) or (IllConditionedMotion("unnamed", 1, text),)
+    )
 
 
 class _Family(NamedTuple):
     """The ill-conditioned part of a three-dimensional family of motions."""
 
-    weak: int
+    ill_conditioned: int
     """How many of its three directions are ill-conditioned."""
     weakest: Floats
     """Unit vector (3,) in the family's own coordinates."""
 
 
-def _weak_part(J: Floats, active: NDArray[np.int_], motions: Floats, limit: float) -> _Family:
+def _ill_conditioned_part(J: Floats, active: NDArray[np.int_], motions: Floats, limit: float) -> _Family:
     """Restrict the Jacobian to the span of three motions (17, 3)."""
     if not set(np.flatnonzero(np.abs(motions).max(axis=1) > 0)) <= set(active.tolist()):
         return _Family(0, np.zeros(3))  # a parameter of this motion is known
@@ -138,7 +140,7 @@ def _weak_part(J: Floats, active: NDArray[np.int_], motions: Floats, limit: floa
 
 def _orientation(
     estimate: Estimate, recording: Recording, J: Floats, active: NDArray[np.int_], limit: float
-) -> list[WeakMotion]:
+) -> list[IllConditionedMotion]:
     """t_X += k, t_Y += R_A k; and t_Q += k, t_Y -= R_Y R_B k."""
     probe, needle = np.zeros((2, 17, 3))
     probe[T_X], probe[T_Y] = np.eye(3), nearest_rotation(recording.A[:, :3, :3].mean(axis=0))
@@ -148,52 +150,54 @@ def _orientation(
         ("probe", probe, "the image's place on the probe and the distance between the bases"),
         ("needle", needle, "the tip's place on the needle and the distance between the bases"),
     ):
-        weak, _ = _weak_part(J, active, family, limit)
-        if weak == 3:
-            found.append(WeakMotion(f"{arm}_orientation", 3, f"the {arm} hardly turns: {slides} can slide together"))
-        elif weak:
+        ill_conditioned, _ = _ill_conditioned_part(J, active, family, limit)
+        if ill_conditioned == 3:
+            found.append(
+                IllConditionedMotion(f"{arm}_orientation", 3, f"the {arm} hardly turns: {slides} can slide together")
+            )
+        elif ill_conditioned:
             text = f"the {arm} turns about one axis only: {slides} can slide together along it"
-            found.append(WeakMotion(f"{arm}_axis", weak, text))
+            found.append(IllConditionedMotion(f"{arm}_axis", ill_conditioned, text))
     return found
 
 
 def _tip(
     estimate: Estimate, recording: Recording, J: Floats, active: NDArray[np.int_], limit: float
-) -> list[WeakMotion]:
+) -> list[IllConditionedMotion]:
     """w_X = k with t_X so that the mean tip stays: the image turns about the tip, or about the line of all tips."""
     family = np.zeros((17, 3))
     p = np.append((recording.P * estimate.scale).mean(axis=0), 0.0) / LENGTH_MM
     family[W_X], family[T_X] = np.eye(3), estimate.R_X @ skew(p)
-    weak, _ = _weak_part(J, active, family, limit)
-    if weak == 3:
+    ill_conditioned, _ = _ill_conditioned_part(J, active, family, limit)
+    if ill_conditioned == 3:
         text = "the tip hardly moves in the image: the image can turn about it on the probe"
-        return [WeakMotion("tip_position", 3, text)]
-    if weak:
+        return [IllConditionedMotion("tip_position", 3, text)]
+    if ill_conditioned:
         text = "the tip moves along one line of the image only: the image can turn about that line on the probe"
-        return [WeakMotion("tip_line", weak, text)]
+        return [IllConditionedMotion("tip_line", ill_conditioned, text)]
     return []
 
 
 def _relative(
     estimate: Estimate, recording: Recording, J: Floats, active: NDArray[np.int_], limit: float
-) -> list[WeakMotion]:
+) -> list[IllConditionedMotion]:
     """t_X += R_X a, t_Q += b with M_i b = a for every pose: a shift that does not rotate between needle and image."""
     family = np.zeros((17, 3))
     family[T_X], family[T_Q] = estimate.R_X, nearest_rotation(needle_in_image(estimate, recording).mean(axis=0)).T
-    weak, a = _weak_part(J, active, family, limit)
-    if weak == 0:
+    ill_conditioned, a = _ill_conditioned_part(J, active, family, limit)
+    if ill_conditioned == 0:
         return []
-    if weak == 3:
+    if ill_conditioned == 3:
         text = "needle and image hardly turn against each other: image and tip can slide together in any direction"
-        return [WeakMotion("needle_in_image", 3, text)]
-    if weak == 1 and np.linalg.norm(a[:2]) >= IN_PLANE:
+        return [IllConditionedMotion("needle_in_image", 3, text)]
+    if ill_conditioned == 1 and np.linalg.norm(a[:2]) >= IN_PLANE:
         text = "the insertion angle in the image hardly varies: the tip can slide along the needle"
-        return [WeakMotion("insertion_angle", 1, text)]
-    if weak == 1 and abs(a[2]) >= IN_PLANE:
+        return [IllConditionedMotion("insertion_angle", 1, text)]
+    if ill_conditioned == 1 and abs(a[2]) >= IN_PLANE:
         text = "the needle hardly turns about itself: image and tip can slide together across the image"
-        return [WeakMotion("needle_roll", 1, text)]
+        return [IllConditionedMotion("needle_roll", 1, text)]
     text = "the needle turns against the image about one axis only: image and tip can slide together along it"
-    return [WeakMotion("needle_in_image_axis", weak, text)]
+    return [IllConditionedMotion("needle_in_image_axis", ill_conditioned, text)]
 
 
 TURN_RAD = float(np.radians(25.0))
@@ -249,7 +253,7 @@ class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
     """
 
     def __init__(self, observability: Observability, suggestion: SuggestedPoses) -> None:
-        self.motions: tuple[WeakMotion, ...] = observability.weak
+        self.motions: tuple[IllConditionedMotion, ...] = observability.ill_conditioned
         self.ratio = observability.ratio
         self.suggestion = suggestion
         what = "; ".join(motion.text for motion in self.motions) + f" (singular value ratio {self.ratio:.1e})"
@@ -263,7 +267,7 @@ def require_observable(estimate: Estimate, recording: Recording, active: NDArray
         Degenerate: They do not; with poses that would mend it.
     """
     found = observe(estimate, recording, active)
-    if found.weak:
+    if found.ill_conditioned:
         raise Degenerate(found, propose(estimate, recording, active))
     return found
 
@@ -373,20 +377,20 @@ def _ratio(H: Floats) -> float:
 
 def _text(poses: tuple[PoseChange, ...]) -> str:
     counted = Counter(_one(pose) for pose in poses)
-    said = [f"{text} ({count} poses)" if count > 1 else text for text, count in counted.items()]
-    return f"add {len(poses)} poses, each from pose {poses[0].reference}: " + "; ".join(said)
+    changes = [f"{text} ({count} poses)" if count > 1 else text for text, count in counted.items()]
+    return f"add {len(poses)} poses, each from pose {poses[0].reference}: " + "; ".join(changes)
 
 
 def _one(pose: PoseChange) -> str:
-    said = []
+    changes = []
     for axis, angle in zip(IMAGE_AXES, pose.probe_turn_image, strict=True):
         if angle:
-            said.append(f"turn the probe by {np.degrees(angle):+.0f} deg about the {axis} through the tip")
+            changes.append(f"turn the probe by {np.degrees(angle):+.0f} deg about the {axis} through the tip")
     if pose.tip_shift_mm.any():
         u, v = pose.tip_shift_mm
-        said.append(f"bring the tip to another place of the image, u {u:+.0f} mm, v {v:+.0f} mm")
+        changes.append(f"bring the tip to another place of the image, u {u:+.0f} mm, v {v:+.0f} mm")
     if pose.insertion_change:
-        said.append(f"change the insertion angle in the image by {np.degrees(pose.insertion_change):+.0f} deg")
+        changes.append(f"change the insertion angle in the image by {np.degrees(pose.insertion_change):+.0f} deg")
     if pose.needle_roll:
-        said.append(f"turn the needle about itself by {np.degrees(pose.needle_roll):+.0f} deg")
-    return " and ".join(said)
+        changes.append(f"turn the needle about itself by {np.degrees(pose.needle_roll):+.0f} deg")
+    return " and ".join(changes)

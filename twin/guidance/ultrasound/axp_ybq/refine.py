@@ -229,13 +229,13 @@ class ImageErrors(NamedTuple):
             for name, value, over in zip(self.names, self.found, size, strict=True)
             if over >= min(CLEAR, size.max())
         ]
-        said = (
+        text = (
             f"the residuals are not noise alone: they fit better with {', '.join(shown)} (F test of "
             f"{len(self.names)} errors of the image, p {self.probability:.2g}), which leaves {self.rms_mm:.2f} mm "
             "(rms) at the tips; the calibration does not use this: P_u_px, P_v_px as headers let it find mm per pixel"
         )
         numbers = dict(zip(self.names, self.found.tolist(), strict=True))
-        return Finding("image_errs", Severity.WARNING, said, {**numbers, "p": self.probability, "rms_mm": self.rms_mm})
+        return Finding("image_errs", Severity.WARNING, text, {**numbers, "p": self.probability, "rms_mm": self.rms_mm})
 
 
 NAMES = ("scale_u", "scale_v", "skew", "turn")
