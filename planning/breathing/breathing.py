@@ -125,7 +125,7 @@ def mean_square_within(position: float, exponent: int, about: float) -> float:
     """
     end = np.arcsin(np.clip(position, 0.0, 1.0) ** (1 / (2 * exponent)))
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    s = np.sin(end * (nodes + 1) / 2) ** (2 * exponent)
+    s = np.sin(end * (nodes + 1) / 2) ** (2 * exponent)  # nodes -1..1 to angles 0..end
     return float(np.sum(weights * (s - about) ** 2) / 2)
 
 

@@ -253,7 +253,7 @@ FINE_SIDES = 96
 def prism(radius_mm: float, length_mm: float, sides: int = PRISM_SIDES) -> Floats:
     """Corners of a prism about a cylinder along z, centred: shape (2 ``sides``, 3), mm; those of one end first."""
     turn = 2.0 * np.pi * np.arange(sides) / sides
-    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / sides)
+    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / sides)  # circumscribed: encloses the circle
     ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     half = length_mm / 2.0 + SLACK_MM
     return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
@@ -401,7 +401,7 @@ def connected_parts(mesh: TriangleMesh) -> list[Floats]:
 def _in_parts(mesh: TriangleMesh) -> tuple[Floats, Ints]:
     """Corners part by part, and where each part begins; faces are connected where they share a corner."""
     count = len(mesh.vertices)
-    used = np.flatnonzero(np.bincount(mesh.faces.ravel(), minlength=count))
+    used = np.flatnonzero(np.bincount(mesh.faces.ravel(), minlength=count))  # corners without a face are no part
     starts, ends = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
     links = scipy.sparse.coo_array((np.ones(len(starts), np.int8), (starts, ends)), shape=(count, count))
     part = scipy.sparse.csgraph.connected_components(links, directed=False)[1][used]

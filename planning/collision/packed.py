@@ -202,7 +202,7 @@ def coarse_hull(corners: Floats) -> Coarse:
         return Coarse(corners, 0.0)
     few = corners[np.unique(np.argmax(_directions(COARSE_DIRECTIONS) @ corners.T, axis=1))]
     hull = scipy.spatial.ConvexHull(few)
-    outside = (corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > -SLACK_MM
+    outside = (corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > -SLACK_MM  # beyond a face
     triangles = np.ascontiguousarray(few[hull.simplices])
     return Coarse(few, float(farthest_from(triangles, corners[outside])) + SLACK_MM)
 
@@ -227,7 +227,7 @@ class Neighbours(NamedTuple):
 def neighbours(corners: Floats) -> Neighbours:
     """Which corners (n, 3) of a convex hull share an edge of its triangles; a corner within the hull has none."""
     faces = scipy.spatial.ConvexHull(corners).simplices
-    edges = np.concatenate([np.roll(faces, turn, axis=1)[:, :2] for turn in range(3)])
+    edges = np.concatenate([np.roll(faces, turn, axis=1)[:, :2] for turn in range(3)])  # each face's three
     pairs = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0).astype(np.int64)
     return Neighbours(np.bincount(pairs[:, 0], minlength=len(corners)), pairs[:, 1])
 
@@ -247,7 +247,7 @@ def joint_levers(model: UrModel, check: Check) -> Floats:
     if check.hulls is None or check.first_body is None:
         return levers
     body = check.second_body
-    own = np.linalg.norm(apply(body.T_frame_body, check.hulls[1]), axis=1).max()
+    own = np.linalg.norm(apply(body.T_frame_body, check.hulls[1]), axis=1).max()  # from its frame's origin
     lengths = np.hypot(model.a, model.d)
     for joint in range(check.first_body.frame, body.frame):
         levers[joint] = abs(model.a[joint]) + lengths[joint + 1 : body.frame].sum() + own

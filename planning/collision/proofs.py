@@ -229,11 +229,11 @@ def _clear_all_over(model: UrModel, proofs: Proofs, touches: Touches, joint: int
     unproven, touching = tested[None], np.zeros_like(tested)
     for _ in range(HALVINGS):
         q, turns = np.zeros((len(middles), 6)), np.zeros(6)
-        q[:, joint : joint + 2], turns[joint : joint + 2] = middles, half
+        q[:, joint : joint + 2], turns[joint : joint + 2] = middles, half  # other joints do not matter to the pair
         frames = link_poses(model, q)
         left = proofs.clear_about(frames, turns, unproven)
         for square, check in np.argwhere(left.touching).tolist():
-            touching[check] = touching[check] or touches(check, frames[square])
+            touching[check] = touching[check] or touches(check, frames[square])  # FCL decides at the middle
         still = left.unproven & ~touching
         kept = still.any(axis=1)
         if not kept.any():

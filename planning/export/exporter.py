@@ -81,7 +81,7 @@ def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radiu
     fractions = np.linspace(0.0, 1.0, SAMPLES + 1)
     poses = flange_pose(checker.model, corner + fractions[:, None] * (other - corner))
     tips = poses[:, :3, 3] + checker.tool.needle_length_mm * poses[:, :3, 2]
-    far = np.linalg.norm(tips - tips[0], axis=1)
+    far = np.linalg.norm(tips - tips[0], axis=1)  # mm from the tip at the corner
     if radius_mm > LARGEST_FRACTION * far[-1]:
         return 1.0
     return float(fractions[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
@@ -104,7 +104,7 @@ def _triangle(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats
         across = max(float(checker.sweep_mm(arc).max()) for arc in grid.swapaxes(0, 1)[1:])
         if max(outward, across) <= GRID_MM:
             return grid[:, 1:].reshape(-1, 6)
-        rays = math.ceil(rays * max(1.0, across / GRID_MM))
+        rays = math.ceil(rays * max(1.0, across / GRID_MM))  # refine until neighbours are near enough
         steps = math.ceil(steps * max(1.0, outward / GRID_MM))
 
 

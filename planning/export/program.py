@@ -150,7 +150,7 @@ def straight_move(model: UrModel, program: Program) -> Trajectory:
     poses = np.repeat(program.T_base_target[None], len(times), axis=0)
     poses[:, :3, 3] = start + travelled[:, None] * (end - start) / length - program.tcp_mm * poses[:, :3, 2]
     branches = inverse(model, poses)
-    off = np.abs(wrap_to_pi(branches[0] - program.standoff_q)).max(axis=1)
+    off = np.abs(wrap_to_pi(branches[0] - program.standoff_q)).max(axis=1)  # by the joint farthest off
     if np.isnan(off).all():
         raise InputError("the arm does not reach its standoff", where="insertion", allowed="a pose within reach")
     q = branches[:, int(np.nanargmin(off))]
@@ -163,7 +163,7 @@ def straight_move(model: UrModel, program: Program) -> Trajectory:
 def _joint_move(trajectory: Trajectory, first: int, last: int, blend_mm: float) -> JointMove:
     """The move over the samples first..last, in the time that the plan takes."""
     q, times = trajectory.q[first : last + 1], trajectory.times_s[first : last + 1]
-    leading = int(np.argmax(np.abs(q[-1] - q[0])))
+    leading = int(np.argmax(np.abs(q[-1] - q[0])))  # movej's speed is that of the joint that moves farthest
     ramp = _ramp(np.abs(q[:, leading] - q[0, leading]), times)
     return JointMove(q[-1], ramp.speed, ramp.acceleration, blend_mm)
 
@@ -210,13 +210,13 @@ def _insertion_ramp(plan: Plan, tips: Floats) -> _Ramp:
 
 def _trapezoid(length: float, speed: float, acceleration: float) -> tuple[Floats, Floats]:
     """Times and distances run, both (m,), from rest to rest, in equal steps of ``STREAM_S`` or, of a long one, more."""
-    speed = min(speed, math.sqrt(length * acceleration))
+    speed = min(speed, math.sqrt(length * acceleration))  # a triangle where the length is short
     ramp, plateau = speed / acceleration, length / speed - speed / acceleration
     end = 2.0 * ramp + plateau
     times = np.linspace(0.0, end, min(max(2, math.ceil(end / STREAM_S)), MOST_SAMPLES) + 1)
     early, late = np.minimum(times, ramp), np.maximum(times - ramp - plateau, 0.0)
     travelled = acceleration * early**2 / 2 + speed * (times - early) - acceleration * late**2 / 2
-    travelled[-1] = length
+    travelled[-1] = length  # sums of steps round
     return times, travelled
 
 

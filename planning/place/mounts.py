@@ -152,7 +152,7 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
 def default_reach_mm(model: UrModel, needle_length_mm: float) -> float:
     """Default distance of a base from the target, mm."""
     span = abs(model.a2) + abs(model.a3) + needle_length_mm + FREE_MM
-    return ROUNDS_MM * math.ceil(span / ROUNDS_MM)
+    return ROUNDS_MM * math.ceil(span / ROUNDS_MM)  # rounded up
 
 
 def _region(
@@ -244,7 +244,7 @@ class WantedDirections:
         chosen = [int(np.argmax(self.weight))]
         cosine = self.outward_ct @ self.outward_ct[chosen[0]]
         while len(chosen) < count:
-            chosen.append(int(np.argmin(cosine)))
+            chosen.append(int(np.argmin(cosine)))  # farthest-point sampling
             cosine = np.maximum(cosine, self.outward_ct @ self.outward_ct[chosen[-1]])
         nearest = np.argmax(self.outward_ct @ self.outward_ct[chosen].T, axis=1)
         weight = np.bincount(nearest, self.weight, minlength=count).astype(np.float64)

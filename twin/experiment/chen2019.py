@@ -146,7 +146,7 @@ def rigid_residuals(touched: tuple[Floats, ...]) -> tuple[Floats, ...]:
         rows = rows_of(names)
         T = fit_rigid(np.broadcast_to(READ[rows], (len(points), len(rows), 3)), points[:, rows])
         fitted = READ[rows] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-        found.append((points[:, rows] - fitted) @ T[:, :3, :3])
+        found.append((points[:, rows] - fitted) @ T[:, :3, :3])  # R^T r: into CT axes
     return tuple(found)
 
 
@@ -191,7 +191,7 @@ def strain_gains(residuals: tuple[Floats, ...]) -> dict[str, Floats]:
             b = np.zeros(points.shape)
             b[:, moved] = points[:, along]
             A = design(points, np.zeros(3))
-            left = b.ravel() - A @ np.linalg.lstsq(A, b.ravel(), rcond=None)[0]
+            left = b.ravel() - A @ np.linalg.lstsq(A, b.ravel(), rcond=None)[0]  # M b
             dot, norm = dot + one.reshape(len(one), -1) @ left, norm + float(left @ left)
         gains[name] = dot**2 / norm / whole
     return gains

@@ -376,7 +376,7 @@ def _sides(count: int, around: int) -> np.ndarray:
 
 def _outward(vertices: Floats, faces: np.ndarray) -> TriangleMesh:
     a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
-    inward = float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0
+    inward = float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0  # six times the signed volume
     return TriangleMesh(vertices, np.asarray(faces[:, ::-1] if inward else faces, dtype=np.int32))
 
 
@@ -392,7 +392,7 @@ def _across_tube(along: Floats, wide: Floats | None) -> tuple[Floats, Floats]:
     first = np.array([0.3, 0.7, 0.65]) if wide is None else np.asarray(wide, dtype=float)
     one = np.empty_like(along)
     for k, tangent in enumerate(along):
-        first = first - (first @ tangent) * tangent
+        first = first - (first @ tangent) * tangent  # carried on without a twist
         first /= np.linalg.norm(first)
         one[k] = first
     return one, np.cross(along, one)
@@ -421,7 +421,7 @@ class Outline:
         above = corners[:, :, 2] > at
         cut = corners[above.any(axis=1) & ~above.all(axis=1)]
         above = cut[:, :, 2] > at
-        alone = np.argmax(above == (above.sum(axis=1) == 1)[:, None], axis=1)
+        alone = np.argmax(above == (above.sum(axis=1) == 1)[:, None], axis=1)  # the corner alone on its side
         rows = np.arange(len(cut))
         tip, first, second = (cut[rows, (alone + step) % 3] for step in range(3))
         return np.stack([_crossing(tip, first, at), _crossing(tip, second, at)], axis=1)
@@ -436,7 +436,7 @@ class Outline:
         segments = self.section(z) - self.middle(z)
         across = np.array([-direction[1], direction[0]])
         off, along = segments @ across, segments @ direction
-        crossed = (off[:, 0] > 0) != (off[:, 1] > 0)
+        crossed = (off[:, 0] > 0) != (off[:, 1] > 0)  # segments that the line through the middle crosses
         off, along = off[crossed], along[crossed]
         ahead = along[:, 0] - off[:, 0] * (along[:, 1] - along[:, 0]) / (off[:, 1] - off[:, 0])
         return float(ahead.max(initial=0.0))

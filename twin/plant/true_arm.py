@@ -63,7 +63,7 @@ class TrueArm(NamedTuple):
             rng: For the repeatability.
         """
         half = 0.5 * self.backlash_rad
-        settled = np.clip(q_before, q_command - half, q_command + half)
+        settled = np.clip(q_before, q_command - half, q_command + half)  # the play operator
         return np.asarray(settled + rng.normal(0.0, self.repeatability_rad, 6))
 
 

@@ -338,7 +338,7 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
     """
     plane, count = stack.plane, len(stack.slices)
     along = float(stack.step_ct @ plane.normal_ct)
-    sideways_mm = plane.axes_ct.T @ stack.step_ct
+    sideways_mm = plane.axes_ct.T @ stack.step_ct  # how far each slice is shifted in its own plane
     tilt = float(np.degrees(np.arctan2(np.linalg.norm(sideways_mm), along)))
     if tilt > MAX_TILT_DEG:
         what = f"the slices' normal and the way from slice to slice are {tilt:.0f} degrees apart"
@@ -350,7 +350,7 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
     low, high = np.floor(shifts.min(axis=0) + WHOLE_PIXEL), np.ceil(shifts.max(axis=0) - WHOLE_PIXEL)
     T = stack.T_ct_index
     T[:3, 2] = along * plane.normal_ct
-    T[:3, 3] += T[:3, :2] @ low
+    T[:3, 3] += T[:3, :2] @ low  # its corner moves with the least shift
     size = (high - low).astype(int) + (columns, rows)
     return StraightGrid((int(size[0]), int(size[1]), count), T, shifts - low, tilt)
 

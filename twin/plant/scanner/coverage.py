@@ -67,7 +67,7 @@ def cut_solids(
 
 
 def _odd(spacing_mm: float) -> int:
-    return max(LEAST_LINES, 2 * int(np.ceil(spacing_mm / LINE_MM / 2)) + 1)
+    return max(LEAST_LINES, 2 * int(np.ceil(spacing_mm / LINE_MM / 2)) + 1)  # odd
 
 
 def _of_slices(corners: Floats, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -76,7 +76,7 @@ def _of_slices(corners: Floats, count: int) -> tuple[NDArray[np.int64], NDArray[
     high = np.clip(np.floor(corners[:, :, 2].max(axis=1) + 0.5).astype(np.int64), -1, count - 1)
     spans = np.maximum(0, high - low + 1)
     triangle = np.repeat(np.arange(len(corners)), spans)
-    slices = np.arange(len(triangle)) - np.repeat(np.cumsum(spans) - spans, spans) + low[triangle]
+    slices = np.arange(len(triangle)) - np.repeat(np.cumsum(spans) - spans, spans) + low[triangle]  # low, low + 1 ...
     order = np.argsort(slices, kind="stable")
     return np.searchsorted(slices[order], np.arange(count + 1)), triangle[order]
 

@@ -124,7 +124,7 @@ def _stored(
 ) -> NDArray[np.int16]:
     """Blurred slice by slice, with noise, rounded and clipped, shape as ``values``."""
     stored = np.empty(values.shape, np.int16, order="F")
-    sigma = settings.blur_mm / FWHM_PER_SIGMA / spacing_mm[:2]
+    sigma = settings.blur_mm / FWHM_PER_SIGMA / spacing_mm[:2]  # in voxels
     for k in range(values.shape[2]):
         image = ndimage.gaussian_filter(values[:, :, k].T, sigma[::-1], mode="nearest", truncate=BLUR_ENDS)
         image += np.float32(settings.noise_hu) * rng.standard_normal(image.shape, dtype=np.float32)
@@ -147,7 +147,7 @@ def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
     """
     found = [np.empty(0, np.int64)]
     for points in _samples(corners):
-        index = np.floor(points + 0.5).astype(np.int64)
+        index = np.floor(points + 0.5).astype(np.int64)  # a voxel reaches half a voxel to each side
         inside = np.all((index >= 0) & (index < shape), axis=1)
         found.append(np.unique(np.ravel_multi_index(tuple(index[inside].T), shape)))
     return np.stack(np.unravel_index(np.unique(np.concatenate(found)), shape), axis=1)
@@ -176,7 +176,7 @@ def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bool
 def _samples(corners: Floats) -> Iterator[Floats]:
     """Points of triangles, at most `SAMPLE_VOXELS` apart, shape (m, 3) at a time."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    counts = np.maximum(1, np.ceil(edges / SAMPLE_VOXELS).astype(np.int64))
+    counts = np.maximum(1, np.ceil(edges / SAMPLE_VOXELS).astype(np.int64))  # pieces of the longest edge
     for count in np.unique(counts).tolist():
         i, j = np.array([(i, j) for i in range(count + 1) for j in range(count + 1 - i)]).T / count
         weights = np.stack([1 - i - j, i, j])
