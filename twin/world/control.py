@@ -165,7 +165,7 @@ class Admittance:
         """Goals of the position motors for the next step."""
         self._yield(measured.force_n)
         J = tips(self._model, self._tip_m, measured.q[None]).J[0]
-        moved = np.linalg.solve(J, np.concatenate([self._place, np.zeros(3)]))
+        moved = np.linalg.solve(J, np.concatenate([self._place, np.zeros(3)]))  # the tip yields without a rotation
         speed = np.linalg.solve(J, np.concatenate([self._velocity, np.zeros(3)]))
         return Goals(reference.q[row] + moved, reference.speed[row] + speed)
 
@@ -173,7 +173,7 @@ class Admittance:
         of = self._virtual
         pull = force_n - of.damping_ns_m * self._velocity - of.stiffness_n_m * self._place
         self._velocity = self._velocity + self.dt / of.mass_kg * pull
-        self._place = self._place + self.dt * self._velocity
+        self._place = self._place + self.dt * self._velocity  # semi-implicit: the new speed
 
 
 REFRESH_STEPS = 5
@@ -217,9 +217,9 @@ class Impedance:
         turn = rotation_error(reference.R_base_tip[row], tip.R_base_tip[0])
         error = np.concatenate([reference.position_m[row] - tip.position_m[0], turn])
         if not (self._keep_compliance and np.linalg.norm(measured.force_n) > CONTACT_N):
-            self._integral = self._integral + self.dt * error
+            self._integral = self._integral + self.dt * error  # of position (m s) and rotation (rad s)
         spring = self._K * (error + self._stiffness.integral_per_s * self._integral)
-        wrench = spring + self._D @ (reference.twist[row] - J @ measured.speed)
+        wrench = spring + self._D @ (reference.twist[row] - J @ measured.speed)  # damps what differs from the motion
         feedforward = self._model.inverse_dynamics(measured.q, measured.speed, reference.acceleration[row])
         return Torques(feedforward + J.T @ wrench)
 
@@ -531,7 +531,7 @@ def _give(arm: Arm, action: Torques | Goals, joint_offsets: Floats) -> None:
     if isinstance(action, Torques):
         arm.torque(action.torque_nm)
     else:
-        arm.command(action.q + joint_offsets, action.speed)
+        arm.command(action.q + joint_offsets, action.speed)  # encoders to true joints
 
 
 class Motors:

@@ -277,7 +277,7 @@ def choose_poses(
     chosen: list[int] = []
     H = design.base
     for _ in range(n):
-        chosen.append(_best(design, H, chosen))
+        chosen.append(_best(design, H, chosen))  # greedy: the next one that lowers the error most
         H = H + design.information(chosen[-1])
     return np.sort(_exchanged(design, H, chosen))
 
@@ -333,7 +333,7 @@ def _wanted(workspace: Recording, belief: _Belief) -> Floats:
 
 def _design(candidates: Recording, belief: _Belief, recorded: Recording | None) -> _Design:
     rows = _whitened(candidates, belief)
-    base = _with_prior(PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0)))
+    base = _with_prior(PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0)))  # makes H invertible
     if recorded is not None:
         known = _whitened(recorded, belief).reshape(-1, rows.shape[2])
         base = base + known.T @ known
@@ -366,7 +366,7 @@ def _exchanged(design: _Design, H: Floats, chosen: list[int]) -> NDArray[np.int_
     for _ in range(MAX_SWEEPS):
         changed = False
         for place, index in enumerate(list(chosen)):
-            without = H - design.information(index)
+            without = H - design.information(index)  # information adds up over poses
             best = _best(design, without, chosen[:place] + chosen[place + 1 :])
             after = without + design.information(best)
             if best != index and _value(design, after) < (1 - WORTH) * _value(design, H):

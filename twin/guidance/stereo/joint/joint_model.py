@@ -191,7 +191,7 @@ class JointModel:
             J[:, :, start : start + PER_CAMERA] = _camera_slopes(planned, camera, errors, points) * deviations
             by_point = camera.jacobian(points)
             _diagonal(J, 0, x.span("balls_c").start, by_point[:n_balls])
-            J[n_balls:, :, x.span("head")] = by_point[n_balls:] @ self.head_slopes(x, markers_c)
+            J[n_balls:, :, x.span("head")] = by_point[n_balls:] @ self.head_slopes(x, markers_c)  # chain rule
             _diagonal(J, n_balls, x.span("markers_m").start, by_point[n_balls:] @ T_c_m[:3, :3])
             missed = camera.project(points) - pixels[index]
             rows.append(_whitened(missed, J, roots[index]))
@@ -219,7 +219,7 @@ class JointModel:
         for row, stay in enumerate(stays):
             start = x.span("balls_c").start + 3 * int(stay)
             J[row, :, start : start + 3] = np.eye(3)
-        J[:, :, x.span("base")] = -self.base_slopes(x, measured)
+        J[:, :, x.span("base")] = -self.base_slopes(x, measured)  # ball minus where base and arm have it
         J[:, :, x.span("arm")] = -T[:3, :3] @ rod.slopes[:, :3] * self.observed.errors.arm_deviations()
         return x.balls_c[stays] - measured, J
 
@@ -241,7 +241,7 @@ class JointModel:
         """Rows of the unknowns with a declared deviation from their nominal value."""
         J = np.eye(x.vector().size)
         drawn = np.r_[x.span("cameras"), x.span("arm")]
-        return x.vector()[drawn], J[drawn]
+        return x.vector()[drawn], J[drawn]  # counted in deviations: the prior's residual is the unknown itself
 
 
 def _camera_slopes(planned: Camera, camera: Camera, errors: Floats, points: Floats) -> Floats:
@@ -370,7 +370,7 @@ def adjust(observed: Observed, guess: Guess, start: Unknowns | None = None) -> A
     if not (fit.settled and fit.determined):
         raise NoAnswerError(UNSETTLED)
     covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
-    chi2 = float(np.sum((fit.system.residuals + fit.system.slopes @ fit.step) ** 2))
+    chi2 = float(np.sum((fit.system.residuals + fit.system.slopes @ fit.step) ** 2))  # after the last step
     return Adjusted(model, fit.estimate, covariance, chi2, _freedom(fit.system), fit.iterations)
 
 
@@ -425,7 +425,7 @@ def rod_poses(rod: CarriedRod, eta: Floats, q: Floats) -> RodPoses:
     origins, axes = poses[..., :3, 3], poses[..., :3, :3]
     R = axes[:, 6]
     ball = origins[:, 6] + R @ (eta[FLANGE_ERRORS:] + np.array([0.0, 0.0, rod.rod_mm]))
-    x, z = axes[:, 1:, :, 0], axes[:, :-1, :, 2]
+    x, z = axes[:, 1:, :, 0], axes[:, :-1, :, 2]  # x behind each joint, z before it
     twist = np.cross(x, ball[:, None] - origins[:, 1:])
     zero = np.cross(z, ball[:, None] - origins[:, :-1])
     slopes = np.zeros((len(q), 6, N_ROD))

@@ -83,7 +83,7 @@ class DeclaredArm(NamedTuple):
     def arrival_covariance(self, q: Floats, turn: Floats) -> Floats:
         """Covariance of the flange between arrivals at one pose, shape (n, 6, 6), mm and rad; arguments as above."""
         J = error_jacobian(self.model, q, 0.0)[..., PARAMETERS["joint"]]
-        variance = self.arrival_rad**2 + self.play_rad**2 * (turn == 0.0)
+        variance = self.arrival_rad**2 + self.play_rad**2 * (turn == 0.0)  # play is noise where its sign is unknown
         return np.asarray((J * variance[:, None, :]) @ np.swapaxes(J, -1, -2))
 
 

@@ -160,7 +160,7 @@ def agreed_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.
 
 def _common_axis(seen: Floats, kept: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """The axis (3,) nearest to most of the directions (n, 3), whatever their sign, and each one's angle to it (n,)."""
-    longest = np.linalg.eigh(seen[kept].T @ seen[kept])[1][:, -1]
+    longest = np.linalg.eigh(seen[kept].T @ seen[kept])[1][:, -1]  # signs do not matter to it
     middle = np.median((seen * np.where(seen @ longest < 0.0, -1.0, 1.0)[:, None])[kept], axis=0)
     axis = middle / np.linalg.norm(middle)
     return np.asarray(axis), np.arccos(np.clip(np.abs(seen @ axis), 0.0, 1.0))
@@ -216,7 +216,7 @@ def direction_from_plane(estimate: Estimate, recording: Recording) -> Floats:
     Needs poses between which the needle rotated about itself; otherwise V is not unique.
     """
     across_image = needle_in_image(estimate, recording)[:, 2, :]
-    return np.asarray(np.linalg.svd(across_image)[2][-1])
+    return np.asarray(np.linalg.svd(across_image)[2][-1])  # null vector: z.M_i V = 0
 
 
 class Linearised(NamedTuple):
@@ -271,7 +271,7 @@ def linearised_direction(estimate: Estimate, recording: Recording, v_image: Floa
     rows = across(v_image)
     R_AXY = (recording.A[:, :3, :3] @ estimate.R_X).transpose(0, 2, 1) @ estimate.R_Y
     J = np.zeros((len(recording), 2, N_PARAMETERS))
-    J[:, :, W_X] = rows @ skew(m)
+    J[:, :, W_X] = rows @ skew(m)  # dm = [m]x w_X
     J[:, :, W_Y] = -rows @ R_AXY @ skew(recording.B[:, :3, :3] @ estimate.V)
     J[:, :, DIRECTION] = rows @ M @ tangent_basis(estimate.V)
     return Linearised((rows @ m[:, :, None])[:, :, 0], J)

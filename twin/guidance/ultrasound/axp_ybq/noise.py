@@ -219,7 +219,7 @@ def small_sample(problem: Problem, fit: RobustFit) -> SmallSample | None:
     slopes = at_fit.jacobian.reshape(len(own), -1)
     J, N = slopes[:, :p], slopes[:, p:]
     inner = np.linalg.inv(np.eye(N.shape[1]) + N.T @ own @ N)
-    V = own - own @ N @ inner @ N.T @ own
+    V = own - own @ N @ inner @ N.T @ own  # Woodbury: inverse of Omega + N N^T
     return _kenward_roger(V, J, at_fit.covariance[:p, :p], [_block_diagonal(part) for part in D.values()])
 
 
@@ -233,9 +233,9 @@ def _block_diagonal(blocks: Floats) -> Floats:
 def _kenward_roger(V: Floats, J: Floats, C: Floats, parts: list[Floats]) -> SmallSample:
     """The paper's section 3, in its letters: V = Sigma^-1, C = Phi, D_i = dSigma / dv_i."""
     VJ = V @ J
-    P = V - VJ @ C @ VJ.T
+    P = V - VJ @ C @ VJ.T  # projection off the unknowns
     PD, VD = [P @ D for D in parts], [V @ D for D in parts]
-    W = np.linalg.inv(0.5 * np.array([[np.sum(a * b.T) for b in PD] for a in PD]))
+    W = np.linalg.inv(0.5 * np.array([[np.sum(a * b.T) for b in PD] for a in PD]))  # Var(v)
     Pi = [-VJ.T @ D @ VJ for D in parts]
     pairs = [(i, j) for i in range(len(parts)) for j in range(len(parts))]
     CP = [C @ one for one in Pi]
