@@ -140,7 +140,7 @@ class FastEngine:
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`.
 
-        FCL is asked about the triangles near the axis alone, which is what it answers of all of them: a surface touches
+        FCL is queried for the triangles near the axis alone, with the same result as for all of them: a surface touches
         a capsule where one of its triangles does, FCL tests each triangle by itself, and one that is farther from the
         axis than the radius by more than FCL's tolerance it calls free. `near_faces` leaves out no block whose distance
         from the axis is, by its lower bound, within the radius and `FCL_BEYOND_MM`.

@@ -165,7 +165,7 @@ def packed_trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], 
 
 
 def settings() -> dict[str, float]:
-    """Constants of this room that decide its results, for cache keys."""
+    """Constants of this module that decide its results, for cache keys."""
     return {
         "leaf": LEAF_RADIUS_MM,
         "slack": SLACK_MM,

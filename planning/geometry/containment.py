@@ -230,11 +230,11 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     rays = np.take(directions, order, axis=0)
     lengths = np.sqrt(np.einsum("ij,ij->i", rays, rays))
     origin = np.array(origin, dtype=np.float64)
-    room, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
-    while total > room:  # space was too small: once more, with as much as was counted
-        room = total
-        ray, depth, face = np.empty(room, np.int64), np.empty(room), np.empty(room, np.int64)
-        way = np.empty(room, np.int64)
+    space, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
+    while total > space:  # space was too small: once more, with as much as was counted
+        space = total
+        ray, depth, face = np.empty(space, np.int64), np.empty(space), np.empty(space, np.int64)
+        way = np.empty(space, np.int64)
         binned = rays, lengths, order, starts, bins
         total = _visit(mesh.vertices, mesh.faces, origin, binned, length, ray, depth, face, way)
     ray, depth, face, way = ray[:total], depth[:total], face[:total], way[:total]

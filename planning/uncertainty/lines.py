@@ -557,8 +557,8 @@ def likeliest_slope(
 ) -> tuple[Floats, bool]:
     """The slope (5,) along which the needle touches soonest, and whether nothing else touches about as soon.
 
-    The nearest face need not be the likeliest, where a farther one lies in the direction of greater doubt: rays are
-    sent in 51 directions. What touches sooner than a plane across the likeliest direction would is something else.
+    The nearest face need not be the likeliest, where a farther one lies in the direction of greater uncertainty: rays
+    are sent in 51 directions. What touches sooner than a plane across the likeliest direction would is something else.
     """
     size = float(np.linalg.norm(slope))
     directions = np.vstack([-slope / size if size > 0.0 else np.eye(5)[0], _rays()])

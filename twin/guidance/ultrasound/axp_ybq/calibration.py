@@ -70,7 +70,7 @@ class Calibration:
         arm_errors: Posterior mean of their parameters, in declared standard deviations; shape (46,), or (52,) and
             (58,) with the play of one arm and of both; (0,) without.
         joint_covariance: Of parameters and arms' errors together, shape (p + m, p + m); ``covariance`` without.
-        small_sample: What the doubt of a noise that was found makes of the region, where arms are declared.
+        small_sample: Region with the uncertainty of an estimated noise, where arms are declared.
     """
 
     X: Floats
@@ -265,7 +265,7 @@ def calibration_of(
     at_fit, estimate, kept, p = weighed(problem, fit), fit.estimate, fit.tip_kept, len(problem.active)
     freedom = 3 * int(kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction - p
     residuals, names = at_fit.residuals[:, :3], problem.recording.names
-    image, told = image_errors(problem, fit), direction_findings(names, kept & ~fit.direction_kept, seen)
+    image, directions = image_errors(problem, fit), direction_findings(names, kept & ~fit.direction_kept, seen)
     return Calibration(
         X=read_only(pose(estimate.R_X, estimate.t_X)),
         Y=read_only(pose(estimate.R_Y, estimate.t_Y)),
@@ -277,7 +277,7 @@ def calibration_of(
         weights=read_only(1.0 * kept),
         outliers=tuple(name for name, used in zip(names, kept, strict=True) if not used),
         image=image,
-        findings=told if image is None or not image.doubted else (*told, image.finding()),
+        findings=directions if image is None or not image.doubted else (*directions, image.finding()),
         iterations=fit.iterations,
         condition=observability.ratio,
         covariance=read_only(at_fit.covariance[:p, :p]),

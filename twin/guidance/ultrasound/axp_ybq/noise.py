@@ -241,7 +241,7 @@ def _kenward_roger(V: Floats, J: Floats, C: Floats, parts: list[Floats]) -> Smal
     CP = [C @ one for one in Pi]
     A1 = sum(W[i, j] * np.trace(CP[i]) * np.trace(CP[j]) for i, j in pairs)
     A2 = sum(W[i, j] * np.sum(CP[i] * CP[j].T) for i, j in pairs)
-    doubt = sum(W[i, j] * (VJ.T @ parts[i] @ VD[j] @ VJ - Pi[i] @ C @ Pi[j]) for i, j in pairs)
+    excess = sum(W[i, j] * (VJ.T @ parts[i] @ VD[j] @ VJ - Pi[i] @ C @ Pi[j]) for i, j in pairs)
     size = len(C)
     B = (A1 + 6 * A2) / (2 * size)
     g = ((size + 1) * A1 - (size + 4) * A2) / ((size + 2) * A2)
@@ -250,5 +250,5 @@ def _kenward_roger(V: Floats, J: Floats, C: Floats, parts: list[Floats]) -> Smal
     mean = 1.0 / (1.0 - A2 / size)
     variance = 2.0 / size * (1 + c1 * B) / ((1 - c2 * B) ** 2 * (1 - c3 * B))
     freedom = 4 + (size + 2) / (size * variance / (2 * mean**2) - 1)
-    adjusted = C + C @ (doubt + doubt.T) @ C
+    adjusted = C + C @ (excess + excess.T) @ C
     return SmallSample(0.5 * (adjusted + adjusted.T), float(freedom), float(freedom / (mean * (freedom - 2))))
