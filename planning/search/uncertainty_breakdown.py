@@ -124,7 +124,8 @@ class UncertaintyBreakdown:
         parts = [f"{chance_text(self.p_hit)} to hit"]
         parts += [f"{chance_text(chance)} to touch {name}"] if name else []
         parts += [
-            f"{100 * fraction:.0f} % of the uncertainty is {SOURCES[source].text}" for source, fraction in self.sources()[:1]
+            f"{100 * fraction:.0f} % of the uncertainty is {SOURCES[source].text}"
+            for source, fraction in self.sources()[:1]
         ]
         return "; ".join([*parts, *(goal.text() for goal in self.goals)])
 
