@@ -39,7 +39,7 @@ from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
+from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
 ROLLS = np.radians(np.arange(0.0, 360.0, 2.0))
 APART = np.radians(60.0)
@@ -134,7 +134,7 @@ def cell(of: Stand, errors: ErrorModel, q_touch: np.ndarray, method: Method, roo
     if rooms == 0:
         return Cell(predicted, np.nan, np.nan)
     truth = replace(errors, arm=errors.arm.scaled(arm))
-    drawn = draw_rooms(puncture, truth, rooms, np.random.default_rng(0)).reached_alone()
+    drawn = draw_trials(puncture, truth, rooms, np.random.default_rng(0)).reached_alone()
     off = drawn.tip_ct - drawn.target_ct
     inside = np.einsum("na,ab,nb->n", off, np.linalg.inv(cov), off) <= chdtri(3, 0.05)
     return Cell(predicted, float(np.sqrt(np.mean(np.sum(off**2, axis=1)))), float(inside.mean()))

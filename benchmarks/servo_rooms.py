@@ -41,7 +41,7 @@ from puncture_twin.twin.guidance.stereo.joint.needle_error import (
 from puncture_twin.twin.guidance.stereo.robot_calibration import calibrating_rod, carried_rod, grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, ball_jacobian, flange_poses
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, planned_cameras
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, draw_workcell, planned_cameras
 
 PIXEL_PX = 0.03
 """Of a centre by edges, per axis; declared here, since there are no pictures of which a tracker could tell it."""

@@ -49,7 +49,7 @@ from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding, refined_chances
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, hit_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
+from puncture_twin.twin.rehearsal.trials import Puncture, Trials, draw_trials
 
 REAL_ERRORS = "\n[errors]\nct_pixel_mm = 1.5\nct_spacing_mm = 3.0\nsurface_mm = 0\n"
 """Its contours are taken for true: what is held against rooms here is the needle's own error."""
@@ -218,7 +218,7 @@ def tally(
     rng, each, freedom = np.random.default_rng(seed), max(rooms // len(of.q), 1), 3 * markers - 6
     sums = {"known": _Sums.empty(), "found": _Sums.empty(), "found, size 1": _Sums.empty()}
     for puncture, error in punctures(of, markers, corrected=corrected):
-        drawn = draw_rooms(puncture, of.errors.scaled(truth), each, rng).reached_alone()
+        drawn = draw_trials(puncture, of.errors.scaled(truth), each, rng).reached_alone()
         came, sizes = _came(of, puncture, error, drawn), np.sqrt(drawn.chi_squared / freedom)
         sums["known"].add(_predicted(of, error, puncture, None), np.ones(len(sizes)), drawn, came)
         if not found:
@@ -228,7 +228,7 @@ def tally(
         true_sizes = _true_sizes(freedom)
         many = each * np.log(true_sizes[-1] / true_sizes[0]) / np.log(FOUND[1] / FOUND[0]) / len(true_sizes)
         for true_size in true_sizes:
-            drawn = draw_rooms(puncture, of.errors.scaled(truth * true_size), int(np.ceil(many)), rng).reached_alone()
+            drawn = draw_trials(puncture, of.errors.scaled(truth * true_size), int(np.ceil(many)), rng).reached_alone()
             sizes = np.sqrt(drawn.chi_squared / freedom)
             if FOUND[0] <= true_size <= FOUND[1]:
                 sums["found"].add_error(told, sizes / true_size, drawn, true_size)
@@ -303,7 +303,7 @@ def _radii(error: PoseError, q: np.ndarray) -> np.ndarray:
     return np.array(RADII) * np.sqrt(np.trace(error.tip_covariance(q)[0]))
 
 
-def _came(of: Scene, puncture: Puncture, error: PoseError, rooms: Rooms) -> tuple[np.ndarray, np.ndarray]:
+def _came(of: Scene, puncture: Puncture, error: PoseError, rooms: Trials) -> tuple[np.ndarray, np.ndarray]:
     """Which rooms hit lesion and balls, shape (n, 5), and which touch what, shape (n, k)."""
     case, anatomy = of.context.case, of.context.anatomy
     away = np.linalg.norm(rooms.tip_ct - rooms.target_ct, axis=1)
@@ -320,7 +320,7 @@ def _came(of: Scene, puncture: Puncture, error: PoseError, rooms: Rooms) -> tupl
     return np.column_stack([hit, within]), touched
 
 
-def _touched(of: Scene, puncture: Puncture, rooms: Rooms, shift: float) -> np.ndarray:
+def _touched(of: Scene, puncture: Puncture, rooms: Trials, shift: float) -> np.ndarray:
     """Which rooms touch what, shape (n, k); their tips are no farther off than a shift."""
     case, checked = of.context.case, of.context.anatomy.checked
     columns, radius = demanding(checked), case.needle.radius_mm
@@ -350,18 +350,18 @@ class _Sums:
     def empty(cls) -> _Sums:
         return cls([], [], [], [], [])
 
-    def add(self, told: Told, sizes: np.ndarray, rooms: Rooms, came: tuple[np.ndarray, np.ndarray]) -> None:
+    def add(self, told: Told, sizes: np.ndarray, rooms: Trials, came: tuple[np.ndarray, np.ndarray]) -> None:
         """One direction: what was predicted, each room's own size, and what came."""
         self.add_error(told, sizes, rooms)
         self.add_chances(told, sizes, rooms, came)
         self.tests.append(rooms.chi_squared)
 
-    def add_error(self, told: Told, sizes: np.ndarray, rooms: Rooms, true_size: float = 1.0) -> None:
+    def add_error(self, told: Told, sizes: np.ndarray, rooms: Trials, true_size: float = 1.0) -> None:
         """Squares of what came and was predicted, both over the true size: their means are alike where it is fixed."""
         came = float(((rooms.tip_ct - rooms.target_ct) ** 2).sum()) / true_size**2
         self.errors.append((came, float(np.trace(told.cov_ct) * (sizes**2).sum())))
 
-    def add_chances(self, told: Told, sizes: np.ndarray, rooms: Rooms, came: tuple[np.ndarray, np.ndarray]) -> None:
+    def add_chances(self, told: Told, sizes: np.ndarray, rooms: Trials, came: tuple[np.ndarray, np.ndarray]) -> None:
         """Whether regions held, and chances came true, of rooms with these sizes."""
         error = rooms.tip_ct - rooms.target_ct
         square = np.einsum("na,ab,nb->n", error, np.linalg.inv(told.cov_ct), error)

@@ -40,7 +40,7 @@ FUNCTIONS = {
         "with_joint_chances": "chances",
     },
     "planning.search.ranking": {"ranked": "ranking"},
-    "planning.search.doubt": {"doubt_of": "chances"},
+    "planning.search.uncertainty_breakdown": {"uncertainty_breakdown": "chances"},
     "twin.jobs.second_process": {"SecondProcess.end": "rehearsal and film, beside"},
 }
 """By module: what of it is timed under which name."""

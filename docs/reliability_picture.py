@@ -16,7 +16,7 @@ import numpy as np
 
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.rehearsal.distribution import rehearse_rooms
+from puncture_twin.twin.rehearsal.distribution import rehearse_trials
 
 ROOT = Path(__file__).parents[1]
 CASES = {"abdomen, errors x 8": ("abdomen", 8.0), "carton": ("carton/case_m.toml", 1.0)}
@@ -33,7 +33,7 @@ def rehearsed(path, factor, directions, rooms):
     rows = np.random.default_rng(0).permutation(found.ranked)[:directions]
     pairs = {"hit": [], "touch": []}
     for row in rows:
-        done = rehearse_rooms(context, found.outward_ct[row], found.arm.q_insertion[row], rooms, seed=int(row))
+        done = rehearse_trials(context, found.outward_ct[row], found.arm.q_insertion[row], rooms, seed=int(row))
         pairs["hit"].append((done.p_hit, done.hit.mean()))
         pairs["touch"] += list(zip(done.p_touch, done.touched.mean(axis=0), strict=True))
     return {kind: np.array(values) for kind, values in pairs.items()}

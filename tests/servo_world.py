@@ -12,7 +12,12 @@ from puncture_twin.twin.guidance.stereo.joint.joint_model import N_ROD, Guess, O
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, configurations, rod_orientation
-from puncture_twin.twin.guidance.stereo.stereo_room import calibration_frame, draw_workcell, head_pose, planned_cameras
+from puncture_twin.twin.guidance.stereo.stereo_workcell import (
+    calibration_frame,
+    draw_workcell,
+    head_pose,
+    planned_cameras,
+)
 
 CASE = load_servo_case(folder() / "head")
 HELD = CarriedRod(ur_model("ur3"), CASE.file.tool.rod_mm, rod_orientation(np.radians(CASE.file.tool.tilt_deg)))

@@ -23,7 +23,7 @@ from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.twin.rehearsal.rooms import Puncture
+from puncture_twin.twin.rehearsal.trials import Puncture
 
 NO_ARM = {
     "link_mm": 0.0,

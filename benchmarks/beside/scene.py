@@ -17,7 +17,7 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, scan_case
 from puncture_twin.twin.jobs.patient.init_job import init_case
-from puncture_twin.twin.plant.outside_objects import Beside
+from puncture_twin.twin.plant.outside_objects import OutsideObjects
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from tools.phantoms.drawn.trunk import draw_trunk
 from tools.phantoms.drawn.trunk_case import CASE, write_trunk_case
@@ -29,7 +29,7 @@ class Asked(NamedTuple):
     """What is scanned: a seed of the anatomy and of what lies beside it, and how."""
 
     seed: int
-    beside: Beside
+    beside: OutsideObjects
     settings: ScanSettings
 
 
@@ -82,7 +82,7 @@ def judged(folder: Path, asked: Asked) -> Judged:
     truth, run = scanned(folder, asked)
     context = prepare(folder / "ct", arm=False)
     found = context.search()
-    parts = {one.name: one.mesh for one in run.scene.beside if is_outer(one)}
+    parts = {one.name: one.mesh for one in run.scene.outside_objects if is_outer(one)}
     through, blind = (_passed(one, parts, run.scene, context.case.needle) for one in (found, truth.search()))
     safe = np.flatnonzero(found.safe)
     case, directions, length = context.case, found.outward_ct[safe], found.path.length[safe]

@@ -28,7 +28,7 @@ from puncture_twin.planning.init.finder import Wanted
 from puncture_twin.planning.init.overrides import with_keys
 from puncture_twin.planning.init.start import Request
 from puncture_twin.twin.jobs.patient.init_job import init_case
-from puncture_twin.twin.plant.outside_objects import Beside
+from puncture_twin.twin.plant.outside_objects import OutsideObjects
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from puncture_twin.twin.plant.scanner.writers import write_nifti
 from tools.phantoms.supine import LESION_LPS_MM, cradle_parts, trunk_parts
@@ -199,7 +199,7 @@ def drawn(seed: int, arms: str, bed: str, lines: int, settings: ScanSettings) ->
     """A drawn trunk with arms, bed and lines, scanned by the product's scanner."""
 
     def make(folder: Path, data: Path | None) -> Scene:
-        truth, run = scanned(folder, Asked(seed, Beside(arms, bed, lines), settings))
+        truth, run = scanned(folder, Asked(seed, OutsideObjects(arms, bed, lines), settings))
         asked_alike(folder / "ct")
         for one in (folder / "ct").iterdir():
             one.rename(folder / one.name)
@@ -207,7 +207,7 @@ def drawn(seed: int, arms: str, bed: str, lines: int, settings: ScanSettings) ->
         grid = Grid.of(target - (330, 240, 400), target + (330, 240, 400), 2.5)
         body = filled(run.scene.skin, grid)
         foreign, limbs = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
-        for one in filter(is_outer, run.scene.beside):
+        for one in filter(is_outer, run.scene.outside_objects):
             mask = filled(one.mesh, grid) & ~body
             foreign |= mask
             if one.name.startswith("arm"):

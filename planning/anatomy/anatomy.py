@@ -27,7 +27,7 @@ from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
 from puncture_twin.planning.formats.labels.label_surface import field_surface
-from puncture_twin.planning.formats.meshes.mesh_files import kept_mesh_warnings
+from puncture_twin.planning.formats.meshes.mesh_files import cached_mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
@@ -135,7 +135,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     structures.extend(beyond.structures)
     _check_names(case, [*structures, *outside])
     read = {one.name: one.mesh for one in structures if one.source != OWN_TARGET}  # the ball is ours
-    of_meshes = kept_mesh_warnings(read, cache)
+    of_meshes = cached_mesh_warnings(read, cache)
     warnings = (*loader.warnings, *beyond.warnings, *left_out, *skin.warnings, *of_meshes)
     found = (*guesses, *unseen.findings)
     return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch, found)

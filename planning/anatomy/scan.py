@@ -32,7 +32,7 @@ from puncture_twin.planning.base.cache.array_cache import Arrays
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.mesh_guard import fits
 from puncture_twin.planning.formats.volumes.nearest_voxel import nearest
-from puncture_twin.planning.geometry.containment import holds
+from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.voxelize import voxels_inside
@@ -167,7 +167,7 @@ class Scan:
         low, high = mesh.bounds + [[-step_mm], [step_mm]]
         near = (one.vertices for one in unnamed if one is not None)
         within = any(np.all((low <= some) & (some <= high), axis=1).any() for some in near)
-        return within or any(one is not None and holds(one, (low + high) / 2.0) for one in unnamed)
+        return within or any(one is not None and contains(one, (low + high) / 2.0) for one in unnamed)
 
     def contains(self, point_ct: NDArray[np.float64]) -> bool:
         """Whether a point (3,), LPS mm, lies in the image; only the header is read."""

@@ -1,4 +1,4 @@
-"""The straight insertion: its line, and as joint motion, where a branch's path along the needle ends, how good it is.
+"""The straight insertion: its line, its joint motion, where a branch's path along the needle ends, and its margin.
 
 Each function is followed by the compiled loop behind it: a plain one over plain arrays, for which an arm is its lengths
 (d1, a2, a3, d4, d5, d6) in mm.
@@ -76,14 +76,14 @@ FULL_MARGIN_RAD = math.pi / 2
 
 
 class InsertionStop(NamedTuple):
-    """Where a path along the needle ends, and why."""
+    """End of a path along the needle, and its reason."""
 
     depth_mm: float
     detail: str
 
 
 def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop | None:
-    """Where a path stops being feasible: out of reach, at a singularity, or with a joint that jumps; None if nowhere.
+    """First sample at which a path is not feasible: out of reach, singular, or a joint jumps; None if none.
 
     Args:
         model: The arm.
@@ -126,7 +126,7 @@ def _first_stop_at(lengths, path, depths, at_least, fastest):  # type: ignore[no
 
 
 def reach_margin(model: UrModel, q: Floats) -> float:
-    """The least over a motion of each joint's distance to its limits over a quarter turn, and of the singularity terms.
+    """Margin of a motion: least of each joint's distance to its limits over a quarter turn, and the singularity terms.
 
     Args:
         model: The arm.

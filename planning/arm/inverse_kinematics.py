@@ -137,7 +137,7 @@ def wrist_angles(lengths, R, p, c1, s1, flip):  # type: ignore[no-untyped-def]  
 
 @allocation_free()
 def _bend(lengths, x, y):  # type: ignore[no-untyped-def]  # numba infers
-    """Cosine of the elbow that reaches (x, y) in the shoulder's plane. NaN where that is too far or too near."""
+    """Cosine of the elbow that reaches (x, y) in the shoulder's plane; NaN where that is too far or too near."""
     a2, a3 = lengths[1], lengths[2]
     cosine = (x * x + y * y - a2 * a2 - a3 * a3) / (2.0 * a2 * a3)
     if abs(cosine) <= 1.0:
@@ -147,7 +147,7 @@ def _bend(lengths, x, y):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free(inline="always")
 def wrapped_angle(angle):  # type: ignore[no-untyped-def]  # numba infers
-    """The same angle in (-pi, pi]; untouched where it is there already."""
+    """An angle wrapped to (-pi, pi]; untouched where it is there already."""
     if -math.pi < angle <= math.pi:
         return angle
     angle = math.pi - (math.pi - angle) % TURN
@@ -161,7 +161,7 @@ def branch_of(model: UrModel, q: Floats) -> Ints:
 
 
 def wrap_to_pi(angle: Floats) -> Floats:
-    """The same angles in (-pi, pi], any shape, rad."""
+    """Angles wrapped to (-pi, pi], any shape, rad."""
     wrapped = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
     return np.asarray(np.where(wrapped <= -np.pi, np.pi, wrapped))
 

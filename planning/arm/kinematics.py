@@ -1,33 +1,8 @@
-"""Forward kinematics of the UR arms: frames of the links, and the Jacobian.
+"""Kinematics of UR arms: frames of the links, Jacobians, parameter errors, singularities, and tip speeds.
 
 The base frame is the controller's (a URDF's ``base_link`` is rotated by 180 deg about z against it). Frames follow
 Denavit and Hartenberg: T_{i-1}_{i} = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Compiled loops take an arm as its lengths
 (d1, a2, a3, d4, d5, d6) in mm.
-
-How the errors of an arm and of the needle on it move the needle: 28 parameters, by Denavit and Hartenberg.
-
-Source: Mooring, Roth, Driels, "Fundamentals of Manipulator Calibration", 1991: one column a parameter, its axis times
-its lever. With z_{i-1}, o_{i-1} axis and origin of joint i, and x_i, o_i of the frame behind it, at the tip p:
-
-    a_i: (x_i; 0)   d_i: (z_{i-1}; 0)   alpha_i: (x_i x (p - o_i); x_i)   q_i: (z_{i-1} x (p - o_{i-1}); z_{i-1})
-    tip offset: (R_flange; 0)   needle direction: (0; first two columns of R_flange)
-
-d2 is left out: axes 2 and 3 are parallel, and d3 moves the arm alike.
-
-Kinematics of an arm whose Denavit-Hartenberg numbers are not the nominal ones.
-
-T_{i-1}_{i} = Rz(q_i + zero_i) Tz(d_i) Tx(a_i) Rx(alpha_i). The parameters that err, and their order, are the first 23
-of `error_jacobian`. A calibration estimates such an arm, a twin draws one.
-
-How far a configuration of a UR arm is from its three singularities: of shoulder, elbow and wrist.
-
-How fast a plan may move: the needle's tip, and the joints as a fraction of what the arm can.
-
-Are the joints of this arm? Held against what the same file says of where flange, tool or tip was.
-
-A UR3e's joints read as a UR3's are 18 mm off, and nothing in six angles says so. But a recording often states the same
-thing twice: a controller's own pose beside its joints, a touched point, a flange. With the arm's nominal lengths both
-must agree, up to what a controller's own calibration moves.
 """
 
 from __future__ import annotations
@@ -50,7 +25,7 @@ from puncture_twin.planning.formats.points import JointRecording
 
 
 def _rows(q: Floats) -> Floats:
-    """Configurations (..., 6) as one new (n, 6): a copy, since read-only arrays would be compiled for once more."""
+    """Configurations (..., 6) as a new array (n, 6): read-only arrays would be compiled for once more."""
     return np.array(q, dtype=np.float64, order="C").reshape(-1, 6)
 
 
@@ -158,6 +133,15 @@ FREE_D = (0, 2, 3, 4, 5)
 def error_jacobian(model: UrModel, q: Floats, tip_mm: float) -> Floats:
     """The needle's motion per unit of each parameter's error.
 
+    28 parameters of arm and needle: one column a parameter, its axis times its lever (Mooring, Roth, Driels,
+    "Fundamentals of Manipulator Calibration", 1991). With z_{i-1}, o_{i-1} axis and origin of joint i, and x_i, o_i of
+    the frame behind it, at the tip p:
+
+        a_i: (x_i; 0)   d_i: (z_{i-1}; 0)   alpha_i: (x_i x (p - o_i); x_i)   q_i: (z_{i-1} x (p - o_{i-1}); z_{i-1})
+        tip offset: (R_flange; 0)   needle direction: (0; first two columns of R_flange)
+
+    d2 is left out: axes 2 and 3 are parallel, and d3 moves the arm alike.
+
     Args:
         model: The nominal arm.
         q: Shape (..., 6), rad.
@@ -170,8 +154,8 @@ def error_jacobian(model: UrModel, q: Floats, tip_mm: float) -> Floats:
     frames = link_poses(model, q)
     R_flange = frames[..., 6, :3, :3]
     tip = frames[..., 6, :3, 3] + tip_mm * R_flange[..., 2]
-    x, at_x = np.moveaxis(frames[..., 1:, :3, 0], -2, -1), frames[..., 1:, :3, 3]
-    z, at_z = np.moveaxis(frames[..., :6, :3, 2], -2, -1), frames[..., :6, :3, 3]
+    x, at_x = np.moveaxis(frames[..., 1:, :3, 0], -2, -1), frames[..., 1:, :3, 3]  # of the frame behind each joint
+    z, at_z = np.moveaxis(frames[..., :6, :3, 2], -2, -1), frames[..., :6, :3, 3]  # of the frame before it
     J = np.zeros((*np.shape(q)[:-1], 6, N_PARAMETERS))
     J[..., :3, 0:6] = x
     J[..., :3, 6:11] = z[..., list(FREE_D)]
@@ -191,7 +175,11 @@ def _levers(axes: Floats, tip: Floats, origins: Floats) -> Floats:
 
 
 class ErringArm(NamedTuple):
-    """Denavit-Hartenberg numbers of one arm, each of shape (6,), mm and rad."""
+    """Denavit-Hartenberg numbers of one arm, each of shape (6,), mm and rad.
+
+    T_{i-1}_{i} = Rz(q_i + zero_i) Tz(d_i) Tx(a_i) Rx(alpha_i). The parameters that err, and their order, are the first
+    23 of `error_jacobian`. A calibration estimates such an arm, a twin draws one.
+    """
 
     a: Floats
     d: Floats
@@ -240,11 +228,11 @@ ELBOW = 2
 """The row of `link_poses` whose origin is the elbow: where the upper arm ends."""
 
 ELBOW_DIGITS = 6
-"""The same of its place, mm: it does not move with the roll."""
+"""Decimals of the elbow's place, mm: it does not move with the roll."""
 
 
 class Singularity(NamedTuple):
-    """How far a configuration is from the three singularities of a UR arm; each 0 (singular) to 1. Shapes (...)."""
+    """Distance of a configuration from the three singularities of a UR arm; each 0 (singular) to 1. Shapes (...)."""
 
     shoulder: Floats
     """In-plane distance of the wrist centre from axis 1, over the longest possible."""
@@ -285,7 +273,7 @@ def away_from_singularities(model: UrModel, q: Floats) -> NDArray[np.bool_]:
 
 
 def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> Floats:
-    """Of configurations the one farthest from singular; of equals the one whose elbow lies farthest along a direction.
+    """The configuration farthest from singular; of equals the one whose elbow lies farthest along a direction.
 
     A branch and its mirror image, and all rolls about the flange's axis, are equally far but for rounding: a choice
     among them by the last bit differs between machines.
@@ -293,7 +281,7 @@ def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> 
     Args:
         model: The arm.
         q: Shape (n, 6), rad; rows may be NaN, not all of them.
-        elbow_towards: Shape (3,), base frame: where there is room for the elbow.
+        elbow_towards: Shape (3,), base frame: where there is space for the elbow.
 
     Returns:
         Shape (6,), rad.
@@ -328,26 +316,27 @@ def least_term(lengths, q):  # type: ignore[no-untyped-def]  # numba infers
 
 
 class SpeedLimits(NamedTuple):
-    """What a case allows, and its plan keeps. The names are the keys of ``[robot]``."""
+    """Speed limits that a case allows, and its plan keeps. The names are the keys of ``[robot]``."""
 
     tip_speed_mm_s: float = 250.0
-    """Of the needle's tip, on the approach: what ISO 10218-1 calls reduced speed."""
+    """Speed of the needle's tip on the approach: what ISO 10218-1 calls reduced speed."""
 
     insertion_speed_mm_s: float = 10.0
-    """Of the tip, along the insertion: a needle is inserted slowly, and an operator must be able to stop it."""
+    """Speed of the tip along the insertion: a needle is inserted slowly, and an operator must be able to stop it."""
 
     joint_speed_fraction: float = 0.5
-    """Of each joint's highest speed, as MoveIt's velocity scaling."""
+    """Fraction of each joint's highest speed, as MoveIt's velocity scaling."""
 
     joint_acceleration_fraction: float = 1.0
-    """Of each joint's highest acceleration, as MoveIt's acceleration scaling."""
+    """Fraction of each joint's highest acceleration, as MoveIt's acceleration scaling."""
 
 
 DEFAULT_SPEEDS = SpeedLimits()
-"""Where nobody says how fast."""
+"""Speeds where none are stated."""
 
 HIGHEST = SpeedLimits(1000.0, 100.0, 1.0, 1.0)
-"""That a case may ask for: a UR's usual tool speed, a needle that is pushed briskly, and all that the joints can."""
+"""The highest speeds that a case may state: a UR's usual tool speed, a needle that is pushed briskly, and all that the
+joints can."""
 
 
 def slowed(model: UrModel, speeds: SpeedLimits) -> UrModel:
@@ -409,7 +398,7 @@ FITS_MM = 1.5
 """Another model whose joints put the tool so near to where it was is the arm that was recorded."""
 
 LEVER_MM = 95.0
-"""A flange's axes are held against joints by points so far out: 3 degrees move them by 5 mm."""
+"""A flange's axes are compared with joints by points so far out: 3 degrees move them by 5 mm."""
 
 
 def check_arm(
@@ -422,7 +411,11 @@ def check_arm(
     where: str | Path,
     any_tool: bool = False,
 ) -> None:
-    """Refuse joints that do not put the tool where the same file says that it was.
+    """Refuse joints of another arm: ones that do not put the tool where the same file says that it was.
+
+    A UR3e's joints read as a UR3's are 18 mm off, and six angles alone do not show it. But a recording often states the
+    same thing twice: a controller's own pose with its joints, a touched point, a flange. With the arm's nominal lengths
+    both must agree, up to what a controller's own calibration moves.
 
     Args:
         model: The case's arm.

@@ -1,8 +1,7 @@
 """The bodies of the arm's links, in the link frames of :mod:`puncture_twin.planning.arm.kinematics`, in mm.
 
-Source: the collision shapes of its URDF; ``meshes/ur/LICENSE`` says whence those are that ship.
-
-The URDF behind an arm's model: the user's own, if it is built as a UR, or the one that ships under its name.
+Source: the collision shapes of the URDF behind an arm's model: the user's own, if it is built as a UR, or the one that
+ships under its name (``meshes/ur/LICENSE`` says whence).
 """
 
 from __future__ import annotations
@@ -33,13 +32,13 @@ LINK_NAMES = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", 
 SLABS: Mapping[str, int] = MappingProxyType({"base": 3, "upper_arm": 3, "forearm": 4})
 """Into how many slabs along its longest side a link is cut before the hulls are taken; the others stay whole.
 
-One hull of the whole forearm bulges over the wrist and meets wrist 2 in 21 % of random configurations of a UR3 where
+One hull of the whole forearm bulges over the wrist and touches wrist 2 in 21 % of random configurations of a UR3 where
 the mesh itself never does; with these slabs 73.3 % of them are free against 73.8 % for the open meshes themselves.
 """
 
 
 PIN_RADIUS_MM = 10.0
-"""Of the pin that stands for a joint where the meshes leave a gap: well inside every link."""
+"""Radius of the pin that replaces a joint where the meshes leave a gap: well inside every link."""
 
 FLUSH_MM = 1e-4
 """Meshes that overlap along their joint's axis by less than this end in one plane: rounding says whether they touch."""
@@ -48,7 +47,7 @@ FLAT_MM = 0.05
 """Points that lie within such a sheet span no body: their hull would be one of rounding."""
 
 MOST_GAP_MM = 5.0
-"""Of an own URDF's shapes: the UR5's meshes leave 3 mm, and a mesh in another unit hundreds."""
+"""Gap between an own URDF's shapes, at most: the UR5's meshes leave 3 mm, and a mesh in another unit hundreds."""
 
 PIN_ROOT_MM = 5.0
 """How far such a pin reaches into the links at both sides."""
@@ -94,8 +93,8 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
         "urdf": urdf.digest,
         "shipped": model.shipped,
     }
-    kept = user_cache().arrays(made_from, lambda: _packed(_convex_links(model)), by=__name__, check=unpacked_meshes)
-    pieces, ends = unpacked_meshes(kept), np.cumsum(kept["pieces"])
+    cached = user_cache().arrays(made_from, lambda: _packed(_convex_links(model)), by=__name__, check=unpacked_meshes)
+    pieces, ends = unpacked_meshes(cached), np.cumsum(cached["pieces"])
     parts = zip(LINK_NAMES, [0, *ends], ends, strict=False)
     return tuple(Link(name, i, pieces[start:end]) for i, (name, start, end) in enumerate(parts))
 
@@ -111,13 +110,13 @@ def _convex_links(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
 
 
 def _packed(links: Sequence[Sequence[TriangleMesh]]) -> Arrays:
-    """The links' pieces for the cache, and how many each link has."""
+    """The links' pieces for the cache, and the number of pieces of each link."""
     return {**packed_meshes([piece for link in links for piece in link]), "pieces": np.array([*map(len, links)])}
 
 
 @cache
 def visual_links(model: UrModel) -> tuple[Link, ...]:
-    """The links in full detail, for pictures: same frames as :func:`collision_links`.
+    """The links in full detail, for images: same frames as :func:`collision_links`.
 
     They are the collision shapes themselves (43,000 triangles for the UR3): reading coloured Collada files would need
     one more package.
@@ -128,7 +127,7 @@ def visual_links(model: UrModel) -> tuple[Link, ...]:
 
 
 def _link_shapes(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
-    """The collision shapes of the seven bodies, turned from the URDF's link frames to ours: a constant motion each."""
+    """The collision shapes of the seven bodies, from the URDF's link frames to ours: a constant motion each."""
     urdf = model_urdf(model)
     T_link_urdflink = np.linalg.inv(link_poses(model, np.zeros(6))) @ urdf.body_poses(np.zeros(6))
     return [
@@ -190,7 +189,7 @@ def _thickness_mm(points: Floats) -> float:
 def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[TriangleMesh, ...]]:
     """For each link the pin that closes the gap to the next one along their joint's axis, if the meshes leave one.
 
-    The UR5's leave up to 3 mm, and a flat surface passing there would meet neither link.
+    The UR5's leave up to 3 mm, and a flat surface passing there would touch neither link.
     """
     poses = link_poses(model, np.zeros(6))
     pins: list[tuple[TriangleMesh, ...]] = []
@@ -219,7 +218,7 @@ def _pin(low: float, high: float) -> TriangleMesh:
 
 
 def _crossings(starts: Floats, ends: Floats, axis: int, cut: float) -> Floats:
-    """Where edges (n, 3) to (n, 3) pass the plane ``axis = cut``, shape (k, 3), mm."""
+    """Points where edges (n, 3) to (n, 3) pass the plane ``axis = cut``, shape (k, 3), mm."""
     a, b = starts[:, axis], ends[:, axis]
     crosses = (a - cut) * (b - cut) < 0.0
     fraction = ((cut - a[crosses]) / (b[crosses] - a[crosses]))[:, None]

@@ -1,4 +1,4 @@
-"""What the arm carries and what stands about it: needle holder and needle, and the workcell's boxes."""
+"""What the arm carries and what surrounds it: needle holder and needle, and the workcell's boxes."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Tool:
         shaft_mm: Usable length: from the holder's end to the tip.
         needle_diameter_mm: Diameter of the needle.
         holder_diameter_mm: Diameter of the holder.
-        body: What the flange carries beside them, or None.
+        body: What the flange carries besides them, or None.
 
     Raises:
         InputError: If a length is not finite and positive, or the shaft is longer than the needle.
@@ -100,17 +100,17 @@ class Tool:
 
     @property
     def holder_length_mm(self) -> float:
-        """From the flange to where the needle leaves the holder, mm."""
+        """Distance from the flange to where the needle leaves the holder, mm."""
         return self.needle_length_mm - self.shaft_mm
 
     @property
     def holder_span_mm(self) -> tuple[float, float]:
-        """Where the holder's body begins and ends on the flange's z axis, mm."""
+        """Start and end of the holder's body on the flange's z axis, mm."""
         return (-HOLDER_ROOT_MM, self.holder_length_mm)
 
     @property
     def needle_span_mm(self) -> tuple[float, float]:
-        """Where the needle's body begins and ends on the flange's z axis, mm."""
+        """Start and end of the needle's body on the flange's z axis, mm."""
         return (self.holder_length_mm - NEEDLE_ROOT_MM, self.needle_length_mm)
 
 
@@ -156,7 +156,7 @@ class Box:
 
 
 SIDES = 24
-"""Of the polygon that stands for the bore: inscribed, so the bore is up to 0.9 % narrower than it is (3 mm of 350)."""
+"""Sides of the polygon of the bore: inscribed, so the bore is up to 0.9 % narrower than it is (3 mm of 350)."""
 
 
 def gantry_boxes(

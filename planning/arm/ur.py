@@ -80,7 +80,7 @@ class UrModel:
 
     @cached_property
     def digest(self) -> str:
-        """Hexadecimal SHA-256 of all that the arm is: two of one digest are the same arm, to the bit."""
+        """Hexadecimal SHA-256 of all the model's numbers: two arms of one digest are the same to the bit."""
         numbers = (self.lengths, self.joint_limits, self.max_speeds, self.max_torques, np.array(self.max_acceleration))
         words = (self.name, *self.joint_names, str(self.shipped), "" if self.urdf is None else self.urdf.digest)
         return hashlib.sha256("\n".join(words).encode() + b"".join(one.tobytes() for one in numbers)).hexdigest()
@@ -115,7 +115,7 @@ class UrModel:
 
     @property
     def shoulder_base(self) -> NDArray[np.float64]:
-        """The shoulder point, where axes 1 and 2 meet, base frame, shape (3,), mm."""
+        """The shoulder point, where axes 1 and 2 intersect, base frame, shape (3,), mm."""
         return np.array([0.0, 0.0, self.d1])
 
     def within_limits(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -1,9 +1,4 @@
-"""What a cohort is made of: a folder, a CSV, or a TOML file with patterns and grids of options.
-
-A cohort as ``cohort.toml``: patterns of cases, and a grid of options that each of them is run with.
-
-One case of a cohort, before anything of it has been read.
-"""
+"""The cases of a cohort: a folder, a CSV, or a TOML file with patterns of cases and a grid of options for each."""
 
 from __future__ import annotations
 
@@ -32,9 +27,32 @@ from puncture_twin.planning.case.options import NO_OPTIONS, SECTIONS, CaseOption
 from puncture_twin.planning.case.toml_types import Section, Text
 
 CASE_FILE = "case.toml"
+
 ALLOWED = f"a folder with {CASE_FILE} files, a CSV with the header 'case', or a cohort.toml"
+
 MAX_FILE_BYTES = 200_000_000
 """A million lines of two hundred characters."""
+
+
+@dataclass(frozen=True)
+class CohortCase:
+    """One case with its options.
+
+    Attributes:
+        stated: As the cohort writes it.
+        path: The case file, or the folder that holds ``case.toml``.
+        name: What people call it; "" leaves it to the case.
+        options: What is stated in place of what the case states.
+    """
+
+    stated: str
+    path: Path
+    name: str = ""
+    options: CaseOptions = NO_OPTIONS
+
+
+MOST_CASES = 1_000_000
+"""Cases of one cohort: more is a slip in a grid of options."""
 
 
 def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]]:
@@ -80,7 +98,7 @@ def _folder_cases(cohort: Path) -> list[CohortCase]:
     """Every case file below a folder, also behind links to folders, each folder once; none that cannot be looked into.
 
     Raises:
-        InputError: A folder that cannot be read, or a link to nothing beside folders: a patient would be lost.
+        InputError: A folder that cannot be read, or a link to nothing next to folders: a patient would be lost.
     """
     found, seen = [], set[str]()
     for folder, below, files in os.walk(cohort, followlinks=True, onerror=_refuse_unreadable):
@@ -107,7 +125,9 @@ def _refuse(what: str, where: str) -> NoReturn:
 
 
 CASE, NAME, TARGET = "case", "name", "target"
+
 ALLOWED_COLUMNS = f"{CASE}, {NAME}, {TARGET}, and options as KIND.KEY (KIND one of {', '.join(SECTIONS)})"
+
 LONGEST_CELL = 20_000
 
 
@@ -135,7 +155,7 @@ def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
 
 
 def _rows(content: bytes, path: Path) -> Any:
-    """The lines, as a reader that counts them."""
+    """Lines of a CSV as a reader that counts them."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -187,7 +207,7 @@ def target_option(text: str) -> dict[str, Any]:
 
 
 def _value(cell: str) -> Any:
-    """A cell as TOML reads it: a number, a list, a text in quotes; else it is a text as it stands."""
+    """A cell as TOML reads it: a number, a list, a text in quotes; else its own text."""
     try:
         return tomllib.loads(f"value = {cell}\n")["value"]
     except (tomllib.TOMLDecodeError, KeyError, RecursionError):
@@ -195,6 +215,7 @@ def _value(cell: str) -> Any:
 
 
 ALLOWED_TOML = "a cohort.toml with cases = [patterns] and, if wanted, tables of options"
+
 KEYS = "docs/how-to/cohorts.md"
 
 Choices = dict[Text, dict[str, Any]] | tuple[Any, ...]
@@ -212,7 +233,7 @@ AXES = {
 
 
 class CohortFile(Section):
-    """The whole file."""
+    """Schema of a whole ``cohort.toml``."""
 
     schema_: SchemaOne = Field(1, alias="schema")
     cases: Annotated[tuple[Text, ...], Field(min_length=1)]
@@ -253,7 +274,7 @@ def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
 
 
 def _matches(patterns: Sequence[str], path: Path) -> list[str]:
-    """What the patterns match, each once, in the order of the patterns."""
+    """Matches of the patterns, each once, in the order of the patterns."""
     found: dict[str, None] = {}
     for pattern in patterns:
         matches = sorted(glob.glob(pattern, root_dir=path.parent, recursive=True))  # noqa: PTH207  # absolute ones too
@@ -272,7 +293,7 @@ def _axis(stated: Any, axis: str, kind: str, path: Path) -> list[_Choice]:
 
 
 def _table(values: Any, kind: str, where: str) -> Mapping[str, Any]:
-    """A table as it stands; of a target a point, of an arm its model, without the key."""
+    """The option's table of the case file; of a target a point, of an arm its model, without the key."""
     if isinstance(values, Mapping):
         return values
     if kind == "target" and isinstance(values, list | tuple):
@@ -290,24 +311,3 @@ def _combined(choices: Sequence[_Choice], path: Path) -> tuple[str, CaseOptions]
 def _labels(choices: Sequence[_Choice]) -> Iterator[str]:
     for one in choices:
         yield f"{one.kind} {one.name}"
-
-
-@dataclass(frozen=True)
-class CohortCase:
-    """One case with its options.
-
-    Attributes:
-        stated: As the cohort writes it.
-        path: The case file, or the folder that holds ``case.toml``.
-        name: What people call it; "" leaves it to the case.
-        options: What is stated in place of what the case states.
-    """
-
-    stated: str
-    path: Path
-    name: str = ""
-    options: CaseOptions = NO_OPTIONS
-
-
-MOST_CASES = 1_000_000
-"""Of one cohort: more is a slip in a grid of options."""

@@ -1,8 +1,7 @@
-"""One table for a cohort, a row a case, and one dataset of candidates with the same columns for all.
+"""The merged tables of a cohort, and two merged cohorts compared.
 
-One row a case: its verdict in numbers, or its reason. mm and degrees.
-
-Two merged cohorts against each other: what became safe, what was lost, how far the best entries moved.
+``cases.parquet`` has a row a case: its verdict in numbers (mm and degrees), or its reason; the dataset has the
+candidates of all cases with the same columns. `compare` says what became safe and what was lost.
 """
 
 from __future__ import annotations
@@ -98,7 +97,7 @@ def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
 
 
 def widened(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """A table with all columns of a schema, null where it has none; its own metadata stay."""
+    """A table with all columns of a schema, null where it has none; its own metadata are unchanged."""
     columns = [table[one.name] if one.name in table.column_names else pa.nulls(len(table), one.type) for one in schema]
     return pa.table(columns, schema=schema.with_metadata(table.schema.metadata))
 
@@ -145,7 +144,7 @@ def blank_row(planned: PlannedCase, exit_code: int | None, reason: str | None) -
     return row | stated | {"exit_code": exit_code, "reason": reason, "directions": 0, "safe": 0, "page": False}
 
 
-def found_row(planned: PlannedCase, context: CaseContext, candidates: Candidates) -> dict[str, Any]:
+def searched_row(planned: PlannedCase, context: CaseContext, candidates: Candidates) -> dict[str, Any]:
     """The row of a case that was searched."""
     safe = int(candidates.safe.sum())
     row = blank_row(planned, 0 if safe else 1, None if safe else no_safe_reason(candidates))
@@ -157,7 +156,7 @@ def found_row(planned: PlannedCase, context: CaseContext, candidates: Candidates
 
 
 def no_safe_reason(candidates: Candidates) -> str:
-    """With what most directions fell to."""
+    """The reason of most directions, where none is safe."""
     counts = candidates.counts()
     return f"{NO_SAFE} (most: {next(iter(counts))})" if counts else NO_SAFE
 
@@ -178,7 +177,7 @@ def _best(candidates: Candidates) -> dict[str, Any]:
 
 
 def _reach(candidates: Candidates) -> float | None:
-    """Which fraction of the directions that the organs leave the arm reaches; None where nobody asked it."""
+    """Fraction of the organ-safe directions that the arm reaches; None where it was not queried."""
     checked = candidates.arm.reachable >= 0
     return float((candidates.arm.reachable[checked] == 1).mean()) if checked.any() else None
 
@@ -220,12 +219,12 @@ class CaseChange(NamedTuple):
 
     @property
     def moved_mm(self) -> float | None:
-        """How far the best entry moved on the skin; None without two."""
+        """Distance between the best entries on the skin, mm; None without two."""
         return _distance(_vector(self.before), _vector(self.after))
 
     @property
     def clearance_mm(self) -> float | None:
-        """By how much the best candidate's clearance grew; None without two."""
+        """Growth of the best candidate's clearance, mm; None without two."""
         values = [None if row is None else row["best_clearance_mm"] for row in (self.before, self.after)]
         return None if values[0] is None or values[1] is None else values[1] - values[0]
 
@@ -247,16 +246,16 @@ class Comparison:
 
     @property
     def moved_mm(self) -> list[float]:
-        """Of every case that is safe in both."""
+        """Distances between the best entries of every case that is safe in both, mm."""
         return [one.moved_mm for one in self.changes if one.moved_mm is not None]
 
     def beyond(self, tolerance_mm: float) -> list[CaseChange]:
         """The cases whose verdict changed, or whose best clearance did by more than so much."""
-        return [one for one in self.changes if one.kind != "same" or not _kept(one, tolerance_mm)]
+        return [one for one in self.changes if one.kind != "same" or not _unchanged(one, tolerance_mm)]
 
 
 def compare(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> Comparison:
-    """Hold the rows of two merged cohorts against each other."""
+    """Compare the rows of two merged cohorts."""
     first, second = _keyed(before), _keyed(after)
     keys = [*second, *(key for key in first if key not in second)]
     return Comparison(tuple(CaseChange(key[0], key[1], first.get(key), second.get(key)) for key in keys))
@@ -299,8 +298,8 @@ def _keyed(rows: Iterable[Mapping[str, Any]]) -> dict[CaseKey, Mapping[str, Any]
     return found
 
 
-def _kept(change: CaseChange, tolerance_mm: float) -> bool:
-    """Whether the best clearance is as it was; one that only one of them has is not."""
+def _unchanged(change: CaseChange, tolerance_mm: float) -> bool:
+    """Whether the best clearance is unchanged; one that only one of them has is not."""
     one, other = change.before, change.after
     if one is None or other is None or (one["best_clearance_mm"] is None) != (other["best_clearance_mm"] is None):
         return False

@@ -1,6 +1,7 @@
-"""``plan.parquet``: every case of a cohort, with an id that is the hash of its inputs, its options and the version.
+"""The plan of a cohort (``plan.parquet``) and the results of its cases on disk.
 
-The result of one case: a folder ``DIR/ID`` that appears by one rename, with everything in it or not at all.
+A case's id is the hash of its inputs, its options and the version. Its result is a folder ``DIR/ID`` that appears by
+one rename, with everything in it or not at all.
 """
 
 from __future__ import annotations
@@ -139,7 +140,7 @@ def identified(row: PlannedCase) -> PlannedCase:
 
 
 def _readable(row: PlannedCase) -> tuple[Input, ...]:
-    """Of a case that is refused, the case file where it can be read."""
+    """The case file of a refused case, where it can be read."""
     try:
         path = find_toml(row.path, "case.toml")
         return (content_input(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE)),)
@@ -148,7 +149,7 @@ def _readable(row: PlannedCase) -> tuple[Input, ...]:
 
 
 def relative_text(text: str, row: PlannedCase) -> str:
-    """What is said of a case, without the folder in which it happens to lie: the same bytes give the same text."""
+    """A case's message without the folder in which it happens to lie: the same bytes give the same text."""
     path = Path(row.path)
     folder = str(path.parent if path.suffix == ".toml" else path)
     return one_line(text.replace(f"{folder}/", "").replace(folder, OWN_FOLDER))
@@ -191,7 +192,7 @@ PROGRAM_FAILED = 3
 """The exit code of a case at which the program, not the case, failed: the next run tries it again."""
 
 IS_THERE = frozenset({errno.ENOTEMPTY, errno.EEXIST})
-"""What the system says where another result is there already."""
+"""Error numbers of a rename where another result is there already."""
 
 WORK_PREFIX = ".puncture-twin-cases-"
 """Folders of results that are being written; who holds the lock of a part knows that nobody else writes to its own."""
@@ -255,7 +256,7 @@ def is_final(row: Mapping[str, Any] | None) -> bool:
 
 
 def discard(out: Path, case_id: str, work: Path) -> None:
-    """Take a result away that is not final or not whole; it is gone at once, or it stays."""
+    """Remove a result that is not final or not whole, at once or not at all."""
     folder = out / case_id
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise InputError(f"{case_id} there is not a result of this cohort", where=out, allowed="a folder of its own")

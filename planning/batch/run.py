@@ -1,12 +1,6 @@
-"""A cohort's cases, or a part, run by one at a time until each has a row; what has one is left as it is.
+"""Runs of a cohort: all of it or a part ``i/n``, on this machine or a scheduler's; its state, and an estimate.
 
-A part of a cohort: ``i/n``, as stated or as SLURM's array says it.
-
-How long a cohort will take, and how much memory and disk: measured at its first case that can be read.
-
-What has become of a cohort: done, failed with reasons, missing, stale.
-
-The same cases on the workers of a ``dask.distributed`` scheduler, on as many machines as it has.
+Cases are run by one process at a time until each has a row; what has one is left as it is.
 
 Dask runs a task again whose worker died, finished or not: every case is run at least once, and committed exactly once,
 because its result appears by a rename that only the first can make. The cohort, its output folder and this package are
@@ -65,7 +59,7 @@ class Part(NamedTuple):
 
     @property
     def text(self) -> str:
-        """As it is typed."""
+        """The part as it is typed."""
         return f"{self.number}/{self.parts}"
 
     def of(self, items: Sequence[Item]) -> Sequence[Item]:
@@ -93,7 +87,7 @@ def slurm_part(environment: Mapping[str, str]) -> Part | None:
     """The part of this task of a SLURM array; None outside of one.
 
     Raises:
-        InputError: An array from whose numbers the part cannot be told.
+        InputError: An array from whose numbers the part cannot be inferred.
     """
     if TASK not in environment:
         return None
@@ -117,7 +111,7 @@ ALLOWED_AT_ONCE = "one run at a time, parts beside each other (--part i/n), or a
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be run, and how.
+    """Cases to be run, and how.
 
     Attributes:
         part: Of the plan.
@@ -134,7 +128,7 @@ class Request:
 
 @dataclass
 class RunCounts:
-    """What a run did.
+    """Counts of one run.
 
     Attributes:
         planned: Cases of the part.
@@ -180,7 +174,7 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     Args:
         out: The cohort's folder, with its plan.
         request: Which part, and how.
-        watcher: Whoever shows progress, in cases.
+        watcher: Shows progress, in cases.
         elsewhere: Runs the cases; None runs them in processes of this machine.
 
     Raises:
@@ -193,9 +187,11 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     with running(out, request.part) as work:
         rows = request.part.of(plan.cases)
         cases = distinct(rows)
-        kept = [_kept_row(one, out, work) for one in cases]
-        tasks = [CaseTask(one, out, work, request.write_page) for one, row in zip(cases, kept, strict=True) if not row]
-        refused = sum(row["exit_code"] > 1 for row in kept if row)
+        cached = [_stored_row(one, out, work) for one in cases]
+        tasks = [
+            CaseTask(one, out, work, request.write_page) for one, row in zip(cases, cached, strict=True) if not row
+        ]
+        refused = sum(row["exit_code"] > 1 for row in cached if row)
         counts = RunCounts(len(rows), len(rows) - len(cases), len(cases) - len(tasks), refused)
         watcher.count("cases", 0, len(tasks))
         with closing(_ends(tasks, request, elsewhere)) as ends:
@@ -209,7 +205,7 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
 
 
 def distinct(cases: Iterable[PlannedCase]) -> list[PlannedCase]:
-    """The first case of each id: of the same bytes, options and version the answer is one."""
+    """The first case of each id: the same bytes, options and version have one answer."""
     return list({one.id: one for one in reversed(list(cases))}.values())[::-1]
 
 
@@ -219,8 +215,8 @@ def _ends(tasks: Sequence[CaseTask], request: Request, elsewhere: RunTasks | Non
     return run_tasks(tasks, worker_count(request.jobs, len(tasks)), request.limits)
 
 
-def _kept_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | None:
-    """The row of a case; what is there otherwise, a failure of the program or half a result, goes."""
+def _stored_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | None:
+    """The stored row of a case; a failure of the program or half a result is removed."""
     row = read_row(out, planned.id)
     if is_final(row):
         return row
@@ -230,7 +226,7 @@ def _kept_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | N
 
 @contextmanager
 def running(out: Path, part: Part) -> Iterator[Path]:
-    """Hold a part of a cohort; yields a folder for what is being written, which goes in the end.
+    """Lock a part of a cohort; yields a folder for drafts, which is removed in the end.
 
     The system frees the locks of a process that dies, and its folder is removed by the next run of the same part, or of
     the whole.
@@ -275,7 +271,7 @@ COPIES = 2
 
 @dataclass(frozen=True)
 class Estimate:
-    """Of a cohort.
+    """Estimated time, memory and disk of a cohort.
 
     Attributes:
         cases: In all.
@@ -295,7 +291,7 @@ class Estimate:
 
 
 def estimate(cases: Sequence[PlannedCase]) -> Estimate:
-    """Run the first case that can be read twice, the second time warm, and take all others to be like it.
+    """Estimate a cohort from its first case that can be read, run twice, the second time warm.
 
     Args:
         cases: The plan's.
@@ -316,7 +312,7 @@ def estimate(cases: Sequence[PlannedCase]) -> Estimate:
 
 @dataclass
 class CohortState:
-    """Cases of a plan, each counted once.
+    """State of a cohort's cases, each counted once: done, failed, missing or stale.
 
     Attributes:
         planned: Cases in all.
@@ -381,7 +377,7 @@ class CohortState:
 
 
 def cohort_state(out: Path, progress: Count) -> CohortState:
-    """Look at every case of a plan.
+    """The state of every case of a plan.
 
     Args:
         out: The cohort's folder.
@@ -400,12 +396,12 @@ def cohort_state(out: Path, progress: Count) -> CohortState:
 CONNECT_S = 20.0
 """So long a scheduler may take to answer."""
 
-KEPT = "puncture_twin_kept"
+WORKER_CACHE = "puncture_twin_kept"
 """Attribute of Dask's worker object: what this process keeps, and who is at it."""
 
 
-class _Kept:
-    """Of one worker process. Its threads run one case at a time: FCL's objects are moved for each question."""
+class _WorkerCache:
+    """Cache of one worker process. Its threads run one case at a time: FCL's objects are moved for each query."""
 
     def __init__(self) -> None:
         self.memory = Memory(MEMORY_BYTES)
@@ -413,7 +409,7 @@ class _Kept:
 
 
 def on_scheduler(address: str) -> RunTasks:
-    """Whoever runs cases on a scheduler's workers.
+    """A function that runs cases on a scheduler's workers.
 
     Args:
         address: Such as ``tcp://10.0.0.1:8786``.
@@ -462,7 +458,7 @@ def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Gene
 
 
 def _killed(task: CaseTask) -> CaseEnd:
-    """Its row; or the result that was there before its worker died."""
+    """The row of a case that killed its workers; or the result that was there before."""
     return ended(task) or commit_failure(task, WORKER_DIED)
 
 
@@ -470,6 +466,6 @@ def run_on_worker(task: CaseTask) -> CaseEnd:
     """Run a case in a worker's process, one at a time."""
     from distributed import get_worker
 
-    kept: _Kept = vars(get_worker()).setdefault(KEPT, _Kept())
-    with kept.turn:
-        return run_case(task, kept.memory)
+    cached: _WorkerCache = vars(get_worker()).setdefault(WORKER_CACHE, _WorkerCache())
+    with cached.turn:
+        return run_case(task, cached.memory)

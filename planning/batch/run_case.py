@@ -18,7 +18,7 @@ from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.progress import Stages
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
-from puncture_twin.planning.batch.merge import blank_row, found_row
+from puncture_twin.planning.batch.merge import blank_row, searched_row
 from puncture_twin.planning.batch.plan import (
     PAGE_NAME,
     PROGRAM_FAILED,
@@ -43,12 +43,12 @@ WritePage = Callable[[CaseContext, Candidates, Path], None]
 BAD_INPUT = 2
 
 READY = "ready"
-"""A worker's first word: its modules are loaded."""
+"""A worker's first message: its modules are loaded."""
 
 
 @dataclass(frozen=True)
 class CaseTask:
-    """One case to be run; whoever runs it needs nothing else.
+    """One case to be run, with all that a worker needs.
 
     Attributes:
         planned: The case.
@@ -106,7 +106,7 @@ def run_case(task: CaseTask, memory: Memory = NO_MEMORY) -> CaseEnd:
 
 
 def ended(task: CaseTask) -> CaseEnd | None:
-    """How a case has ended already; None where it has no row."""
+    """The end of a case that has a row already; None without one."""
     row = read_row(task.out, task.planned.id)
     return None if row is None else CaseEnd(task.planned.id, row["exit_code"], row["reason"])
 
@@ -133,17 +133,17 @@ def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
     except Exception as error:  # whatever breaks becomes this case's row: the others go on
         if isinstance(error, OSError) and disk_is_full(error, task.out):
             raise
-        said = relative_text(f"{type(error).__name__}: {error}", planned)
-        row, inputs = blank_row(planned, PROGRAM_FAILED, said), read_inputs(json.loads(planned.inputs))
+        message = relative_text(f"{type(error).__name__}: {error}", planned)
+        row, inputs = blank_row(planned, PROGRAM_FAILED, message), read_inputs(json.loads(planned.inputs))
     return _committed(task, draft, row, inputs, stages.seconds)
 
 
 def _searched(task: CaseTask, context: CaseContext, draft: Path) -> dict[str, Any]:
-    found = context.search()
-    write_table(found, context.provenance(), draft / TABLE_NAME)
-    row = found_row(task.planned, context, found)
+    candidates = context.search()
+    write_table(candidates, context.provenance(), draft / TABLE_NAME)
+    row = searched_row(task.planned, context, candidates)
     if task.write_page is not None:
-        task.write_page(context, found, draft)
+        task.write_page(context, candidates, draft)
         row["page"] = (draft / PAGE_NAME).is_file()
     return row
 
@@ -168,7 +168,7 @@ def _committed(
 
 
 def work(connection: Connection, memory_bytes: int) -> None:
-    """Run what comes until nothing more does.
+    """Run tasks from the queue until none is left.
 
     Args:
         connection: Gives `CaseTask`, takes `READY` and then a `CaseEnd` for each.

@@ -28,17 +28,17 @@ WORKER_DIED, TIMED_OUT, OUT_OF_MEMORY = "worker_died", "timed_out", "out_of_memo
 """Reasons of the rows that no worker could write."""
 
 TRIES = 2
-"""Of a case whose worker dies."""
+"""Tries of a case whose worker dies."""
 
 LOOK_EVERY_S = 0.2
-"""So often memory and time are looked at."""
+"""Seconds between two checks of memory and time."""
 
 STATM = "/proc/{}/statm"
 SPAWN = multiprocessing.get_context("spawn")
 
 
 class Limits(NamedTuple):
-    """Of one case.
+    """Time and memory limits of one case.
 
     Attributes:
         memory_mb: Resident set of its worker, 10^6 bytes; None sets no limit.
@@ -54,7 +54,7 @@ NO_LIMITS = Limits()
 
 @dataclass
 class _Worker:
-    """A process and what it is at."""
+    """A process and the case that it runs."""
 
     process: SpawnProcess
     connection: Connection
@@ -63,13 +63,13 @@ class _Worker:
     since: float = field(default_factory=time.monotonic)
 
     def give(self, task: CaseTask) -> None:
-        """Let it run a case; one that has just died is noticed by its sentinel."""
+        """Hand a case to the worker; one that has just died is noticed by its sentinel."""
         self.task, self.since = task, time.monotonic()
         with suppress(OSError):
             self.connection.send(task)
 
     def end(self) -> None:
-        """Kill it."""
+        """Kill the process."""
         self.process.kill()
         self.process.join()
         self.connection.close()
@@ -103,12 +103,12 @@ class TaskQueue:
         return task
 
     def again(self, task: CaseTask) -> None:
-        """Put a case back, before the others of its group."""
+        """Requeue a case before the others of its group."""
         self._groups.setdefault(group_of(task), deque()).appendleft(task)
 
 
 def group_of(task: CaseTask) -> str:
-    """Where a case's files lie: a guess at the patient, which decides who runs it and nothing else."""
+    """Folder of a case's files: a guess at the patient, which decides which worker runs it and nothing else."""
     return str(Path(task.planned.path).parent)
 
 
@@ -156,7 +156,7 @@ def _started(task: CaseTask, limits: Limits) -> _Worker:
 
 @contextmanager
 def _without_interrupt() -> Iterator[None]:
-    """What is started here never sees Ctrl-C: the main process ends it."""
+    """Start processes that never see Ctrl-C: the main process ends them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -165,23 +165,23 @@ def _without_interrupt() -> Iterator[None]:
 
 
 def _spoken(workers: list[_Worker]) -> list[_Worker]:
-    """The workers that have said something, or have died."""
+    """Workers that have sent something, or have died."""
     handles = [handle for one in workers for handle in (one.connection, one.process.sentinel)]
     found = wait(handles, timeout=LOOK_EVERY_S)
     return [one for one in workers if one.connection in found or one.process.sentinel in found]
 
 
 def _heard(worker: _Worker, workers: list[_Worker], queue: TaskQueue) -> Iterator[CaseEnd]:
-    """What a worker said, and what it does next; or its death."""
+    """Handle a worker's message and its next case; or its death."""
     try:
-        said = worker.connection.recv() if worker.connection.poll() else None
+        message = worker.connection.recv() if worker.connection.poll() else None
     except (EOFError, OSError):
-        said = None
-    if said == READY:
+        message = None
+    if message == READY:
         worker.ready = True
         worker.give(worker.task)
-    elif isinstance(said, CaseEnd):
-        yield said
+    elif isinstance(message, CaseEnd):
+        yield message
         if queue:
             worker.give(queue.next(worker.task))
         else:
@@ -194,7 +194,7 @@ def _heard(worker: _Worker, workers: list[_Worker], queue: TaskQueue) -> Iterato
 
 
 def _died(task: CaseTask, queue: TaskQueue) -> Iterator[CaseEnd]:
-    """The case again, or its row; a result that was there before the death is one."""
+    """Requeue the case of a dead worker, or write its row; a result from before the death counts."""
     end = ended(task)
     if end is not None:
         yield end
@@ -205,12 +205,12 @@ def _died(task: CaseTask, queue: TaskQueue) -> Iterator[CaseEnd]:
 
 
 def _without_row(task: CaseTask, reason: str) -> CaseEnd:
-    """The row of a case that was stopped, unless it had just come to its end."""
+    """The row of a stopped case, unless it had just ended."""
     return ended(task) or commit_failure(task, reason)
 
 
 def _beyond(worker: _Worker, limits: Limits) -> str:
-    """Which limit a worker's case has passed; "" where none."""
+    """The limit that a worker's case has passed; "" where none."""
     if not worker.ready:
         return ""
     if limits.timeout_s is not None and time.monotonic() - worker.since > limits.timeout_s:
@@ -221,7 +221,7 @@ def _beyond(worker: _Worker, limits: Limits) -> str:
 
 
 def resident_bytes(process: int) -> int:
-    """What a process holds in memory; 0 where it is gone."""
+    """Memory of a process; 0 where it is gone."""
     try:
         pages = Path(STATM.format(process)).read_text(encoding="ascii").split()[1]
     except (OSError, IndexError):

@@ -1,14 +1,12 @@
-"""The breathing that a case declares: how far, whereto, and how much of it each structure follows.
+"""The breathing that a case declares: amplitude, direction, gate, and the weight by which each structure follows.
 
-The model is the plainest that there is: everything moves along one line, structure i by s w_i b, with s the position in
-the breath, b the amplitude and w_i its weight. The target's weight is 1. Nothing deforms, and in and out pass the same
-places.
-
-The breath as a curve: Lujan, Larsen, Balter and Ten Haken, Med. Phys. 26 (1999), 715-720.
+Everything moves along one line, structure i by s w_i b, with s the position in the breath, b the amplitude and w_i its
+weight; the target's is 1. Nothing deforms, and in and out pass the same places. The position over time follows Lujan,
+Larsen, Balter and Ten Haken, Med. Phys. 26 (1999), 715-720:
 
     z(t) = z0 - b cos^2n(pi t / T - phi)
 
-z0 is the place at full exhale, b the amplitude, T the period. With phi = pi/2 the period begins at exhale, and the
+z0 is the place at full exhale, T the period. With phi = pi/2 the period begins at exhale, and the
 position s = (z0 - z) / b runs from 0 (exhale) to 1 (full inhale): s(t) = sin^2n(pi t / T).
 """
 
@@ -24,7 +22,7 @@ from puncture_twin.planning.formats.labels.naming import ByName
 
 @dataclass(frozen=True, eq=False)
 class Breathing:
-    """What a case declares of the breath; mm.
+    """The breathing that a case declares; mm.
 
     Attributes:
         amplitude_mm: b, of the target, from exhale to full inhale.
@@ -57,7 +55,7 @@ class Breathing:
 
     @property
     def in_window(self) -> Bools:
-        """Which of `positions` the gate lets through, shape (m,)."""
+        """Which of `positions` lie in the gate's window, shape (m,)."""
         s = self.positions
         return np.asarray(s <= (1.0 if self.gate is None else self.gate))
 
@@ -76,7 +74,7 @@ class Breathing:
 
     @property
     def window_text(self) -> str:
-        """When a safe candidate is safe. It never says that a needle may stay while the patient breathes."""
+        """When a safe candidate is safe, in words; never that a needle may stay while the patient breathes."""
         if self.gate is None and not self.whole:
             return "at exhale, if inserted there; no other phase was looked at"
         if self.gate is None:
@@ -127,9 +125,9 @@ def mean_square_within(position: float, exponent: int, about: float) -> float:
     """
     end = np.arcsin(np.clip(position, 0.0, 1.0) ** (1 / (2 * exponent)))
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    s = np.sin(end * (nodes + 1) / 2) ** (2 * exponent)
+    s = np.sin(end * (nodes + 1) / 2) ** (2 * exponent)  # nodes -1..1 to angles 0..end
     return float(np.sum(weights * (s - about) ** 2) / 2)
 
 
 NODES = 32
-"""Of Gauss and Legendre: powers of a sine up to the 24th are exact to 1e-12 over a quarter of its period."""
+"""Nodes of Gauss and Legendre: powers of a sine up to the 24th are exact to 1e-12 over a quarter period."""

@@ -29,7 +29,7 @@ from puncture_twin.planning.uncertainty.pose_error import Bend, PoseError
 
 @dataclass(frozen=True, eq=False)
 class BentPath:
-    """What bends a needle, and what it passes.
+    """A needle that bends, and the tissues of its path.
 
     Attributes:
         case: The case.
@@ -47,16 +47,16 @@ class BentPath:
 
     @cached_property
     def bend(self) -> Bend:
-        """By how much, if its bevel never turns."""
+        """The deflection, if the bevel never rotates."""
         insertion = insertion_along(self.bending, self.anatomy, self.case.target_ct, self.outward_ct, self.path_length)
         return Bend(insertion.tip_mm, self.bending.shaft.length_mm)
 
     def with_shaft(self, shaft: Shaft) -> BentPath:
-        """With another needle of the same bevel."""
+        """The path with another needle of the same bevel."""
         return replace(self, bending=replace(self.bending, shaft=shaft))
 
     def without_bevel(self) -> BentPath:
-        """With a symmetric tip."""
+        """The path with a symmetric tip."""
         return replace(self, bending=replace(self.bending, alpha=0.0))
 
 
@@ -76,7 +76,7 @@ def bent_path(case: Case, anatomy: Anatomy, outward_ct: Floats) -> BentPath | No
 
 
 def other_gauges(shaft: Shaft) -> dict[int, Shaft]:
-    """The next finer gauge and the two next thicker ones, by their numbers; tubes beside a tube, rods beside a rod."""
+    """Numbers of the next finer gauge and the two next thicker ones: tubes for a tube, rods for a rod."""
     by_width = sorted(GAUGES, key=lambda number: GAUGES[number].outer_mm)
     finer = [number for number in by_width if GAUGES[number].outer_mm < shaft.outer_mm - SAME_MM]
     thicker = [number for number in by_width if GAUGES[number].outer_mm > shaft.outer_mm + SAME_MM]
@@ -92,7 +92,7 @@ SAME_MM = 0.03
 
 
 GATES = (None, 0.5, 0.25, 0.1)
-"""Of the needle that waits, by s; None waits for nothing."""
+"""Position s of the breath that the needle waits for; None waits for none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ class Breath:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """What ties a target in the CT to a needle's tip.
+    """The chain from a target in the CT to a needle's tip: registration, arm, errors.
 
     Attributes:
         model: The arm.
@@ -131,7 +131,7 @@ class Chain:
         target_ct: Shape (3,), mm.
         q_insertion: Shape (6,), rad, the tip on the target.
         path: Of a needle that bends; None for a straight one.
-        breath: None where nobody declares it.
+        breath: None where it is not declared.
         aim: The insertion that a joint registration is corrected for.
     """
 
@@ -150,7 +150,7 @@ class Chain:
     aim: Aim | None = None
 
     def pose_error(self) -> PoseError:
-        """Of this chain, its errors taken for declared."""
+        """The pose error of this chain, its errors taken as declared."""
         noise = reading_noise(self.errors, self.model, self.tip_mm, self.q_touch, known=True)
         points_base = apply(self.T_base_ct, self.points_ct)
         fit = fit_uncertainty(self.method, fit_triad, self.T_base_ct, self.points_ct, points_base, noise, found=False)
@@ -161,12 +161,12 @@ class Chain:
         return PoseError(self.model, self.tip_mm, target, self.errors, fit, bend)
 
     def tip_mean_square(self) -> Floats:
-        """Of the tip against the point that was meant, shape (3, 3), mm^2, base axes."""
+        """Mean square of the tip about the intended point, shape (3, 3), mm^2, base axes."""
         still = self.pose_error().tip_covariance(self.q_insertion[None])[0]
         return still if self.breath is None else still + self.breath.mean_square_base()
 
     def expected_mm(self) -> float:
-        """Tip against the point that was meant, rms."""
+        """Expected (rms) distance of the tip from the intended point, mm."""
         return float(np.sqrt(np.trace(self.tip_mean_square())))
 
     def with_errors(self, errors: ErrorModel) -> Chain:

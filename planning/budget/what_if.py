@@ -1,4 +1,4 @@
-"""What each source costs alone, and what other slices, markers, touches or another arm would leave of the error."""
+"""Cost of each error source alone, and what other slices, markers, touches or another arm would leave of the error."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from puncture_twin.planning.uncertainty.touch_choice import choose_touches
 SPACINGS_MM = (1.0, 2.0, 3.0, 5.0)
 MOST_MARKERS = 10
 CANDIDATES = 40
-"""Places of the skin that are tried for each further marker."""
+"""Places on the skin that are tried for each further marker."""
 
 APART_MM = 20.0
 """One more marker is no nearer than this to another."""
@@ -48,7 +48,7 @@ class SourceCost:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Something that could be done differently.
+    """One change of the chain, and the error that it would leave.
 
     Attributes:
         group: slices, markers, touches, arm, tip, needle or breath.
@@ -64,7 +64,7 @@ class Change:
 
 
 def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
-    """Every source, the dearest first; their squares alone add up to the whole's."""
+    """Cost of every source, the largest first; only the squares add up to the whole's."""
     outward_base = -flange_pose(chain.model, chain.q_insertion)[:3, 2]
     budget = error_budget(chain.pose_error(), chain.q_insertion, outward_base)
     squares = {source: budget.rms_mm**2 * part for source, part in budget.fraction.items()}
@@ -79,12 +79,12 @@ def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
 
 
 def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tuple[Change, ...]:
-    """What could be done differently, each alone.
+    """The changes of a chain, each alone.
 
     Args:
         chain: As it is.
         skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
-        bed_ct: Shape (3,), unit, across the CT's slices; None where nobody says, and slices are left out.
+        bed_ct: Shape (3,), unit, across the CT's slices; None where it is not stated, and slices are left out.
     """
     return (
         *([] if bed_ct is None else _slices(chain, bed_ct)),
@@ -97,9 +97,9 @@ def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tupl
     )
 
 
-def best_change(found: tuple[Change, ...]) -> Change:
+def best_change(options: tuple[Change, ...]) -> Change:
     """The one that leaves the least error."""
-    return min(found, key=lambda one: one.rms_mm)
+    return min(options, key=lambda one: one.rms_mm)
 
 
 def _slices(chain: Chain, bed_ct: Floats) -> Iterator[Change]:
@@ -112,7 +112,7 @@ def _slices(chain: Chain, bed_ct: Floats) -> Iterator[Change]:
 
 
 def _target(errors: ErrorModel, reading: Floats) -> Floats:
-    """The target is read in the same slices, unless it was declared by itself."""
+    """Chains in which the target is read in other slices too, unless it was declared by itself."""
     alike = np.array_equal(errors.target_cov_ct, errors.marker_cov_ct)
     return reading if alike else errors.target_cov_ct
 
@@ -164,7 +164,7 @@ def _gates(chain: Chain) -> Iterator[Change]:
 
 
 def _fewer_markers(chain: Chain) -> Iterator[Change]:
-    """Without the marker that is missed least, again and again down to three."""
+    """Fewer markers: without the one that costs least, again and again down to three."""
     found = []
     while len(chain.points_ct) > MIN_MARKERS:
         every = np.arange(len(chain.points_ct))
@@ -179,7 +179,7 @@ def _with_rows(chain: Chain, rows: Ints) -> Chain:
 
 
 def _more_markers(chain: Chain, skin_points_ct: Floats) -> Iterator[Change]:
-    """One more where it helps most, again and again; touched in the insertion's orientation."""
+    """More markers: one where it helps most, again and again; touched in the insertion's orientation."""
     points = skin_points_ct[:: max(1, len(skin_points_ct) // CANDIDATES)]
     q = _touch_like_insertion(chain, points)
     points, q = points[~np.isnan(q).any(axis=1)], q[~np.isnan(q).any(axis=1)]

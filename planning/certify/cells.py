@@ -77,7 +77,7 @@ class Cells:
 
         Args:
             radius: Of the cells, shape (n,), rad.
-            size: The angular diameter that is wanted, rad: where one half is about as small, no quarters are made.
+            size: The wanted angular diameter, rad: where one half is about as small, no quarters are made.
         """
         tall = self.theta[:, 1] - self.theta[:, 0]
         widest = np.clip(np.pi / 2, self.theta[:, 0], self.theta[:, 1])
@@ -89,7 +89,7 @@ class Cells:
         return np.where(wide > WIDEST_BETA / 2, "b", best)
 
     def take(self, rows: NDArray[np.int64] | Bools) -> Cells:
-        """Some of the cells."""
+        """Some of the cells, by rows."""
         return Cells(self.theta[rows], self.beta[rows])
 
     def cones(self, R_ct_entry: Floats) -> Cones:
@@ -103,7 +103,7 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Cones:
-    """What encloses n cells, in the CT frame.
+    """Cones that enclose n cells, in the CT frame.
 
     Attributes:
         centres: Shape (n, 3), unit, the middle of each cell.

@@ -1,9 +1,4 @@
-"""A certified map of a cap of directions, as a value and as a versioned file.
-
-How a certificate shows itself in a notebook.
-
-The safe cone of every safe candidate, as a column and a term of the ranking.
-"""
+"""A certified map of a cap of directions: the value, its versioned file, and the safe cone that it gives candidates."""
 
 from __future__ import annotations
 
@@ -76,10 +71,10 @@ CERTIFIED = (
 """The constraints that hold all over a safe cell."""
 
 TOUCH_CERTIFIED = "chance to touch each structure: at most {:g}"
-"""That too, where a chance was asked for; margins are then so wide that a cell is rejected for it."""
+"""Also certified where a chance was stated; margins are then so wide that a cell is rejected for it."""
 
 NOT_CERTIFIED = ("reach of the arm", "approach of the arm", "limits of chances (min_hit, max_touch)")
-"""What a certificate says nothing about."""
+"""Constraints that a certificate does not prove."""
 
 PROVED_SAFE, REJECTED, UNDECIDED = "SRU"
 """Letters of the leaves in the tree; lower-case letters are splits (`puncture_twin.planning.certify.cells.SPLITS`)."""
@@ -87,7 +82,7 @@ PROVED_SAFE, REJECTED, UNDECIDED = "SRU"
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Which directions are proven safe, which are proven not to be, and which cells are too small to say.
+    """A certified map: directions proven safe, proven rejected, and cells too small to decide.
 
     Attributes:
         question: What it answers.
@@ -123,7 +118,7 @@ class Certificate:
         return f"case {self.question.case_name}, {len(self.verdict):,} cells to {np.degrees(self.size):g} deg: {areas}"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
+        """HTML for a notebook."""
         return certificate_html(self)
 
     @cached_property
@@ -145,7 +140,7 @@ class Certificate:
         return found
 
     def safe_cone(self, outward_ct: Floats) -> Floats:
-        """By how much each direction may be off, in any direction, and still be proven safe; shape (n,), rad.
+        """Angle by which each direction may be off in any direction and still be proven safe, shape (n,), rad.
 
         0 for a direction in a cell that is not safe, or outside the cap: nothing is proven there.
 
@@ -341,7 +336,7 @@ def _range(values: Any) -> tuple[float, float]:
 
 
 UNDECIDED_COLOUR: Rgb = (255, 255, 255)
-"""Of cells that are too small to say: neither a safe colour nor a reason's."""
+"""Colour of cells that are too small to decide: neither a safe colour nor a reason's."""
 
 
 @never_raises

@@ -1,4 +1,4 @@
-"""Does a certificate hold? Plain numpy and FCL, cell by cell; nothing of what made the certificate is used.
+"""Independent check of a certificate: plain numpy and FCL, cell by cell, without any code that made the certificate.
 
 What a cell claims is proven from the surfaces by the lemmas of docs/concepts/certificate.md. A triangle that is proven
 clear of a cell is clear of its parts too, and what is true of the skin all over a cell is true all over its parts.
@@ -81,7 +81,7 @@ class _Cell:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What is proven all over a cell: which triangles may be near, the skin, where the flanges of waiting needles are.
+    """Facts proven all over a cell: triangles that may be near, the skin, the flanges of waiting needles.
 
     Those count along which a tip may wait; at least and at most so far from the target, mm.
     """
@@ -170,7 +170,7 @@ class _Checker:
         return Verification(*(int((self._certificate.verdict == letter).sum()) for letter in "SRU"))
 
     def _learn(self, cell: _Cell, whole: _Known) -> _Known:
-        """What is known of a cell beyond what is known of the whole that it is part of."""
+        """Facts of a cell beyond those of the whole that it is part of."""
         question = self._question
         if cell.rho > WIDEST:
             return whole
@@ -194,7 +194,7 @@ class _Checker:
         return organs[~_apart(self._organs[organs], limit, cell, length)]
 
     def _flange(self, skin: SkinFacts, known: tuple[float, float]) -> tuple[float, float]:
-        """Where the flanges are by the skin's facts, and by what was known before (lemma 9)."""
+        """Bounds of the flanges by the skin's facts, and by those known before (lemma 9)."""
         longest, largest = self._question.longest, self._question.max_skin_angle
         shallow, steep = max(skin.least_angle - ANGLE_PAD_RAD, 0.0), skin.largest_angle + ANGLE_PAD_RAD
         least = waiting_flange(self._needle, min(skin.least_skin, longest), min(shallow, largest))
@@ -218,7 +218,7 @@ class _Checker:
             raise InputError(what, where="certificate", allowed="claims that follow from the case")
 
     def _safe(self, known: _Known) -> bool:
-        """No structure comes near, and the skin is met once, soon enough and steeply enough."""
+        """Whether no structure comes near, and the skin is crossed once, soon enough and steeply enough."""
         lost = any(self._inside) or self._even
         return not lost and len(known.organs) == 0 and known.skin_good
 
@@ -284,17 +284,17 @@ def _apart(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools
     found |= _separated(corners, depth, limit, middle - (middle @ cell.u)[:, None] * cell.u, cell)
     found |= _before_own_plane(corners, limit, cell, length)
     rest = np.flatnonzero(~found) if cell.rho <= NEAR_BELOW else np.empty(0, np.int64)
-    beside = corners[rest] - depth[rest, :, None] * cell.u
-    edge = beside[:, [1, 2, 0]] - beside
-    part = -(beside * edge).sum(axis=2) / np.maximum((edge * edge).sum(axis=2), 1e-300)
-    feet = beside + np.clip(part, 0, 1)[:, :, None] * edge
+    shifted = corners[rest] - depth[rest, :, None] * cell.u
+    edge = shifted[:, [1, 2, 0]] - shifted
+    part = -(shifted * edge).sum(axis=2) / np.maximum((edge * edge).sum(axis=2), 1e-300)
+    feet = shifted + np.clip(part, 0, 1)[:, :, None] * edge
     for side in range(3):
         found[rest] |= _separated(corners[rest], depth[rest], limit[rest], feet[:, side], cell)
     return np.asarray(found)
 
 
 def _before_own_plane(corners: Floats, limit: Floats, cell: _Cell, length: Floats) -> Bools:
-    """Where every axis of the cell ends before the triangle's own plane, or leads away from it."""
+    """Which triangles every axis of the cell ends before, or leads away from."""
     normal = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     height = np.einsum("kci,ki->kc", corners, normal)
     side = np.where(height[:, :1] >= 0.0, 1.0, -1.0)
@@ -308,7 +308,7 @@ def _before_own_plane(corners: Floats, limit: Floats, cell: _Cell, length: Float
 
 
 def _separated(corners: Floats, depth: Floats, limit: Floats, aside: Floats, cell: _Cell) -> Bools:
-    """Where m·v <= 0 for every direction v of the cell and m·p >= limit for the corners p; m is ``aside``, tilted."""
+    """Whether m·v <= 0 for every direction v of the cell and m·p >= limit for the corners p; m is ``aside``, tilted."""
     normal, ahead = _unit(aside), cell.corners @ cell.u
     tilt = np.full(len(corners), np.tan(cell.rho))
     if ahead.min() > cell.bulge:

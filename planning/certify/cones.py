@@ -1,4 +1,4 @@
-"""Which triangles matter to which cone of directions: bounding cones, and lists that shrink from cell to part."""
+"""Bounding cones of triangles, and for every cell the list of triangles that may matter to it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Lists:
 
     @classmethod
     def one(cls, items: Ints) -> Lists:
-        """A single list."""
+        """Lists with a single list."""
         return cls(np.array([0, len(items)]), items)
 
     def take(self, rows: Ints) -> Lists:
@@ -56,7 +56,7 @@ def zones(corners: Floats, limit: Floats | float) -> Zones:
 
     Args:
         corners: Shape (m, 3, 3), mm from the target.
-        limit: Shape (m,) or a number; 0 for the directions that meet the triangle, mm.
+        limit: Shape (m,) or a number; 0 for the directions that hit the triangle, mm.
     """
     limits = np.ascontiguousarray(np.broadcast_to(np.asarray(limit, dtype=np.float64), len(corners)))
     return Zones(*_zones(np.ascontiguousarray(corners), limits, np.cos(ZONE_PAD_RAD), np.sin(ZONE_PAD_RAD)))

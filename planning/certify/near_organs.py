@@ -1,4 +1,4 @@
-"""Which cells of directions are clear of the organs, and which come too near, by planes and by convexity.
+"""Cells of directions against organs: which are clear, and which come too near, by planes and by convexity.
 
 docs/concepts/certificate.md, lemmas 2 to 4. No distance is needed to prove a cell clear: a plane that keeps a triangle
 at the limit from every axis of the cell is proof enough, however it was found.
@@ -24,7 +24,7 @@ SURELY_MIXED = np.radians(0.5)
 it is not safe, and at such a size another triangle rejects all of it in one case of a hundred."""
 
 HOPELESS = 0.6
-"""At a corner of a cell the axis is farther from a triangle beside it by about this part of the cone's radius at
+"""At a corner of a cell the axis is farther from a triangle next to it by about this part of the cone's radius at
 least: a triangle that is no witness by this estimate is not tried."""
 
 
@@ -47,7 +47,7 @@ class Organs:
 
 @dataclass(frozen=True, eq=False)
 class OrganFacts:
-    """What holds for every axis of n cells.
+    """Facts about organs that hold for every axis of n cells.
 
     Attributes:
         near: The triangles of which a cell is not proven clear; a cell without one is clear of all.
@@ -166,7 +166,7 @@ def _elsewhere(toward, cosine, sine, cos_radius, sin_radius):  # type: ignore[no
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _beside_cell(t, u, four, bulge, limit, pad, lengths, unlike):  # type: ignore[no-untyped-def]  # numba infers
-    """What a triangle is to a cell about u: clear of it or not; its `_corners`, where a witness is not too unlike.
+    """Relation of a triangle to a cell about u: clear of it or not; its `_corners`, where a witness is not too unlike.
 
     Last, by how much the line along u is farther from it than the limit.
     """
@@ -284,7 +284,7 @@ def _apart(t, n, u, four, bulge, limit, length):  # type: ignore[no-untyped-def]
 def _before_own_plane(t, four, bulge, limit, length, ahead):  # type: ignore[no-untyped-def]  # numba infers
     """Whether every axis of a cell ends at the limit or farther before the plane of a triangle, or leads away from it.
 
-    A large triangle (a table, where the image ends) lies beside the axis as a ray and across it as a line: no plane
+    A large triangle (a table, where the image ends) lies next to the axis as a ray and across it as a line: no plane
     along the axis helps. ``ahead`` is the least cosine between the cell's middle and its corners.
     """
     ax, ay, az = t[3] - t[0], t[4] - t[1], t[5] - t[2]

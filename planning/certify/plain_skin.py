@@ -21,7 +21,7 @@ EDGE_ON = 0.9e-10
 
 @dataclass(frozen=True, eq=False)
 class SkinFacts:
-    """What holds for every ray of one cone; see `puncture_twin.planning.certify.skin_cones.SkinBounds`."""
+    """Facts of the skin for every ray of a cone; see `puncture_twin.planning.certify.skin_cones.SkinBounds`."""
 
     count: int
     cut: bool
@@ -51,7 +51,7 @@ class PlainSkin:
         """Everything about the triangles ``rows`` over the cone of half-angle ``rho`` about ``u``, mm and rad.
 
         Args:
-            rows: Triangles among which are all that the cone meets.
+            rows: Triangles among which are all that the cone intersects.
             u: Shape (3,), unit.
             rho: Less than π/2.
             ray: Shape (3,), a direction inside the cell.
@@ -64,7 +64,7 @@ class PlainSkin:
         hit = ((edges.min(axis=0) <= rho) | (_pierced(self.corners[rows], u) == 1)) & (near <= length)
         rows, near, far, edges = rows[hit], near[hit], far[hit], edges[:, hit]
         pierced = _pierced(self.corners[rows], ray)
-        touched = np.less_equal(edges, rho).T  # which edges the cone meets
+        touched = np.less_equal(edges, rho).T  # which edges the cone intersects
         changes = (far >= length) | (self._folds[rows] & touched).any(axis=1) | (pierced < 0)
         bare = ~self.cut[rows]
         entry = bare & (near <= longest)
@@ -85,11 +85,11 @@ class PlainSkin:
         matrix = np.einsum("nci,ncj->nij", self._normals[rows], opposite)
         middle = matrix @ u
         size = np.linalg.norm(middle, axis=1)
-        q = middle / np.where(size > 0, size, 1.0)[:, None]
+        q = middle / np.where(size > 0, size, 1.0)[:, None]  # unit normal along the cone's axis
         along = np.einsum("ni,nij->nj", q, matrix)
         aside = np.linalg.norm(matrix - q[:, :, None] * along[:, None, :], axis=(1, 2))
         chord = 2 * np.sin(rho / 2)
-        rest = size - np.linalg.norm(along, axis=1) * chord
+        rest = size - np.linalg.norm(along, axis=1) * chord  # M v along q is at least this
         spread = np.where(rest > 0, np.arctan2(aside * chord, np.maximum(rest, 0)) + rho, np.pi)
         angle = np.arccos(np.clip(np.abs(q @ u), 0, 1))
         return np.maximum(angle - spread, 0.0), np.minimum(angle + spread, np.pi / 2)
@@ -116,7 +116,7 @@ def _folds(mesh: TriangleMesh, corners: Floats) -> Bools:
     for face, s in zip(faces, sign.tolist(), strict=True):
         if len(set(face)) == 3:
             for p, q in zip(face, face[1:] + face[:1], strict=True):
-                sides[min(p, q), max(p, q)].append(s if p < q else -s)
+                sides[min(p, q), max(p, q)].append(s if p < q else -s)  # seen from one end to the other
     regular = {edge for edge, found in sides.items() if sorted(found) == [-1, 1]}
     return np.array(
         [
@@ -127,18 +127,18 @@ def _folds(mesh: TriangleMesh, corners: Floats) -> Bools:
 
 
 def _depths(corners: Floats, u: Floats, rho: float) -> tuple[Floats, Floats]:
-    """Least and largest depth at which rays of the cone can meet each triangle: by its plane, and by its corners."""
+    """Least and largest depth at which rays of the cone can hit each triangle: by its plane, and by its corners."""
     farthest = np.linalg.norm(corners, axis=2).max(axis=1)
     centre = corners.mean(axis=1)
     nearest = np.linalg.norm(centre, axis=1) - np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
-    flat = area > 1e-12 * farthest**2
+    flat = area > 1e-12 * farthest**2  # a triangle without area has no plane
     normal = normal / np.where(flat, area, 1.0)[:, None]
     height = np.einsum("ij,ij->i", normal, corners[:, 0])
     angle = np.arccos(np.clip(np.where(height < 0, -1, 1) * (normal @ u), -1, 1))
     height = np.abs(height)
-    steep = np.maximum(angle - rho, 0.0)
+    steep = np.maximum(angle - rho, 0.0)  # the ray of the cone that is most square to the plane
     near = np.where(flat & (steep < np.pi / 2), height / np.maximum(np.cos(steep), 1e-12), 0.0)
     shallow = angle + rho
     far = np.where(flat & (shallow < np.pi / 2 - 1e-3), height / np.maximum(np.cos(shallow), 1e-4), np.inf)
@@ -153,7 +153,7 @@ def _edge_angle(p: Floats, q: Floats, u: Floats) -> Floats:
     ends = np.minimum(_to(p / lp[:, None], u), _to(q / lq[:, None], u))
     normal = np.cross(p, q)
     area = np.linalg.norm(normal, axis=1)
-    arc = area > 1e-9 * lp * lq
+    arc = area > 1e-9 * lp * lq  # else the two ends are one direction, or opposite ones
     between = arc & (np.cross(normal, p) @ u >= 0) & (np.cross(q, normal) @ u >= 0)
     aside = np.arcsin(np.minimum(np.abs(normal @ u) / np.where(arc, area, 1.0), 1.0))
     opposite = ~arc & (np.einsum("ij,ij->i", p, q) < 0)
@@ -161,7 +161,7 @@ def _edge_angle(p: Floats, q: Floats, u: Floats) -> Floats:
 
 
 def _to(directions: Floats, u: Floats) -> Floats:
-    return 2 * np.arcsin(np.minimum(np.linalg.norm(directions - u, axis=1) / 2, 1.0))
+    return 2 * np.arcsin(np.minimum(np.linalg.norm(directions - u, axis=1) / 2, 1.0))  # exact near 0
 
 
 def _pierced(corners: Floats, ray: Floats) -> Ints:
@@ -169,10 +169,10 @@ def _pierced(corners: Floats, ray: Floats) -> Ints:
     a, b, c = np.moveaxis(corners, 1, 0)
     weights = np.stack([np.cross(b, c) @ ray, np.cross(c, a) @ ray, np.cross(a, b) @ ray], axis=1)
     lengths = np.linalg.norm(corners, axis=2)
-    doubt = 1e-11 * np.roll(lengths, -1, axis=1) * np.roll(lengths, -2, axis=1)
-    left, right = (weights > doubt).any(axis=1), (weights < -doubt).any(axis=1)
+    rounding = 1e-11 * np.roll(lengths, -1, axis=1) * np.roll(lengths, -2, axis=1)
+    left, right = (weights > rounding).any(axis=1), (weights < -rounding).any(axis=1)
     ahead = np.einsum("nc,nci,i->n", weights, corners, ray)
     found = np.where((ahead > 0) == left, 1, 0)
-    found[(np.abs(weights) <= doubt).any(axis=1)] = -1
+    found[(np.abs(weights) <= rounding).any(axis=1)] = -1
     found[left & right] = 0
     return found

@@ -1,4 +1,4 @@
-"""What a certificate answers: everything but the surfaces that a verdict depends on."""
+"""The question that a certificate answers: everything but the surfaces that a verdict depends on."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Question:
     touch: float | None = None
 
     def cap(self) -> Cells:
-        """The whole cap as one cell."""
+        """The whole cap of directions as one cell."""
         return Cells(np.array([self.theta], float), np.array([self.beta], float))
 
 

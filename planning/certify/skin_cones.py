@@ -1,4 +1,4 @@
-"""What every ray of a cone meets of the skin: bounds over all crossings, and their number where it is the same for all.
+"""Skin crossings of all rays of a cone: bounds on depth and angle, and their number where it is the same for all.
 
 docs/concepts/certificate.md derives each bound; `puncture_twin.planning.certify.checker` has the lemmas in plain form.
 """
@@ -16,7 +16,7 @@ from puncture_twin.planning.certify.cones import Lists
 from puncture_twin.planning.certify.skin_surface import SkinSurface
 
 CONE_PAD_RAD = 3e-7
-"""Widens every cone: the search turns a ray that meets an edge by 1e-7, and angles round to 1e-8."""
+"""Widens every cone: the search turns a ray that hits an edge by 1e-7, and angles round to 1e-8."""
 
 LENGTH_PAD_MM = 1e-5
 """Widens every depth: rounding at a metre is 1e-10, and crossings within 1e-6 mm are one."""
@@ -31,8 +31,8 @@ class SkinBounds:
 
     Attributes:
         count: Shape (n,), crossings within the needle's length, the same for all rays; -1 where that is not proven.
-        cut: Shape (n,), whether a triangle that is not skin may be met within the needle's length.
-        least_skin: Shape (n,), no skin is met at a smaller depth; inf where none is met within the range.
+        cut: Shape (n,), whether a triangle that is not skin may be hit within the needle's length.
+        least_skin: Shape (n,), no skin is hit at a smaller depth; inf where none is hit within the range.
         farthest: Shape (n,), no crossing within the needle's length is deeper.
         least_angle, largest_angle: Shape (n,), bounds of the angle to the normal at every skin crossing that is no
             deeper than the longest path.
@@ -126,7 +126,7 @@ def _bound(  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True)
 def _depths(a, b, c, u, rho, nearest, farthest):  # type: ignore[no-untyped-def]  # numba infers
-    """Least and largest depth at which a ray of the cone may meet the triangle."""
+    """Least and largest depth at which a ray of the cone may hit the triangle."""
     normal = _cross(_minus(b, a), _minus(c, a))
     area = np.sqrt(_dot(normal, normal))
     if area <= 1e-12 * farthest * farthest:

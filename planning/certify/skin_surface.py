@@ -1,4 +1,4 @@
-"""The skin as seen from one target: what a cone of directions needs to know of each of its triangles."""
+"""The skin as seen from one target: the data of each triangle that bounds over cones of directions need."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ EDGE_ON = 1e-10
 """A triangle whose solid angle's determinant is below this, relative to its corners' lengths, is seen edge-on."""
 
 RAYS, SEED = 5, 11
-"""Directions that vote on parity, always the same: a regular direction meets the edges of surfaces made on a grid."""
+"""Directions that vote on parity, always the same: a regular direction hits the edges of surfaces made on a grid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class SkinSurface:
         fold: Shape (m, 3), whether the number of crossings may change where a ray passes the edge from corner i to
             i + 1: it is not shared by exactly two triangles that lie on its two sides as seen from the target.
         cut: Shape (m,), triangles that are not skin.
-        zones: The directions that meet each triangle.
+        zones: The directions that hit each triangle.
         odd: Whether a ray crosses the surface an odd number of times; True for an open one, where it means nothing.
     """
 
@@ -137,14 +137,14 @@ def _side(corners):  # type: ignore[no-untyped-def]  # numba infers
 
 
 def _leaves_oddly(corners: Floats) -> bool:
-    """Whether most of some random rays cross a closed surface an odd number of times; one of them may meet an edge."""
+    """Whether most of some random rays cross a closed surface an odd number of times; one of them may hit an edge."""
     rays = np.random.default_rng(SEED).normal(size=(RAYS, 3))
     return 2 * sum(bool(_crosses_odd(corners, ray)) for ray in rays) > RAYS
 
 
 @nb.njit(cache=True)
 def _crosses_odd(corners, ray):  # type: ignore[no-untyped-def]  # numba infers
-    """Parity of one ray's crossings; where it meets an edge, the edge's triangles are missed."""
+    """Parity of one ray's crossings; where it hits an edge, the edge's triangles are missed."""
     odd = False
     for i in range(len(corners)):
         a, b, c = corners[i, 0], corners[i, 1], corners[i, 2]

@@ -100,7 +100,7 @@ def certify(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """What n cells know from the cells that they are parts of.
+    """Knowledge of n cells, inherited from the cells that they are parts of.
 
     Attributes:
         parent: Shape (n,), row of each cell's lists.
@@ -119,7 +119,7 @@ class _State:
     flange: Floats
 
     def of(self, rows: Ints) -> _State:
-        """For parts of the cells ``rows``."""
+        """The state of parts of the cells ``rows``."""
         known = self.witness[:, rows], self.skin_good[rows], self.flange[rows]
         return _State(self.parent[rows], self.skin, self.organs, *known)
 
@@ -162,7 +162,7 @@ class _Evaluator:
         self._inside = [_is_inside(s.mesh, question.target_ct) for s in demanding]
 
     def start(self) -> _State:
-        """What the whole cap knows: nothing, but which triangles a needle can come to at all."""
+        """State of the whole cap: only which triangles a needle can come to at all."""
         farthest = self._question.farthest + LENGTH_PAD_MM
         near = [one.limits.max(initial=0.0) + farthest for one in self._organs]
         organs = [
@@ -191,7 +191,7 @@ class _Evaluator:
         return replace(verdicts, state=replace(known, organs=(within, around)))
 
     def _near(self, part: int, verdicts: _Verdicts, cones: Cones, state: _State, lengths: Floats) -> Lists:
-        """Structures within the body (0) or outside of it (1): reject cells by them, and what of them matters."""
+        """Reject cells by structures within the body (0) or outside of it (1); the lists that matter to their parts."""
         witness, pad = state.witness[part], CLEARANCE_PAD_MM
         found = organ_facts(
             self._organs[part], state.organs[part], state.parent, witness, cones, lengths, wide=MEASURE_BELOW, pad=pad
@@ -210,7 +210,7 @@ class _Evaluator:
         return np.array([*self._question.structures, ""], dtype=np.str_)[column], face
 
     def _all_rejected(self, state: _State) -> _Verdicts:
-        """The target lies in a structure to avoid, or no ray leaves the skin as it must."""
+        """Whether the target lies in a structure to avoid, or no ray leaves the skin as it must."""
         verdicts = _Verdicts.none(state)
         everywhere = np.ones(len(state.parent), bool)
         if any(self._inside):

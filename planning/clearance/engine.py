@@ -1,8 +1,7 @@
-"""What a clearance engine answers: the one interface between the search and whoever measures.
+"""The interface of clearance engines, and needle-to-organ clearance by whichever engine measures.
 
-Clearance of every candidate to every structure, and FCL's verdict on each.
-
-From where needle axes are nearest to surfaces: unit vectors, from the triangles that a search has found.
+An engine is prepared for surfaces once and measures from any target; `measure` adds the verdict at margins, where FCL
+decides ties, and `normals_of` the unit vectors from the nearest triangles.
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats, Ints, Ints32
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.blocks import Blocks
-from puncture_twin.planning.geometry.containment import holds
+from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.triangle_distance import nearest_point
 
 
 @dataclass(frozen=True, eq=False)
 class AxisDistances:
-    """How far needle axes are from structures, mm.
+    """Distances of n needle axes from k structures, mm.
 
     Attributes:
-        distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they meet.
+        distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they intersect.
         depth: Shape (n, k), distance from the target, along the axis, of the axis point nearest to the structure;
-            where they meet, of the first meeting point.
+            where they intersect, of the first point of intersection.
         nearest: Shape (n, k), a triangle of the structure that is as near, a row of the engine's `triangles`.
     """
 
@@ -39,12 +38,12 @@ class AxisDistances:
     nearest: Ints32
 
     def at(self, rows: Ints) -> AxisDistances:
-        """Those of some axes."""
+        """The distances of some axes."""
         return AxisDistances(self.distance[rows], self.depth[rows], self.nearest[rows])
 
 
 class ClearanceEngine(Protocol):
-    """Prepared once for a set of surfaces, wanted any target.
+    """A clearance engine: prepared once for a set of surfaces, it measures from any target.
 
     An engine sees surfaces only. That a needle lies wholly inside a closed surface is the caller's to find, and is
     decided by the target alone, because every axis starts there (see `puncture_twin.planning.clearance.engine`).
@@ -52,12 +51,12 @@ class ClearanceEngine(Protocol):
 
     @property
     def triangles(self) -> tuple[Floats, ...]:
-        """Of each structure, shape (m, 9), corners in rows, mm: what `AxisDistances.nearest` counts."""
+        """Triangles of each structure, shape (m, 9), corners in rows, mm: the rows of `AxisDistances.nearest`."""
         ...
 
     @property
     def blocks(self) -> tuple[Blocks, ...]:
-        """Of each structure: among them `near_faces` finds what a displaced needle can meet."""
+        """Packed blocks of each structure, in which `near_faces` finds what a displaced needle can touch."""
         ...
 
     def measure(
@@ -66,12 +65,12 @@ class ClearanceEngine(Protocol):
         """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3).
 
         ``length`` is one number, shape (k,) or (n, k), mm: as long is an axis for each structure. The arrays are the
-        caller's to change. Without ``shown`` no progress is told: the same axes are tested again.
+        caller's to change. Without ``shown`` no progress is reported: the same axes are tested again.
         """
         ...
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
-        """FCL's own word on whether a capsule of this radius about one axis (3,) touches one structure."""
+        """Whether FCL finds a capsule of this radius about one axis (3,) in contact with one structure."""
         ...
 
     def of(self, columns: Ints) -> ClearanceEngine:
@@ -117,7 +116,7 @@ def too_near(
 
 @dataclass(frozen=True, eq=False)
 class Clearances:
-    """Needle to organ, for n candidates and k structures; mm.
+    """Clearances of n candidates from k structures; mm.
 
     Attributes:
         clearance: Shape (n, k), axis distance minus needle radius, never below minus the radius.
@@ -140,7 +139,7 @@ def measure(
     radius: float,
     axes: AxisDistances | None = None,
 ) -> Clearances:
-    """Measure all candidates.
+    """Measure the clearance of all candidates, with the verdict at each margin.
 
     Every axis starts at the target: where the target lies inside a closed structure, the whole axis is inside it or
     crosses its surface, and the distance is 0 whatever the surfaces say.
@@ -162,7 +161,7 @@ def measure(
         distance, depth = axes.distance.copy(order="K"), axes.depth.copy(order="K")  # a structure's row by row
     violated = np.zeros_like(distance, bool)
     for column, structure in enumerate(structures):
-        if holds(structure.mesh, target_ct):
+        if contains(structure.mesh, target_ct):
             distance[:, column] = depth[:, column] = 0.0
         if structure.demands_margin:
             limit = radius + structure.margin_mm
@@ -174,7 +173,7 @@ def measure(
 
 
 def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
-    """Of n axes and k surfaces, shape (n, k, 3): unit, from the surface to the axis; NaN where they meet.
+    """Unit vectors from each surface to each axis, shape (n, k, 3); NaN where they intersect.
 
     Nothing is searched again. Where several points of a surface are equally near, it is any one of them.
 

@@ -1,12 +1,8 @@
 """The fast engine: exact distances of all needle axes at once, from surfaces packed once and placed about a target.
 
-Directions in bundles: neighbours on the sphere share one walk through the tree.
-
-The order of each surface's triangles in its blocks, kept: to find it takes half of the time of packing.
-
-One surface as seen from one target.
-
-The faces of a structure near one needle axis: all that a small displacement of the needle can meet.
+Directions are measured in bundles: neighbours on the sphere go through the tree together. The order of a surface's
+triangles in its blocks is cached (it takes half of the packing's time). `near_faces` gives the faces that a slightly
+displaced needle can touch.
 """
 
 from __future__ import annotations
@@ -46,7 +42,7 @@ FCL_BEYOND_MM = 1.0
 """Farther from a capsule FCL sees nothing: its tolerance is 1e-6 mm, and the bounds' rounding 1e-5 mm."""
 
 MOST_THREADS = 16
-"""More were never tried."""
+"""Threads at most: more were never tried."""
 
 PIECE_TRIANGLES = 20_000
 """A structure is searched in two pieces and one more for every so many triangles, each with its share of the
@@ -63,7 +59,7 @@ LONGEST_MM = 1e9
 class FastEngine:
     """Exact distances by bundles of directions over trees of discs; FCL where a verdict hangs on rounding.
 
-    Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, wanted any
+    Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, measured from any
     target.
 
     Args:
@@ -93,12 +89,12 @@ class FastEngine:
 
     @property
     def triangles(self) -> tuple[Floats, ...]:
-        """Of each structure, in blocks; see `ClearanceEngine`."""
+        """Triangles of each structure, in blocks; see `ClearanceEngine`."""
         return tuple(blocks.triangles for blocks in self._blocks)
 
     @property
     def blocks(self) -> tuple[Blocks, ...]:
-        """Of each structure; see `ClearanceEngine`."""
+        """Packed blocks of each structure; see `ClearanceEngine`."""
         return self._blocks
 
     def measure(
@@ -123,7 +119,7 @@ class FastEngine:
     def _pieces(
         self, target: Floats, outward: Floats, lengths: Floats, answer: AxisDistances
     ) -> list[tuple[Tiles, Blocks, PlacedSurface, Floats, AxisDistances]]:
-        """What `measure_structure` is given in turn: the largest structures first, in runs of directions.
+        """Arguments of each `measure_structure`: the largest structures first, in runs of directions.
 
         Here rows of ``answer`` are structures.
         """
@@ -136,7 +132,7 @@ class FastEngine:
         return pieces
 
     def _seen_from(self, target: Floats) -> tuple[PlacedSurface, ...]:
-        """The surfaces as seen from a target; those of the last target are kept."""
+        """The surfaces as seen from a target; those of the last target are cached."""
         if self._seen is None or not np.array_equal(self._seen[0], target):
             self._seen = (target.copy(), tuple(placed_surface(blocks, target) for blocks in self._blocks))
         return self._seen[1]
@@ -144,7 +140,7 @@ class FastEngine:
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`.
 
-        FCL is asked about the triangles near the axis alone, which is what it answers of all of them: a surface touches
+        FCL is queried for the triangles near the axis alone, with the same result as for all of them: a surface touches
         a capsule where one of its triangles does, FCL tests each triangle by itself, and one that is farther from the
         axis than the radius by more than FCL's tolerance it calls free. `near_faces` leaves out no block whose distance
         from the axis is, by its lower bound, within the radius and `FCL_BEYOND_MM`.
@@ -184,7 +180,7 @@ def _packed(meshes: Sequence[TriangleMesh], threads: int, cache: Cache) -> tuple
 
 
 def _remembered(meshes: Sequence[TriangleMesh], memory: Memory) -> tuple[Blocks, ...]:
-    """The same, those that an earlier case packed taken from memory."""
+    """The surfaces packed, those that an earlier case packed taken from memory."""
     return tuple(
         memory.get((__name__, mesh.digest), partial(pack, mesh), lambda blocks: blocks.nbytes) for mesh in meshes
     )
@@ -240,7 +236,7 @@ CHORD_SLACK = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Tiles:
-    """Directions in an order in which neighbours follow each other, cut into bundles.
+    """Bundles of directions, ordered so that neighbours follow each other.
 
     Attributes:
         order: Shape (n,), row of each direction in the caller's order.
@@ -257,7 +253,7 @@ class Tiles:
     chord: Floats
 
     def parts(self, most: int) -> list[Tiles]:
-        """The same bundles in at most so many runs of about as many each, none below ``LEAST_BUNDLES``."""
+        """The bundles in at most so many runs of about as many each, none below ``LEAST_BUNDLES``."""
         count = max(1, min(most, len(self.middle) // LEAST_BUNDLES))
         edges = np.linspace(0, len(self.middle), count + 1).astype(int)
         return [self._run(low, high) for low, high in itertools.pairwise(edges)]
@@ -350,7 +346,7 @@ def _found(meshes: Sequence[TriangleMesh], threads: int) -> Arrays:
 
 
 def _of_each(counts: Sequence[int], stored: Arrays) -> tuple[Order, ...]:
-    """The order of each surface.
+    """The block order of each surface.
 
     Raises:
         KeyError, TypeError, ValueError: One leaves out a triangle, which the search would never see then.
@@ -370,7 +366,7 @@ def _of_each(counts: Sequence[int], stored: Arrays) -> tuple[Order, ...]:
 
 
 COORDINATE_SLACK = 1e-6
-"""Share of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
+"""Fraction of a coordinate by which float32 arithmetic of a few terms may err: 8 times its rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -399,7 +395,7 @@ def placed_surface(blocks: Blocks, target: Floats) -> PlacedSurface:
 
 @dataclass(frozen=True, eq=False)
 class NearFaces:
-    """Faces of one structure, and spheres around them; CT frame, mm.
+    """The faces of a structure near one needle axis, which a small displacement could touch; CT frame, mm.
 
     Attributes:
         triangles: Shape (m, 9), corners, in blocks of 16, those that may be nearest first.
@@ -415,7 +411,7 @@ class NearFaces:
         return len(self.triangles)
 
     def distance(self, origins_ct: Floats, outward_ct: Floats, length: float) -> Floats:
-        """Of axes from ``origins_ct`` (n, 3) along ``outward_ct`` (n, 3) from these faces, shape (n,), mm."""
+        """Distances (n,), mm, of axes from ``origins_ct`` (n, 3) along ``outward_ct`` (n, 3) to these faces."""
         found = np.empty(len(origins_ct))
         origins, outward = (np.ascontiguousarray(rows, dtype=np.float64) for rows in (origins_ct, outward_ct))
         displaced_distances(self.triangles, self.faces, self.blocks, origins, outward, float(length), found)

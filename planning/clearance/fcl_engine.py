@@ -1,6 +1,6 @@
-"""The reference engine: FCL, one query per direction and structure. Slow, plain, and right by definition.
+"""The reference engine, and the cross-check against it: FCL, one query per direction and structure.
 
-A second opinion: some directions measured again by plain FCL, and every difference named.
+It is slow, plain and right by definition. `cross_check` measures some directions again and names every difference.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class FclEngine:
 
     @property
     def triangles(self) -> tuple[Floats, ...]:
-        """Of each structure, as its mesh has them; see `ClearanceEngine`."""
+        """Triangles of each structure, as its mesh has them; see `ClearanceEngine`."""
         return tuple(mesh.vertices[mesh.faces].reshape(-1, 9) for mesh in self._meshes)
 
     @property
     def blocks(self) -> tuple[Blocks, ...]:
-        """Of each structure, packed anew: FCL itself needs none; see `ClearanceEngine`."""
+        """Packed blocks of each structure, made anew: FCL itself needs none; see `ClearanceEngine`."""
         return tuple(pack(mesh) for mesh in self._meshes)
 
     def measure(
@@ -72,7 +72,7 @@ class FclEngine:
         return AxisDistances(distance, depth, nearest)
 
     def distances(self, target_ct: Floats, outward_ct: Floats, length: float) -> Floats:
-        """Of one axis from all k structures, shape (k,), 0 on contact: `measure` without where it is nearest."""
+        """Distances of one axis from all k structures, shape (k,), mm, 0 on contact; no nearest points."""
         found = self._one_direction(target_ct, outward_ct, np.full(len(self._objects), length))[0]
         return np.maximum(np.array(found, dtype=np.float64), 0.0)
 
@@ -106,7 +106,7 @@ class FclEngine:
 
 
 def capsule_touches_any(triangles: Floats, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
-    """FCL's word on whether a capsule touches any of some triangles (m, 9), mm; otherwise as `FclEngine.collides`."""
+    """Whether FCL finds a capsule in contact with any of some triangles (m, 9), mm; see `FclEngine.collides`."""
     corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3)
     surface = fcl.CollisionObject(_tree(corners, np.arange(len(corners)).reshape(-1, 3)))
     return _capsule_touches(surface, target_ct, outward_ct, length, radius)

@@ -1,20 +1,10 @@
-"""One body of an arm as FCL objects that move with the joints.
+"""Bodies of the arm for FCL and for bounds: links and tool as convex pieces, bare and padded, and spheres around them.
 
-The bodies of an arm with its tool: links and tool of convex pieces, bare and padded; holder and needle.
-
-A shape of a body that FCL builds when it is first asked about it.
-
-Meshes as FCL sees them: surfaces, solids, and whether two of them touch.
-
-Prisms about cylinders.
-
-Spheres in a tree that enclose a body: what is clear of them is clear of the body.
-
-A sphere is convex, so it contains the convex hull of any points in it. A convex piece is cut by planes into smaller
-ones; the corners of each part are the piece's corners on that side and the points where its edges cross the plane;
-a sphere about those corners contains the part, and the parts together are the piece (docs/concepts/arm-collisions.md).
-
-The connected parts of a surface, and whether one lies within a convex piece, where surfaces do not touch.
+`arm_bodies` makes all of them; a `Solid` is built by FCL when it is first queried. A `SphereTree` encloses a body: what
+is clear of its spheres is clear of the body. A sphere is convex, so it contains the convex hull of any points in it.
+A convex piece is cut by planes; the corners of a part are the piece's corners on that side and the points where its
+edges cross the plane; a sphere about those corners contains the part (docs/concepts/arm-collisions.md).
+Where surfaces do not touch, `LooseParts` tells whether a part of one lies within a convex piece.
 """
 
 from __future__ import annotations
@@ -110,21 +100,21 @@ class Body:
 
     @property
     def hollow(self) -> bool:
-        """Whether FCL sees no more than its surface against the skin."""
+        """Whether FCL sees only its surface when it is tested against the skin."""
         return self.full.surface not in self.full.solids
 
     @cached_property
     def half_spaces(self) -> tuple[Floats, ...]:
-        """Of each piece of ``full`` the half spaces whose intersection it is, (m, 4), in the frame of the shapes."""
+        """Half spaces (m, 4) of each piece of ``full``, whose intersection it is, in the frame of the shapes."""
         return tuple(half_spaces(corners) for corners in self.full.hulls)
 
     def pose(self, poses: Floats) -> fcl.Transform:
-        """Where ``link_poses`` (7, 4, 4) has the body's shapes."""
+        """Pose of the body's shapes where ``link_poses`` (7, 4, 4) has its link."""
         T = poses[self.frame] @ self.T_frame_body
         return fcl.Transform(T[:3, :3], T[:3, 3])
 
     def place(self, poses: Floats) -> None:
-        """Move the shapes to where ``link_poses`` (7, 4, 4) has them."""
+        """Move the shapes with ``link_poses`` (7, 4, 4)."""
         transform = self.pose(poses)
         for shape in (self.bare,) if self.full is self.bare else (self.bare, self.full):
             for item in (*shape.solids, shape.surface):
@@ -189,8 +179,8 @@ def padded_links(links: Sequence[Link], padding_mm: float) -> tuple[Link, ...]:
     def grown() -> Arrays:
         return packed_meshes([padded(piece, padding_mm) for piece in pieces])
 
-    kept = user_cache().arrays(made_from, grown, by=__name__, check=unpacked_meshes)
-    following = iter(unpacked_meshes(kept))
+    cached = user_cache().arrays(made_from, grown, by=__name__, check=unpacked_meshes)
+    following = iter(unpacked_meshes(cached))
     return tuple(Link(link.name, link.frame, tuple(islice(following, len(link.pieces)))) for link in links)
 
 
@@ -199,10 +189,10 @@ class Solid:
 
     Args:
         make: Makes its geometry, mm.
-        pose: Where it stands at first.
+        pose: Its first pose.
 
     Attributes:
-        pose: Where it stands.
+        pose: Its new pose.
     """
 
     def __init__(self, make: Callable[[], fcl.CollisionGeometry], pose: fcl.Transform | None = None) -> None:
@@ -211,7 +201,7 @@ class Solid:
 
     @cached_property
     def made(self) -> fcl.CollisionObject:
-        """The shape where it stands, and wherever it is placed from now on."""
+        """The FCL object where the shape is now; it moves with `place`."""
         return fcl.CollisionObject(self._make(), self.pose)
 
     def place(self, pose: fcl.Transform) -> None:
@@ -222,7 +212,7 @@ class Solid:
 
 
 def touch(a: fcl.CollisionObject, b: fcl.CollisionObject) -> bool:
-    """A fresh result for every question: a reused one keeps its old hit."""
+    """Whether two FCL objects touch; a fresh result each time, since a reused one keeps its old hit."""
     return bool(fcl.collide(a, b, fcl.CollisionRequest(), fcl.CollisionResult()))
 
 
@@ -253,17 +243,17 @@ def padded(mesh: TriangleMesh, padding_mm: float) -> TriangleMesh:
 
 
 PRISM_SIDES = 24
-"""Of the prism about a cylinder: 0.9 % fuller than it."""
+"""Sides of the prism about a cylinder: 0.9 % fuller than it."""
 
 
 FINE_SIDES = 96
-"""Of the prism about a cylinder that is held against triangles: 0.05 % fuller than it."""
+"""Sides of the prism about a cylinder that is tested against triangles: 0.05 % fuller than it."""
 
 
 def prism(radius_mm: float, length_mm: float, sides: int = PRISM_SIDES) -> Floats:
     """Corners of a prism about a cylinder along z, centred: shape (2 ``sides``, 3), mm; those of one end first."""
     turn = 2.0 * np.pi * np.arange(sides) / sides
-    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / sides)
+    outer = (radius_mm + SLACK_MM) / np.cos(np.pi / sides)  # circumscribed: encloses the circle
     ring = outer * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     half = length_mm / 2.0 + SLACK_MM
     return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
@@ -279,7 +269,7 @@ SLACK_MM = 1e-6
 """Every sphere is larger by this: covers the rounding of cuts and of the hull's edges (about 1e-12 mm)."""
 
 CENTRE_STEPS = 25
-"""Of the walk to a sphere's centre; how good it is decides how tight the sphere is, never whether it encloses."""
+"""Steps of the walk to a sphere's centre; how good it is decides how tight the sphere is, never whether it encloses."""
 
 LEAF_RADIUS_MM = 30.0
 """Parts are cut until their sphere is no larger: half of a UR3 wrist's size."""
@@ -301,7 +291,7 @@ def enclosing_sphere(points: Floats) -> BoundingSphere:
 
 @nb.njit(cache=True)
 def _walk_to_centre(points, steps, best):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``best`` (3,) with the best centre met for points (n, 3); the radius that it needs."""
+    """Fill ``best`` (3,) with the best centre visited for points (n, 3); the radius that it needs."""
     x, y, z = [(points[:, i].min() + points[:, i].max()) / 2.0 for i in range(3)]
     least = math.inf
     for step in range(1, steps + 1):
@@ -391,13 +381,13 @@ class LooseParts(NamedTuple):
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> LooseParts:
-        """Of a mesh that has been checked."""
+        """The connected parts of a checked mesh."""
         points, begins = _in_parts(mesh)
         sizes = np.maximum.reduceat(points, begins) - np.minimum.reduceat(points, begins)
         return cls(points[begins], sizes)
 
     def no_larger_than(self, mm: float) -> LooseParts:
-        """Those about which a box is not longer than that from corner to corner."""
+        """The parts whose box has a diagonal no longer than that."""
         small = np.linalg.norm(self.sizes, axis=1) <= mm
         return LooseParts(self.corners[small], self.sizes[small])
 
@@ -411,7 +401,7 @@ def connected_parts(mesh: TriangleMesh) -> list[Floats]:
 def _in_parts(mesh: TriangleMesh) -> tuple[Floats, Ints]:
     """Corners part by part, and where each part begins; faces are connected where they share a corner."""
     count = len(mesh.vertices)
-    used = np.flatnonzero(np.bincount(mesh.faces.ravel(), minlength=count))
+    used = np.flatnonzero(np.bincount(mesh.faces.ravel(), minlength=count))  # corners without a face are no part
     starts, ends = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
     links = scipy.sparse.coo_array((np.ones(len(starts), np.int8), (starts, ends)), shape=(count, count))
     part = scipy.sparse.csgraph.connected_components(links, directed=False)[1][used]

@@ -1,9 +1,9 @@
-"""What the arm may touch: collision answers of FCL for an arm with its needle, the patient's skin and the room.
+"""The reference collision checker: FCL for an arm with its needle against the patient's skin and the workcell.
 
 FCL sees the surfaces of triangle meshes, not their insides. Links, holder, needle and boxes are therefore solid
 convex shapes here, and two of them never hide in one another. The skin is a triangle mesh, and the arm cannot hide in
-it either: neighbouring bodies of the chain overlap (a test holds this), the base stands outside (checked once), so if
-no body meets a closed skin every body is on the base's side of it. For an open skin there is no inside, and only its
+it either: neighbouring bodies of the chain overlap (a test holds this), the base is outside (checked once), so if
+no body touches a closed skin every body is on the base's side of it. For an open skin there is no inside, and only its
 surface counts (``patient_closed``). What is loose (a block of the table) could hide in a link: see `FclSkin`.
 """
 
@@ -48,94 +48,9 @@ from puncture_twin.planning.collision.state_checker import (
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
 
-ANGLES = 72
-"""At which a joint is looked at, evenly over the turn: every 5 degrees."""
-
-APART_MM = 1.0
-"""What two pieces may leave between them and still hang together: too little for a surface to pass through."""
-
-
-@cache
-def joined_pieces(model: UrModel) -> Mapping[tuple[str, str], Bools]:
-    """Which pieces of neighbouring links lie together at every angle of the joint between them.
-
-    These are built into one another and never tested. Any other two of neighbouring links meet at some angles alone,
-    as a camera on wrist 3 may meet wrist 2, or a folded forearm the upper arm: for these each state is asked.
-
-    Args:
-        model: An arm with a URDF of its own.
-
-    Returns:
-        For the names of each link and the next, shape (pieces of the one, pieces of the other).
-
-    Raises:
-        InputError: Two neighbouring links do not touch at some angle, or a piece hangs on none of the others.
-    """
-    links = collision_links(model)
-    solids = [[fcl.CollisionObject(convex(piece)) for piece in link.pieces] for link in links]
-    joined = [_joined(model, links, solids, joint) for joint in range(len(links) - 1)]
-    _check_hanging(model, links, solids, joined)
-    names = pairwise(link.name for link in links)
-    return MappingProxyType(dict(zip(names, joined, strict=True)))
-
-
-Solids = Sequence[Sequence[fcl.CollisionObject]]
-
-
-def _joined(model: UrModel, links: Sequence[Link], solids: Solids, joint: int) -> Bools:
-    """Of the two links at a joint, which pieces lie within ``APART_MM`` of each other at every angle."""
-    always = np.ones((len(solids[joint]), len(solids[joint + 1])), bool)
-    for angle in 2.0 * np.pi * np.arange(ANGLES) / ANGLES:
-        q = np.zeros(len(links) - 1)
-        q[joint] = angle
-        for link in (joint, joint + 1):
-            _place(solids[link], link_poses(model, q)[links[link].frame])
-        gaps = _gaps_mm(solids[joint], solids[joint + 1])
-        if gaps.min() > 0.0:
-            at = f"at {np.degrees(angle):g} degrees of their joint"
-            what = f"the shapes of {links[joint].name} and {links[joint + 1].name} do not meet {at}"
-            allowed = "links that hang together: see the unit, scale and origin of their meshes"
-            raise InputError(what, where=model_urdf(model).where, allowed=allowed)
-        always &= gaps <= APART_MM
-    return always
-
-
-def _check_hanging(model: UrModel, links: Sequence[Link], solids: Solids, joined: Sequence[Bools]) -> None:
-    """Refuse an arm of which a piece is reached from the base by no chain of pieces that lie together."""
-    hanging = {(0, 0)}
-    fresh = [(0, 0)]
-    within = [_gaps_mm(some, some) <= APART_MM for some in solids]
-    while fresh:
-        link, piece = fresh.pop()
-        beside = {(link, int(other)) for other in np.flatnonzero(within[link][piece])}
-        if link < len(joined):
-            beside |= {(link + 1, int(other)) for other in np.flatnonzero(joined[link][piece])}
-        if link > 0:
-            beside |= {(link - 1, int(other)) for other in np.flatnonzero(joined[link - 1][:, piece])}
-        fresh += beside - hanging
-        hanging |= beside
-    for number, body in enumerate(links):
-        for piece, shape in enumerate(body.pieces):
-            if (number, piece) not in hanging:
-                low, high = shape.bounds
-                size = " x ".join(f"{edge:.4g}" for edge in high - low)
-                what = f"a shape of {body.name}, {size} mm, hangs on nothing"
-                allowed = f"shapes of one body that touch, to {APART_MM:g} mm: see unit, scale and origin; or one mesh"
-                raise InputError(what, where=model_urdf(model).where, allowed=allowed)
-
-
-def _place(solids: Sequence[fcl.CollisionObject], T: Floats) -> None:
-    for solid in solids:
-        solid.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
-
-
-def _gaps_mm(first: Sequence[fcl.CollisionObject], second: Sequence[fcl.CollisionObject]) -> Floats:
-    """Distances between pieces, shape (n, m), mm; at most 0 where they touch."""
-    return np.array([[fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult()) for b in second] for a in first])
-
 
 class CellChecker:
-    """FCL's verdict on configurations of one arm, tool, room and patient. Holds no state but its FCL objects.
+    """The reference checker: FCL's verdict on configurations of one arm, tool, workcell and patient.
 
     Not for several threads at once: the FCL objects are moved for each question.
 
@@ -147,12 +62,12 @@ class CellChecker:
         outside: What is not to be touched besides (a table), likewise: the base may touch it, and contacts with it are
             named ``outside_body``.
         padding_mm: How much fuller the arm is for contacts with patient and boxes (not for distances, nor with itself):
-            room for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
-            more than 2 mm prove that the path between them meets neither patient nor box.
+            slack for what robot and registration get wrong. With 1 mm or more, free states between which no body moves
+            more than 2 mm prove that the path between them touches neither patient nor box.
 
     Raises:
         InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, the base
-            stands in the patient, a shape of an own arm hangs on nothing,
+            is in the patient, a shape of an own arm hangs on nothing,
             or an own tool does not hang on the flange.
     """
 
@@ -179,8 +94,8 @@ class CellChecker:
         self._surface = patient if patient is None or outside is None else joined([patient, outside])
         self._patient = None
         if patient is not None:
-            beside = None if outside is None else FclSkin(outside, OUTSIDE_BODY)
-            self._patient = FclPatient(FclSkin(patient, PATIENT), beside)
+            outside_skin = None if outside is None else FclSkin(outside, OUTSIDE_BODY)
+            self._patient = FclPatient(FclSkin(patient, PATIENT), outside_skin)
         self._boxes = _boxes(boxes, {PATIENT, *(body.name for body in self._bodies)})
         self._bounds = {box.name: box.bounds for box in boxes}
         self._checks = (*self._workcell_checks(), *self._self_checks())
@@ -218,7 +133,7 @@ class CellChecker:
     def contacts(
         self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
     ) -> list[Contact | None]:
-        """:meth:`contact` of many states by themselves, shape (n, 6), rad; what is known of them is checked again.
+        """First contact of each of many states, shape (n, 6), rad; known contacts are checked first.
 
         Raises:
             InputError: If a state is not finite.
@@ -226,7 +141,7 @@ class CellChecker:
         return [self.contact(state, needle_may_touch_patient=needle_may_touch_patient) for state in q]
 
     def folded(self, q: Floats) -> Bools:
-        """At which of many states (n, 6), rad, two links touch that come before the last joint: so at any q6.
+        """Which of many states (n, 6), rad, have contact between links before the last joint: at any q6.
 
         Raises:
             InputError: If a state is not finite.
@@ -275,7 +190,7 @@ class CellChecker:
         return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
 
     def distances(self, q: Floats) -> Distances:
-        """How close the moving links and the tool are to patient and boxes.
+        """Least distances of moving links and tool from patient and boxes.
 
         Args:
             q: Shape (6,), rad.
@@ -363,3 +278,88 @@ def _boxes(boxes: Sequence[Box], taken: Set[str]) -> dict[str, Solid]:
         box.name: Solid(partial(fcl.Box, *box.size_mm), fcl.Transform(box.T_base_box[:3, :3], box.T_base_box[:3, 3]))
         for box in boxes
     }
+
+
+@cache
+def joined_pieces(model: UrModel) -> Mapping[tuple[str, str], Bools]:
+    """Which pieces of neighbouring links lie together at every angle of the joint between them.
+
+    These are built into one another and never tested. Any other two of neighbouring links touch at some angles alone,
+    as a camera on wrist 3 may touch wrist 2, or a folded forearm the upper arm: for these each state is tested.
+
+    Args:
+        model: An arm with a URDF of its own.
+
+    Returns:
+        For the names of each link and the next, shape (pieces of the one, pieces of the other).
+
+    Raises:
+        InputError: Two neighbouring links do not touch at some angle, or a piece hangs on none of the others.
+    """
+    links = collision_links(model)
+    solids = [[fcl.CollisionObject(convex(piece)) for piece in link.pieces] for link in links]
+    joined = [_joined(model, links, solids, joint) for joint in range(len(links) - 1)]
+    _check_hanging(model, links, solids, joined)
+    names = pairwise(link.name for link in links)
+    return MappingProxyType(dict(zip(names, joined, strict=True)))
+
+
+ANGLES = 72
+"""Angles at which a joint is tested, evenly over the turn: every 5 degrees."""
+
+APART_MM = 1.0
+"""mm between two pieces that still count as joined: too little for a surface to pass through."""
+
+Solids = Sequence[Sequence[fcl.CollisionObject]]
+
+
+def _joined(model: UrModel, links: Sequence[Link], solids: Solids, joint: int) -> Bools:
+    """Which pieces of the two links at a joint lie within ``APART_MM`` of each other at every angle."""
+    always = np.ones((len(solids[joint]), len(solids[joint + 1])), bool)
+    for angle in 2.0 * np.pi * np.arange(ANGLES) / ANGLES:
+        q = np.zeros(len(links) - 1)
+        q[joint] = angle
+        for link in (joint, joint + 1):
+            _place(solids[link], link_poses(model, q)[links[link].frame])
+        gaps = _gaps_mm(solids[joint], solids[joint + 1])
+        if gaps.min() > 0.0:
+            at = f"at {np.degrees(angle):g} degrees of their joint"
+            what = f"the shapes of {links[joint].name} and {links[joint + 1].name} do not meet {at}"
+            allowed = "links that hang together: see the unit, scale and origin of their meshes"
+            raise InputError(what, where=model_urdf(model).where, allowed=allowed)
+        always &= gaps <= APART_MM
+    return always
+
+
+def _check_hanging(model: UrModel, links: Sequence[Link], solids: Solids, joined: Sequence[Bools]) -> None:
+    """Refuse an arm of which a piece is reached from the base by no chain of pieces that lie together."""
+    hanging = {(0, 0)}
+    fresh = [(0, 0)]
+    within = [_gaps_mm(some, some) <= APART_MM for some in solids]
+    while fresh:
+        link, piece = fresh.pop()
+        joined_here = {(link, int(other)) for other in np.flatnonzero(within[link][piece])}
+        if link < len(joined):
+            joined_here |= {(link + 1, int(other)) for other in np.flatnonzero(joined[link][piece])}
+        if link > 0:
+            joined_here |= {(link - 1, int(other)) for other in np.flatnonzero(joined[link - 1][:, piece])}
+        fresh += joined_here - hanging
+        hanging |= joined_here
+    for number, body in enumerate(links):
+        for piece, shape in enumerate(body.pieces):
+            if (number, piece) not in hanging:
+                low, high = shape.bounds
+                size = " x ".join(f"{edge:.4g}" for edge in high - low)
+                what = f"a shape of {body.name}, {size} mm, hangs on nothing"
+                allowed = f"shapes of one body that touch, to {APART_MM:g} mm: see unit, scale and origin; or one mesh"
+                raise InputError(what, where=model_urdf(model).where, allowed=allowed)
+
+
+def _place(solids: Sequence[fcl.CollisionObject], T: Floats) -> None:
+    for solid in solids:
+        solid.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
+
+
+def _gaps_mm(first: Sequence[fcl.CollisionObject], second: Sequence[fcl.CollisionObject]) -> Floats:
+    """Distances between pieces, shape (n, m), mm; at most 0 where they touch."""
+    return np.array([[fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult()) for b in second] for a in first])

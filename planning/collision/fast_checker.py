@@ -1,6 +1,6 @@
-"""The verdicts of :class:`CellChecker`, sooner: FCL is queried only where spheres and planes prove nothing.
+"""The fast collision checker: the verdicts of :class:`CellChecker`, with FCL only where bounds prove nothing.
 
-Straight joint segments, checked by compiled proofs; FCL has the word where they say nothing.
+`FastChecker` checks states and paths, `SegmentChecker` straight joint segments; both by compiled proofs first.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from puncture_twin.planning.collision.kernels.segments import (
     NOT_FINITE,
     QUERY,
     Answer,
-    Room,
-    segment_room,
+    SegmentScratch,
+    segment_scratch,
 )
 from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES_OUTSIDE
 from puncture_twin.planning.collision.packed import ROUND
@@ -45,7 +45,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
 class FastChecker(CellChecker):
-    """Asks FCL the questions of :class:`CellChecker` that cheap lower bounds on the distances leave open.
+    """Answers :class:`CellChecker`'s questions by bounds, and queries FCL for those that bounds leave open.
 
     The questions come in the same order and their answers are FCL's or proven, so each verdict is the same, down to the
     contact that is named (docs/concepts/arm-collisions.md). Distances are FCL's. Not for several threads at once.
@@ -138,7 +138,7 @@ class FastChecker(CellChecker):
         return None
 
     def _contact_of(self, check: int, answer: int, frames: Floats) -> Contact | None:
-        """What a check finds at frames (7, 4, 4): its answer, or FCL's where it has none."""
+        """Contact of one check at frames (7, 4, 4): by bounds, or by FCL where they prove nothing."""
         if answer == OPEN:
             return self._tested[check].contact_at(frames)
         if answer == CLEAR:
@@ -156,15 +156,15 @@ class FastChecker(CellChecker):
 
     def segment_checker(self, clear_mm: float = 0.0) -> SegmentChecker:
         """A check of many segments, which remembers what touched last; with a clearance where their ends have it."""
-        return SegmentChecker(self.model, self._tested, self._proofs, self._segment_room, clear_mm)
+        return SegmentChecker(self.model, self._tested, self._proofs, self._segment_scratch, clear_mm)
 
     @cached_property
-    def _segment_room(self) -> Room:
-        """Where segments are checked, one after the other."""
-        return segment_room(self._proofs.scene, self._proofs.movers)
+    def _segment_scratch(self) -> SegmentScratch:
+        """Scratch in which segments are checked, one after the other."""
+        return segment_scratch(self._proofs.scene, self._proofs.movers)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
-        """The questions at ``q`` (6,) that are left to FCL."""
+        """The checks at ``q`` (6,), rad, that are left to FCL."""
         motion = self.motion(np.asarray(q, dtype=np.float64)[None])
         mask = self._masks[needle_may_touch_patient]
         return [self._tested[check].contact for _, check in self._proofs.unproven(motion, mask)]
@@ -190,7 +190,7 @@ class FastChecker(CellChecker):
         return -1
 
     def motion(self, path: Floats) -> Motion:
-        """States (m, 6) with what the bounds need of them."""
+        """States (m, 6), rad, with the frames and motions that the bounds need."""
         if len(path) <= 1:
             return Motion(link_poses(self.model, path), *self._still)
         return Motion(*self._swept_full.moving(path))
@@ -204,13 +204,13 @@ FINE_MM = 1.0
 no more than 2 mm of motion apart, which with 1 mm of padding proves the path between them; see :class:`CellChecker`."""
 
 QUESTIONS = 256
-"""Room for what one segment leaves to FCL, at first."""
+"""Space for the queries that one segment leaves to FCL, at first."""
 
 
 class _Filled(NamedTuple):
-    """What the compiled code fills."""
+    """Arrays that the compiled code fills."""
 
-    room: Room
+    scratch: SegmentScratch
     answer: Answer
 
 
@@ -224,22 +224,22 @@ class SegmentChecker:
         model: The arm.
         checks: The questions that may find a contact.
         proofs: The same, packed.
-        room: For them; several may share it, one after the other.
+        scratch: For them; several may share it, one after the other.
         clear_mm: What the padded arm is to keep from patient and boxes besides; of each body and obstacle that are
             nearer to one another at an end of the segment, most of their distance there. What is not proven to be kept
             counts as a contact.
     """
 
     def __init__(
-        self, model: UrModel, checks: Sequence[Check], proofs: Proofs, room: Room, clear_mm: float = 0.0
+        self, model: UrModel, checks: Sequence[Check], proofs: Proofs, scratch: SegmentScratch, clear_mm: float = 0.0
     ) -> None:
         self._model, self._checks, self._clear_mm = model, checks, clear_mm
         self._packed = (proofs.scene, proofs.movers, model.lengths)
         self._order = np.arange(len(checks), dtype=np.int64)
-        self._filled = _Filled(room, _empty_answer(QUESTIONS))
+        self._filled = _Filled(scratch, _empty_answer(QUESTIONS))
 
     def __call__(self, start: Floats, end: Floats) -> Contact | None:
-        """A contact on the segment between two states (6,), rad, the needle being outside the patient; None if free.
+        """Contact on the segment between two states (6,), rad, the needle outside the patient; None if free.
 
         The end is checked as it is, and then the middles of ever smaller parts; all of the segment is proven clear but
         for parts within which no body moves farther than ``FINE_MM`` from a state where FCL finds nothing. The start
@@ -267,7 +267,7 @@ class SegmentChecker:
                 return touching
 
     def _touching(self, start: Floats, end: Floats, queries: int) -> Contact | None:
-        """What FCL finds first where so many queries are left to it."""
+        """First contact by FCL where so many queries are left to it."""
         answer = self._filled.answer
         where = answer.fractions[:queries].tolist(), answer.checks[:queries].tolist()
         for fraction, at in zip(*where, strict=True):

@@ -1,10 +1,8 @@
-"""Boxes and bodies as compiled code takes them: convex hulls, each once, with their edges, and trees of spheres.
+"""Boxes, bodies and skin as compiled code takes them.
 
-Of a hull with many corners a coarse one of few takes its place, with how far the others stand out.
-
-What moves: how far a turn of each joint moves a body, and the sphere about it.
-
-The skin as compiled code takes it: its triangles in a balanced tree of boxes, and its field of distances.
+Convex hulls are packed once each, with their edges; many corners are replaced by a coarse hull of few, with how far the
+others stand out. Bodies have trees of bounding spheres; the skin is a balanced tree of boxes and a field of distances.
+`joint_levers` bounds how far a rotation of each joint moves a body.
 """
 
 from __future__ import annotations
@@ -54,7 +52,8 @@ Axes = tuple[Floats, Floats, Floats]
 
 
 COARSE_DIRECTIONS = 60
-"""In which a coarse hull is as wide as the hull: 26 degrees apart, so a round body of 45 mm bulges out by 1.5 mm."""
+"""Directions in which a coarse hull is as wide as the hull: 26 degrees apart, so a round body of 45 mm bulges out by
+1.5 mm."""
 
 WORKCELL_FRAME = 0
 """The frame of what does not move: the base's."""
@@ -92,7 +91,7 @@ class PackedHulls:
         axes = by_axes(corners)
         inner = np.concatenate([inscribed_prism(piece) if about else piece for piece, about in pieces])
         count = len(self._boxes)
-        boxes, arm = (kept_enclosed(some, cache) for some in (self._corners[:count], self._corners[count:]))
+        boxes, arm = (cached_enclosed(some, cache) for some in (self._corners[:count], self._corners[count:]))
         centres, radii, slack, sizes, few, degrees = (
             np.concatenate([boxes[key], arm[key]]) for key in ("centres", "radii", "slack", "sizes", "few", "degrees")
         )
@@ -114,7 +113,7 @@ def inscribed_prism(corners: Floats) -> Floats:
 
 
 def row_starts(sizes: Sequence[int] | Ints) -> Ints:
-    """Where each row begins, and where the last ends, shape (n + 1,), of rows of given lengths."""
+    """Start of each row and end of the last, shape (n + 1,), of rows of given lengths."""
     return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]).astype(np.int64)
 
 
@@ -124,13 +123,13 @@ def by_axes(points: Floats) -> Axes:
     return x, y, z
 
 
-def kept_enclosed(hulls: Sequence[Floats], cache: Cache) -> Arrays:
+def cached_enclosed(hulls: Sequence[Floats], cache: Cache) -> Arrays:
     """`enclosed` from the cache: boxes apart from the arm, which is the same for every patient."""
     return cache.arrays(made_from("hulls", hulls), lambda: enclosed(hulls), by=__name__)
 
 
 def enclosed(hulls: Sequence[Floats]) -> Arrays:
-    """Of each convex hull a sphere about it and a coarse hull: their numbers, one array each."""
+    """A sphere about each convex hull and a coarse hull: their numbers, one array each."""
     coarse, edges = [coarse_hull(corners) for corners in hulls], [neighbours(corners) for corners in hulls]
     first = row_starts([len(corners) for corners in hulls])
     rows = [hull.rows + start for hull, start in zip(edges, first[:-1], strict=True)]
@@ -166,7 +165,7 @@ def packed_trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], 
 
 
 def settings() -> dict[str, float]:
-    """The numbers of this folder that decide what it makes."""
+    """Constants of this module that decide its results, for cache keys."""
     return {
         "leaf": LEAF_RADIUS_MM,
         "slack": SLACK_MM,
@@ -177,7 +176,7 @@ def settings() -> dict[str, float]:
 
 
 def made_from(what: str, pieces: Sequence[NDArray[Any]]) -> dict[str, object]:
-    """What decides a result about some convex pieces, for the cache: their corners and how they are enclosed."""
+    """Cache key of results about some convex pieces: their corners and how they are enclosed."""
     digest = hashlib.sha256()
     for corners in pieces:
         digest.update(f"{corners.shape}".encode())
@@ -203,7 +202,7 @@ def coarse_hull(corners: Floats) -> Coarse:
         return Coarse(corners, 0.0)
     few = corners[np.unique(np.argmax(_directions(COARSE_DIRECTIONS) @ corners.T, axis=1))]
     hull = scipy.spatial.ConvexHull(few)
-    outside = (corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > -SLACK_MM
+    outside = (corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > -SLACK_MM  # beyond a face
     triangles = np.ascontiguousarray(few[hull.simplices])
     return Coarse(few, float(farthest_from(triangles, corners[outside])) + SLACK_MM)
 
@@ -228,7 +227,7 @@ class Neighbours(NamedTuple):
 def neighbours(corners: Floats) -> Neighbours:
     """Which corners (n, 3) of a convex hull share an edge of its triangles; a corner within the hull has none."""
     faces = scipy.spatial.ConvexHull(corners).simplices
-    edges = np.concatenate([np.roll(faces, turn, axis=1)[:, :2] for turn in range(3)])
+    edges = np.concatenate([np.roll(faces, turn, axis=1)[:, :2] for turn in range(3)])  # each face's three
     pairs = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0).astype(np.int64)
     return Neighbours(np.bincount(pairs[:, 0], minlength=len(corners)), pairs[:, 1])
 
@@ -239,7 +238,7 @@ def in_frame(corners: Floats, body: Body) -> Floats:
 
 
 def joint_levers(model: UrModel, check: Check) -> Floats:
-    """How far a turn of each joint (6,) may move the second body against the first, mm/rad.
+    """How far a rotation of each joint (6,) may move the second body against the first, mm/rad.
 
     A body's point is no farther from a joint's axis than the links between reach, end to end, and the body itself.
     Only the joints between the two bodies move them against one another.
@@ -248,7 +247,7 @@ def joint_levers(model: UrModel, check: Check) -> Floats:
     if check.hulls is None or check.first_body is None:
         return levers
     body = check.second_body
-    own = np.linalg.norm(apply(body.T_frame_body, check.hulls[1]), axis=1).max()
+    own = np.linalg.norm(apply(body.T_frame_body, check.hulls[1]), axis=1).max()  # from its frame's origin
     lengths = np.hypot(model.a, model.d)
     for joint in range(check.first_body.frame, body.frame):
         levers[joint] = abs(model.a[joint]) + lengths[joint + 1 : body.frame].sum() + own
@@ -256,7 +255,7 @@ def joint_levers(model: UrModel, check: Check) -> Floats:
 
 
 def packed_movers(checks: Sequence[Check]) -> Movers:
-    """The piece that each check is about, or all of a body for the skin."""
+    """The moving piece of each check, or all of a body for the skin."""
     rows: dict[int, int] = {}
     frames, spheres, mover = [], [], []
     for check in checks:
@@ -359,7 +358,7 @@ FIELD_MARGIN_MM = 500.0
 """How far around the skin distances are kept: beyond, they are seldom needed."""
 
 MOST_CELLS = 4_000_000
-"""Of that field (16 MB): a larger skin gets a narrower margin."""
+"""Cells of that field at most (16 MB): a larger skin gets a narrower margin."""
 
 
 def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache) -> SkinTree:

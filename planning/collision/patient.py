@@ -1,10 +1,7 @@
-"""The patient as FCL is asked about it: the skin and what else the CT shows, in parts that are made when needed.
+"""The patient and single checks as FCL sees them: the skin and what else the CT shows, in parts built on demand.
 
-One question to FCL, and its answer.
-
-The robot's base must not stand in the patient.
-
-Whether a tool of the user's own hangs on the arm: one that floats could lie wholly in the patient, unseen.
+A `Check` is one query to FCL. A base that stands in the patient is refused, and so is a tool of the user's own that
+hangs on nothing: one that floats could lie wholly in the patient, unseen.
 """
 
 from __future__ import annotations
@@ -39,7 +36,7 @@ from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of
 
 PART_TRIANGLES = 8192
-"""So many triangles share a tree: FCL takes some 4 us to build for each, and 20 us to ask a tree."""
+"""Triangles in one tree: FCL takes some 4 us to build for each, and 20 us to query a tree."""
 
 ROUNDING_MM = 1e-6
 """By how much a body's box is grown: far above the rounding of its pose."""
@@ -48,12 +45,12 @@ ROUNDING_MM = 1e-6
 class FclSkin:
     """A surface in parts, each with a tree of its own, which FCL builds when a body first comes near the part.
 
-    To build a tree takes longer than most questions, and the arm comes near to few parts of a patient. FCL judges a
-    triangle by itself, whichever tree it stands in, so the surface touches what one of its parts touches.
+    To build a tree takes longer than most questions, and the arm comes near to few parts of a patient. FCL tests a
+    triangle by itself, whichever tree it is in, so the surface touches what one of its parts touches.
 
     Args:
         mesh: The surface, mm.
-        name: Of it, for who is told of its fault.
+        name: Of it, for messages about it.
 
     Raises:
         InputError: FCL calls a NaN vertex free and dies of an index out of range: so that is looked for first.
@@ -68,7 +65,7 @@ class FclSkin:
         self._mesh = mesh
 
     def touches(self, solid: Solid, box: Floats) -> bool:
-        """Whether a body touches the surface where it stands.
+        """Whether a body touches the surface where it is.
 
         Args:
             solid: The body.
@@ -77,11 +74,11 @@ class FclSkin:
         return any(touch(self._tree(part), solid.made) for part in self._near(solid.pose, box))
 
     def collides_with(self, body: Body) -> bool:
-        """Whether a body touches the surface where it stands, or has a part of it within."""
+        """Whether a body touches the surface where it is, or has a part of it within."""
         return self.touches(body.full.surface, body.box) or self.has_part_within(body)
 
     def has_part_within(self, body: Body) -> bool:
-        """Whether a connected part of the surface lies within a link where it stands.
+        """Whether a connected part of the surface lies within a link where it is.
 
         Of a link FCL sees the surface, which such a part does not touch. Holder and needle are solid for it.
 
@@ -97,7 +94,7 @@ class FclSkin:
         return bool(near.any()) and bool(within(points[near], body.half_spaces).any())
 
     def _near(self, pose: fcl.Transform, box: Floats) -> list[int]:
-        """The parts that a box about a body, in the body's frame, may meet where the body stands."""
+        """Parts of the surface that a box about a body, in the body's frame, may touch."""
         low, high = _bounds_at(pose, box)
         near = np.all((self._bounds[:, 1] >= low) & (self._bounds[:, 0] <= high), axis=1)
         found: list[int] = np.flatnonzero(near).tolist()
@@ -132,20 +129,20 @@ class FclSkin:
 
 
 class FclPatient(NamedTuple):
-    """The skin, and what besides it is not to be touched."""
+    """The patient for FCL: the skin, and what else the CT shows."""
 
     skin: FclSkin
     outside: FclSkin | None
 
     def touched_part(self, body: Body) -> str | None:
-        """What of it a body touches where it stands: the skin, ``outside_body`` where that is all, or None."""
+        """The part that a body touches where it is: the skin, ``outside_body`` where that is all, or None."""
         if self.skin.collides_with(body):
             return PATIENT
         return OUTSIDE_BODY if self.outside is not None and self.outside.collides_with(body) else None
 
 
 def _bounds_at(pose: fcl.Transform, box: Floats) -> tuple[Floats, Floats]:
-    """Lowest and highest corner (3,) of a box about a body's own box where the body stands."""
+    """Lowest and highest corner (3,) of a box about a body's own box where the body is."""
     R = pose.getRotation()
     centre = R @ (0.5 * (box[0] + box[1])) + pose.getTranslation()
     reach = np.abs(R) @ (0.5 * (box[1] - box[0])) + ROUNDING_MM
@@ -153,7 +150,7 @@ def _bounds_at(pose: fcl.Transform, box: Floats) -> tuple[Floats, Floats]:
 
 
 class Check(NamedTuple):
-    """One question to FCL: do two shapes touch."""
+    """One query to FCL: whether two shapes touch."""
 
     contact: Contact
     """What it means if they do."""
@@ -188,13 +185,13 @@ class Check(NamedTuple):
 
 
 class BaseInPatientError(InputError):
-    """The robot's base stands where the patient is, or their table."""
+    """The robot's base is where the patient is, or their table."""
 
 
 def refuse_base_in(
     model: UrModel, base: Body, placed: FclPatient, patient: TriangleMesh, surface: TriangleMesh
 ) -> None:
-    """Refuse a base that stands in the patient, or in what the CT shows outside of the body.
+    """Refuse a base that is in the patient, or in what the CT shows outside of the body.
 
     Args:
         model: The arm.
@@ -207,8 +204,8 @@ def refuse_base_in(
         BaseInPatientError: It does.
     """
     centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
-    met = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
-    if met or _encloses(patient, centre):
+    hit = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
+    if hit or _encloses(patient, centre):
         what = "the robot's base stands in the patient"
         raise BaseInPatientError(what, where="workcell", allowed="a base outside the skin")
     if surface is not patient and _encloses(surface, centre):
@@ -221,7 +218,7 @@ def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
     """Whether a point lies inside a surface; more than half around an open one counts too."""
     low, high = mesh.bounds
     if not np.all((point >= low) & (point <= high)) and abs(winding_number(mesh, point)) <= 0.5:
-        return False  # outside, or an open surface that goes less than half around: whether it is open need not be told
+        return False  # outside, or an open surface that goes less than half around: whether it is open does not matter
     side = side_of(mesh, point)
     return side is Side.INSIDE or (side is Side.UNKNOWN and abs(winding_number(mesh, point)) > 0.5)
 

@@ -1,6 +1,7 @@
-"""The checks of one cell as compiled code takes them: hulls, spheres and the skin's tree, packed once.
+"""The checks of one workcell, packed for compiled proofs.
 
-Pieces two joints apart that never touch, at no angle: proven once for an arm, and not tested again.
+`Proofs` proves checks clear at states, along paths and in boxes of joint angles. `never_touching` finds the pieces two
+joints apart that touch at no angle: proven once for an arm, and not tested again.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class Motion(NamedTuple):
 
 
 class Around(NamedTuple):
-    """What :meth:`Proofs.clear_about` leaves open."""
+    """The checks that :meth:`Proofs.clear_about` leaves open."""
 
     touching: Bools
     """Shape (m, k): at the state itself the reference must be queried, and is likely to find that something touches."""
@@ -51,7 +52,7 @@ class Around(NamedTuple):
 
 
 class NotClear(NamedTuple):
-    """Of each state the first check that is not proven clear."""
+    """The first check of each state that is not proven clear."""
 
     checks: Ints
     """Shape (m,); -1 where all is clear."""
@@ -60,7 +61,7 @@ class NotClear(NamedTuple):
 
 
 class Proofs:
-    """The checks of one cell, ready to be proven. Not for several threads: the scratch is shared.
+    """The checks of one workcell, ready to be proven. Not for several threads: the scratch is shared.
 
     ``joint_spans`` (k, 3) says of each check whether it is between two bodies of the arm, and the frames of both.
 
@@ -103,7 +104,7 @@ class Proofs:
         packed = hulls.packed(cache)
         skin = packed_skin(patient, skin_triangles, cache)
         self.scene = ProofScene(np.array(rows, dtype=np.int64), skin, spheres, *packed)
-        self._beside = settled_kernels.beside_triangle(self.scene.hulls, STACK)
+        self._beside = settled_kernels.triangle_scratch(self.scene.hulls, STACK)
         self._levers = np.array([joint_levers(model, check) for check in checks])
         self.movers = packed_movers(checks)
         self._work = scratch(len(rows), len(self.scene.hulls.radii))
@@ -136,7 +137,7 @@ class Proofs:
             yield divmod(at, len(self))
 
     def first_not_clear(self, frames: Floats, begins: Ints, tested: Bools, of_state: Ints) -> NotClear:
-        """Of each state by itself the first check that is not proven clear, at or after one.
+        """First check of each state that is not proven clear, at or after one.
 
         Args:
             frames: Shape (m, 7, 4, 4), mm.
@@ -149,7 +150,7 @@ class Proofs:
         return found
 
     def settled_at(self, check: int, frames: Floats) -> int:
-        """What a check comes to at frames (7, 4, 4), see :mod:`puncture_twin.planning.collision.kernels.settled`."""
+        """Result of a check at frames (7, 4, 4), see :mod:`puncture_twin.planning.collision.kernels.settled`."""
         return int(settled_kernels.settled_at(self.scene, self._work, self._beside, check, frames))
 
     def clear_about(self, frames: Floats, turns: Floats, tested: Bools) -> Around:
@@ -171,14 +172,14 @@ JOINTS_BETWEEN = 2
 """Such pairs see two angles alone, whose square can be searched in full; a cube of three would take too long."""
 
 HALVINGS = 9
-"""Of the square of a whole turn each way: down to 0.7 deg, where a UR3's pieces move by about 2 mm."""
+"""Halvings of the square of a whole turn each way: down to 0.7 deg, where a UR3's pieces move by about 2 mm."""
 
 QUARTERS = np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
 """Where the middles of a square's quarters lie, in half sides of the square."""
 
 
 def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, cache: Cache) -> tuple[Check, ...]:
-    """The checks that may find a contact at some angle; the proofs are made to ask the same ones.
+    """The checks without pairs that touch at no angle; the proofs are made to test these.
 
     Args:
         model: The arm.
@@ -228,11 +229,11 @@ def _clear_all_over(model: UrModel, proofs: Proofs, touches: Touches, joint: int
     unproven, touching = tested[None], np.zeros_like(tested)
     for _ in range(HALVINGS):
         q, turns = np.zeros((len(middles), 6)), np.zeros(6)
-        q[:, joint : joint + 2], turns[joint : joint + 2] = middles, half
+        q[:, joint : joint + 2], turns[joint : joint + 2] = middles, half  # other joints do not matter to the pair
         frames = link_poses(model, q)
         left = proofs.clear_about(frames, turns, unproven)
         for square, check in np.argwhere(left.touching).tolist():
-            touching[check] = touching[check] or touches(check, frames[square])
+            touching[check] = touching[check] or touches(check, frames[square])  # FCL decides at the middle
         still = left.unproven & ~touching
         kept = still.any(axis=1)
         if not kept.any():

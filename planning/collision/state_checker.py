@@ -1,6 +1,7 @@
-"""What a check of configurations answers, and the names behind which one checker takes another's place.
+"""The interface of collision checkers, what they return, and bounds on how far an arm's bodies move.
 
-How far the bodies of an arm move between two configurations: the bound behind every sampled collision check.
+Any checker may take another's place behind `StateChecker`. `SweptBodies` bounds the motion between two configurations:
+every sampled collision check rests on it.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class Nearest(NamedTuple):
 
 
 class Distances(NamedTuple):
-    """How close the arm is, 0 where it touches."""
+    """Least distances of the arm, mm, 0 where it touches."""
 
     patient: Nearest
     """Moving links and holder to the skin."""
@@ -79,7 +80,7 @@ class StateChecker(Protocol):
 
     @property
     def tool(self) -> Tool:
-        """What the flange carries."""
+        """The tool on the flange."""
 
     @property
     def swept(self) -> SweptBodies:
@@ -91,13 +92,13 @@ class StateChecker(Protocol):
     def contacts(
         self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
     ) -> list[Contact | None]:
-        """Of each of many states (n, 6), rad, by itself what ``contact`` says.
+        """First contact of each of many states (n, 6), rad.
 
         Where ``round_clear`` (n,) says so, holder and needle are known to touch neither patient nor boxes.
         """
 
     def folded(self, q: Floats) -> Bools:
-        """At which of many states (n, 6), rad, two links touch that come before the last joint: so at any q6."""
+        """Which of many states (n, 6), rad, have contact between links before the last joint: at any q6."""
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
         """The first state of ``q_path`` (m, 6), rad, with a contact, and the contact; None when all are clear."""
@@ -106,7 +107,7 @@ class StateChecker(Protocol):
         """One of ``DISTANCE_PAIRS`` at ``q``, shape (6,), rad; of one body alone when named."""
 
     def distances(self, q: Floats) -> Distances:
-        """All of them."""
+        """All kinds of distance at ``q``, shape (6,), rad."""
 
     def sweep_mm(self, q_path: Floats) -> Floats:
         """Bound on every body's motion along each segment of ``q_path`` (m, 6): shape (m - 1,), mm."""

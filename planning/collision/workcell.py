@@ -1,8 +1,6 @@
-"""The workcell of a case for the arm: the needle on its flange, the patient, what stands around it, where it waits.
+"""The workcell of a case: the needle on its flange, the patient, obstacles and gantry, and where the arm waits.
 
-What a case file says stands about the patient: obstacles and gantry, as boxes for the arm and solids for the needle.
-
-They are solids for the needle too: it is checked against them with and without an arm.
+Obstacles and gantry are boxes for the arm and solids for the needle, which is checked against them also without an arm.
 """
 
 from __future__ import annotations
@@ -37,19 +35,19 @@ TREE_COPIES = 8
 
 
 def case_tool(case: Case) -> Tool:
-    """The needle, its holder, and what else the flange carries."""
+    """Tool of the case: the needle, its holder, and what else the flange carries."""
     needle = case.needle
     return Tool(needle.length_mm, needle.shaft_mm, needle.diameter_mm, needle.holder_diameter_mm, case.tool)
 
 
 def outside_surface(anatomy: Anatomy) -> TriangleMesh | None:
-    """What the CT shows outside of the skin that the arm must not touch, CT frame; None where there is nothing."""
+    """Surface outside of the skin that the arm must not touch, CT frame; None where there is nothing."""
     outside = [one.mesh for one in anatomy.surroundings if one.role is Role.UNKNOWN]
     return joined(outside) if outside else None
 
 
 def patient_surface(anatomy: Anatomy) -> TriangleMesh:
-    """What the arm must not touch as the patient, CT frame: the skin, and what the CT shows outside of it."""
+    """Surface that the arm must not touch as the patient, CT frame: the skin, and what lies outside of it."""
     outside = outside_surface(anatomy)
     return anatomy.skin.mesh if outside is None else joined([anatomy.skin.mesh, outside])
 
@@ -60,7 +58,7 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
     It depends on no target: of one patient and one arm it is made once where ``memory`` keeps it.
 
     Raises:
-        InputError: The robot's base stands in the patient, or the gantry's wall does.
+        InputError: The robot's base, or the gantry's wall, is in the patient.
     """
     check_gantry(case, anatomy.skin.mesh)
     skin, outside = anatomy.skin.mesh, outside_surface(anatomy)
@@ -68,10 +66,10 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
     model, tool = case.robot.model, case_tool(case)
 
     def make() -> FastChecker:
-        placed, beside = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in (skin, outside))
+        placed, placed_outside = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in (skin, outside))
         try:
             return FastChecker(
-                model, tool, boxes, placed, outside=beside, padding_mm=ARM_PADDING_MM, cache=user_cache()
+                model, tool, boxes, placed, outside=placed_outside, padding_mm=ARM_PADDING_MM, cache=user_cache()
             )
         except BaseInPatientError as error:
             where = f"{case.path}: {_placing_key(case)}"
@@ -87,14 +85,14 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
 
 
 def _placing_key(case: Case) -> str:
-    """Where the case says where its robot's base is."""
+    """Key of the case that states where its robot's base is."""
     if case.registration is not None:
         return "registration"
     return "robot.mount" if case.robot.transform is None else "registration.transform"
 
 
 def home_configuration(case: Case) -> Floats:
-    """Where the arm waits, shape (6,), rad: the case's, or arm up and wrist down.
+    """Joints of the waiting arm, shape (6,), rad: the case's, or arm up and wrist down.
 
     Raises:
         InputError: It is beyond the arm's limits.
@@ -122,7 +120,7 @@ def case_boxes(case: Case, T_base_ct: Floats) -> tuple[Box, ...]:
 
 
 def gantry_in_ct(gantry: Gantry) -> tuple[Box, ...]:
-    """The gantry's boxes in the CT frame, which stands in for their base frame."""
+    """The gantry's boxes in the CT frame, which takes the place of their base frame."""
     return _gantry_boxes(gantry, np.eye(4))
 
 
@@ -163,7 +161,7 @@ def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
 
 
 def _crossings(start: Floats, end: Floats, z: float) -> Floats:
-    """Where segments between points (n, 3) pass through the plane of a height, shape (m, 3)."""
+    """Points where segments between points (n, 3) pass through the plane of a height, shape (m, 3)."""
     passing = (start[:, 2] < z) != (end[:, 2] < z)
     a, b = start[passing], end[passing]
     return np.asarray(a + ((z - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a))
@@ -179,7 +177,7 @@ def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
 def check_gantry(case: Case, skin: TriangleMesh) -> None:
     """Refuse a gantry that does not go around the patient.
 
-    The skin alone is held against it. What the CT shows outside of the skin is not: a bed goes through the bore, and
+    The skin alone is tested against it. What the CT shows outside of the skin is not: a bed goes through the bore, and
     beyond the image its surface goes on by assumption.
 
     Args:
@@ -196,10 +194,10 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
 
 
 def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) -> Anatomy:
-    """The anatomy with the case's obstacles and gantry beside what the CT shows outside of the body.
+    """The anatomy with the case's obstacles and gantry as further structures outside of the body.
 
     Raises:
-        InputError: An obstacle has the name of a structure, or the gantry's wall stands in the patient.
+        InputError: An obstacle has the name of a structure, or the gantry's wall is in the patient.
     """
     check_gantry(case, anatomy.skin.mesh)
     solids = surroundings(case, T_base_ct)

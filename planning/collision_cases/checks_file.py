@@ -1,6 +1,6 @@
-"""The schema of a ``*.collision.toml`` file: what people expect of directions, windows and plans.
+"""The schema of a ``*.collision.toml`` file, which states what is expected of directions, windows and plans.
 
-On which line of a TOML file a table or a key of it stands: its reader does not say.
+`line_of` finds the line of a table or key in the text, which the TOML reader does not report.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Chance = Annotated[Number, Field(ge=0, le=1)]
 
 
 class Expectation(Section):
-    """What every table may hold: which case, and what people call the test."""
+    """Keys of every table: the case, and the test's name."""
 
     case: Text | None = None
     name: TestName | None = None
@@ -52,12 +52,12 @@ class Expectation(Section):
 
     @property
     def usual_name(self) -> str:
-        """Of a test that has no name of its own; does not depend on where in the file it stands."""
+        """Name of a test without its own; independent of the place in the file."""
         raise NotImplementedError
 
 
 class CheckSection(Expectation):
-    """What is expected of one direction."""
+    """Expectation of one direction."""
 
     theta_deg: Degrees180
     beta_deg: Degrees360
@@ -72,12 +72,12 @@ class CheckSection(Expectation):
 
     @property
     def usual_name(self) -> str:
-        """Angles and verdict."""
+        """Angles and verdict as the test's name."""
         return f"theta{self.theta_deg:g}-beta{self.beta_deg:g}-{self.verdict}"
 
 
 class WindowSection(Expectation):
-    """What is expected of the window that holds one direction."""
+    """Expectation of the window that contains one direction."""
 
     theta_deg: Degrees180
     beta_deg: Degrees360
@@ -86,23 +86,23 @@ class WindowSection(Expectation):
 
     @property
     def usual_name(self) -> str:
-        """The direction."""
+        """The direction as the test's name."""
         return f"window-theta{self.theta_deg:g}-beta{self.beta_deg:g}"
 
 
 class PlanSection(Expectation):
-    """A plan that must still hold."""
+    """Expectation of a plan that must still be valid."""
 
     file: Text
 
     @property
     def usual_name(self) -> str:
-        """The file."""
+        """The file as the test's name."""
         return "plan-" + "-".join(Path(self.file).parts[-2:])
 
 
 class ChecksFile(Section):
-    """The whole file."""
+    """Schema of a whole file of expectations."""
 
     case: Text | None = None
     check: tuple[CheckSection, ...] = ()
@@ -121,7 +121,7 @@ class ChecksFile(Section):
 
 
 class CheckedFile(NamedTuple):
-    """A file of expectations that was read: what it says, and its bytes."""
+    """A validated file of expectations, and its bytes."""
 
     content: ChecksFile
     data: bytes
@@ -167,7 +167,7 @@ TOKENS = re.compile(
     r"|^[ \t]*\[\[[ \t]*(?P<kind>[A-Za-z0-9_-]+)[ \t]*\]\]",
     re.MULTILINE | re.DOTALL,
 )
-"""Strings and comments, so that what stands in them is passed over, and the heads of tables in arrays."""
+"""Strings and comments, so that what is in them is passed over, and the heads of tables in arrays."""
 
 
 def line_of(text: str, place: Sequence[str | int]) -> int | None:

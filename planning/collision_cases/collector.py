@@ -1,4 +1,4 @@
-"""Files of expectations as tests of pytest: one a table."""
+"""Tables of a ``*.collision.toml`` file as tests of pytest, one a table, and how each is checked."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ from puncture_twin.planning.search.explain import Explanation, reason_text
 from puncture_twin.planning.search.windows import Windows, find_windows, nearest_row
 
 DIGIT = 0.1
-"""Of a tolerance: a rewritten number keeps the rest of it."""
+"""Fraction of a tolerance: a rewritten number keeps the rest of it."""
 
 LEAST_DIGIT_MM, CHANCE_DIGIT = 0.01, 0.01
-"""To which a rewritten least clearance (mm) and a rewritten chance (of itself) are rounded."""
+"""Steps of a rewritten least clearance (mm) and of a rewritten chance (relative)."""
 
 
 def direction_finding(check: CheckSection, found: Explanation) -> Finding:
-    """What of a direction is not as expected."""
+    """Differences of one direction from what is expected."""
     differences = (*_verdict(check, found), *_clearances(check, found), *_least(check, found), *_touch(check, found))
     if not differences:
         return Finding()
@@ -109,14 +109,14 @@ def _number(new: NewNumber) -> NewNumber | None:
 
 
 DIGIT_SQUARE_DEG = 1.0
-"""To which a rewritten area is rounded."""
+"""Step of a rewritten area."""
 
 MOST_SHOWN = 6
 """Windows."""
 
 
 def window_finding(window: WindowSection, direction: Candidates, search: Candidates) -> Finding:
-    """What of a window is not as expected.
+    """Differences of one window from what is expected.
 
     Args:
         window: What is expected.
@@ -170,7 +170,7 @@ class CollisionMismatchError(AssertionError):
 
 @dataclass(frozen=True)
 class Table:
-    """One expectation of a file.
+    """One table of expectations, as a test needs it.
 
     Attributes:
         kind: ``check``, ``window`` or ``plan``.
@@ -221,7 +221,7 @@ def _tables(content: ChecksFile, data: bytes, folder: Path) -> Iterator[Table]:
 
 
 class CollisionItem(pytest.Item):
-    """One expectation."""
+    """One expectation as a test."""
 
     def __init__(self, *, table: Table, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -233,10 +233,10 @@ class CollisionItem(pytest.Item):
         if table.kind != "plan":
             self.user_properties += arm_properties(session, table)
         found = FINDERS[table.kind](session, table, self.path.parent)
-        if found.differences and not (updating(self.config) and self._kept(session, found)):
+        if found.differences and not (updating(self.config) and self._queued_for_rewrite(session, found)):
             raise CollisionMismatchError(found.text(table.expected.why))
 
-    def _kept(self, session: Session, found: Finding) -> bool:
+    def _queued_for_rewrite(self, session: Session, found: Finding) -> bool:
         """Keep what differs for the rewriting at the end, if all of it is numbers."""
         numbers = [one.number for one in found.differences if one.number is not None]
         if len(numbers) < len(found.differences):
@@ -246,7 +246,7 @@ class CollisionItem(pytest.Item):
         return True
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
-        """What differs, in a few lines."""
+        """The differences, in a few lines."""
         if isinstance(excinfo.value, InputError):
             return Finding((Difference(str(excinfo.value)),)).text(self._table.expected.why)
         if isinstance(excinfo.value, CollisionMismatchError):
@@ -254,13 +254,13 @@ class CollisionItem(pytest.Item):
         return super().repr_failure(excinfo, style)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:
-        """Where the test stands."""
+        """Location of the test."""
         line = self._table.line
         return self.path, None if line is None else line - 1, f"{self.path.name}: {self.name}"
 
 
 def arm_properties(session: Session, table: Table) -> list[tuple[str, object]]:
-    """What a test's report says of the arm.
+    """Properties of a test's report about the arm.
 
     Raises:
         InputError: The case cannot be read, or has no arm to be checked.
@@ -327,7 +327,7 @@ def unique_names(wanted: Iterable[str]) -> list[str]:
 
 
 def plan_finding(path: Path, context: CaseContext) -> Finding:
-    """Whether a plan holds: same inputs, its direction safe, its motion free of contact, its numbers those of the case.
+    """Differences of a plan: inputs, its direction's verdict, contacts of its motion, its numbers.
 
     Args:
         path: The plan's file.

@@ -1,12 +1,8 @@
-"""What one run of pytest keeps: cases that were read, their searches, and numbers that are to be rewritten.
+"""One run of pytest: cases that were read, their searches, differences found, and numbers to be rewritten.
 
-What the plugin asks of a run of pytest, and what it says at its end: light, since every run wants it.
-
-A green run must not be read as if arms had been checked, where they were not.
-
-New numbers in a file that people wrote: its comments, order and spaces stay.
-
-What a case was found to be, against what a file expects, and the number that a file would have to expect.
+A green run must not be read as if arms had been checked where they were not: `arm_notes` says so at its end.
+`rewrite` puts new numbers into a file that people wrote; its comments, order and spaces stay.
+Nothing heavy is imported here, since every run of pytest loads it.
 """
 
 from __future__ import annotations
@@ -30,7 +26,7 @@ from puncture_twin.planning.search.context import CaseContext, prepare
 
 @dataclass
 class Session:
-    """Cases are read once: meshes and trees cost more than any check.
+    """Cases and searches of one run, read once: meshes and trees cost more than any check.
 
     Attributes:
         changes: File to what it held when it was read, and the numbers that changed.
@@ -43,7 +39,7 @@ class Session:
     _searches: dict[tuple[Path, bool], Candidates] = field(default_factory=dict)
 
     def context(self, path: Path, *, arm: bool) -> CaseContext:
-        """A case.
+        """The prepared context of a case.
 
         Raises:
             InputError: It cannot be read, or the arm is to be checked in a case that does not say where its base is.
@@ -69,7 +65,7 @@ SESSION = pytest.StashKey[Session]()
 
 
 def session_of(config: pytest.Config) -> Session:
-    """What this run keeps."""
+    """The session of this run of pytest."""
     return config.stash.setdefault(SESSION, Session())
 
 
@@ -86,12 +82,12 @@ def write_changes(config: pytest.Config) -> bool:
 
 
 def rewritten_lines(config: pytest.Config) -> list[str]:
-    """What was rewritten, one line a number."""
+    """Lines on the rewritten numbers, one a number."""
     return session_of(config).lines
 
 
 ARM_PROPERTY = "arm"
-"""Of a test's report: it comes back from other processes too, and into JUnit's file."""
+"""Name of a property of a test's report: it comes back from other processes too, and into JUnit's file."""
 
 CHECKED = "checked"
 
@@ -115,7 +111,7 @@ def arm_notes(reports: Iterable[object]) -> list[str]:
 
 
 def add_flag(parser: pytest.Parser) -> None:
-    """Tell pytest of it."""
+    """Register the flag with pytest."""
     text = "rewrite the numbers that *.collision.toml files expect; never a verdict"
     parser.getgroup("collision").addoption(UPDATE, action="store_true", help=text)
 
@@ -134,7 +130,7 @@ def updating(config: pytest.Config) -> bool:
 
 @dataclass(frozen=True)
 class Change:
-    """A number of one table.
+    """A number of one table to be rewritten.
 
     Attributes:
         kind: The array of the table, such as ``check``.
@@ -196,7 +192,7 @@ def _at(document: Any, keys: Sequence[str | int]) -> Any:
 
 
 MOST_DECIMALS = 17
-"""More than a double has."""
+"""Decimals of a written number: more than a double has."""
 
 MOST_LINES, MOST_DIFFERENCES, MOST_CHARACTERS = 15, 6, 300
 """Of a failure: more is not read. Of its lines that say what differs; and of a line."""
@@ -204,7 +200,7 @@ MOST_LINES, MOST_DIFFERENCES, MOST_CHARACTERS = 15, 6, 300
 
 @dataclass(frozen=True)
 class NewNumber:
-    """What was found for a key.
+    """The found number of a key that expects another.
 
     Attributes:
         keys: From the table inward.
@@ -235,7 +231,7 @@ class NewNumber:
 
 @dataclass(frozen=True)
 class Difference:
-    """One thing that is not as expected.
+    """One difference from an expectation.
 
     Attributes:
         line: What a person reads.
@@ -248,7 +244,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one test.
+    """Result of one test: its differences.
 
     Attributes:
         differences: None where everything is as expected.
@@ -261,7 +257,7 @@ class Finding:
     last: str = ""
 
     def text(self, why: str) -> str:
-        """What differs, why it was expected, and what was found, in `MOST_LINES` lines."""
+        """Differences, why other values were expected, and what was found, in `MOST_LINES` lines."""
         lines = [difference.line for difference in self.differences]
         if len(lines) > MOST_DIFFERENCES:
             lines[MOST_DIFFERENCES - 1 :] = [f"and {len(lines) - MOST_DIFFERENCES + 1} more that differ"]

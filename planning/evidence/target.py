@@ -15,7 +15,7 @@ from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.findings import Finding, Severity
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.geometry.containment import Side, holds, odd_fraction, side_of, winding_number
+from puncture_twin.planning.geometry.containment import Side, contains, odd_fraction, side_of, winding_number
 from puncture_twin.planning.geometry.spaces import Space, Unit, point_text, to_lps
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
@@ -61,7 +61,7 @@ def _likely(name: str) -> Likely:
 def target_place(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
     """A target must lie inside the skin and its own structure, and inside nothing that is to be avoided."""
     if side_of(anatomy.skin.mesh, case.target_ct) is Side.OUTSIDE:
-        hint = readings_inside(case.target_ct, case.space, partial(holds, anatomy.skin.mesh))
+        hint = readings_inside(case.target_ct, case.space, partial(contains, anatomy.skin.mesh))
         yield _misplaced(case, f"outside the skin{hint}", "a point in the body, in mm, in the case's space")
     for structure in anatomy.structures:
         own = structure.name == case.target_structure
@@ -79,7 +79,7 @@ def target_place(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
         elif own and side is Side.OUTSIDE:
             gap = surface_distance(structure.mesh, case.target_ct)
             if gap > ON_SURFACE_MM:
-                hint = readings_inside(case.target_ct, case.space, partial(holds, structure.mesh), "inside")
+                hint = readings_inside(case.target_ct, case.space, partial(contains, structure.mesh), "inside")
                 lies = f"{gap:.1f} mm outside its structure '{structure.name}'{hint}"
                 yield _misplaced(case, lies, "a point inside target.structure")
 
@@ -161,7 +161,7 @@ def target_in_other_space(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
 def _holders(anatomy: Anatomy, point_ct: Floats) -> Iterator[str]:
     """The names of the structures that hold a point (3,), LPS mm; the target's own ball is none."""
     for structure in anatomy.structures:
-        if structure.source != OWN_TARGET and holds(structure.mesh, point_ct):
+        if structure.source != OWN_TARGET and contains(structure.mesh, point_ct):
             yield structure.name
 
 

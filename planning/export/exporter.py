@@ -32,23 +32,24 @@ GRID_MM = MAX_SWEEP_MM / 2.0
 """In two directions: no state of the triangle is farther from a checked one than half of ``MAX_SWEEP_MM``."""
 
 LARGEST_BLEND_MM = 5.0
-"""The first radius tried: enough not to stop, small against the room that a plan leaves."""
+"""The first radius tried: enough not to stop, small against the space that a plan leaves."""
 
 SMALLEST_BLEND_MM = 1.0
 """Radii are halved down to this; then the arm stops at the waypoint."""
 
 LARGEST_FRACTION = 0.45
-"""Of each segment, so that two blends never meet: the controller skips a waypoint whose blend overlaps the next."""
+"""Fraction of each segment, so that two blends never overlap: the controller skips a waypoint whose blend overlaps the
+next."""
 
 SAMPLES = 400
 """Along a segment, to find where the tip comes within the radius."""
 
 
 def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
-    """A radius for each waypoint between the ends; 0 where no corner may be cut.
+    """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut.
 
     Args:
-        checker: Judges contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
+        checker: Checks contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
         waypoints: Shape (k, 6), rad.
 
     Returns:
@@ -80,7 +81,7 @@ def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radiu
     fractions = np.linspace(0.0, 1.0, SAMPLES + 1)
     poses = flange_pose(checker.model, corner + fractions[:, None] * (other - corner))
     tips = poses[:, :3, 3] + checker.tool.needle_length_mm * poses[:, :3, 2]
-    far = np.linalg.norm(tips - tips[0], axis=1)
+    far = np.linalg.norm(tips - tips[0], axis=1)  # mm from the tip at the corner
     if radius_mm > LARGEST_FRACTION * far[-1]:
         return 1.0
     return float(fractions[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
@@ -103,7 +104,7 @@ def _triangle(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats
         across = max(float(checker.sweep_mm(arc).max()) for arc in grid.swapaxes(0, 1)[1:])
         if max(outward, across) <= GRID_MM:
             return grid[:, 1:].reshape(-1, 6)
-        rays = math.ceil(rays * max(1.0, across / GRID_MM))
+        rays = math.ceil(rays * max(1.0, across / GRID_MM))  # refine until neighbours are near enough
         steps = math.ceil(steps * max(1.0, outward / GRID_MM))
 
 
@@ -116,7 +117,7 @@ NOTES = (
 
 
 def csv_text(plan: Plan, *, case_checked: bool) -> str:
-    """The table, with comment lines (#) above its header."""
+    """The plan as CSV, with comment lines (#) above its header."""
     lines = [*heading(plan, NOTES, case_checked=case_checked), ",".join(COLUMNS)]
     for phase in SampledMotion._fields:
         trajectory = getattr(plan, phase)
@@ -126,7 +127,7 @@ def csv_text(plan: Plan, *, case_checked: bool) -> str:
 
 
 def read_csv(text: str, *, where: Path) -> SampledMotion:
-    """Read the table back.
+    """Read such a CSV back.
 
     Raises:
         InputError: Another header, another phase, or rows that are no motion.
@@ -167,7 +168,7 @@ class Exported:
 
 
 class _Draft(NamedTuple):
-    """A text that was read back and found to be the plan, with its notes."""
+    """A text that was read back and equals the plan, with its notes."""
 
     text: str
     notes: tuple[str, ...] = ()
@@ -184,7 +185,7 @@ def export_plan(
         folder: Where the file goes, under the plan file's name.
         source: The plan's file, for its name and for errors.
         checker: Of the plan's own case, against which the plan has been checked (``plan_check``); without it nothing is
-            known beside the plan's way, so no corner is rounded, and the file says so.
+            known off the plan's path, so no corner is rounded, and the file says so.
 
     Raises:
         InputError: Another format, a plan that contradicts itself, or a number beyond the arm's limits; then nothing
@@ -201,7 +202,7 @@ def export_plan(
 
 
 def export_name(source: Path, format_name: str) -> str:
-    """The file's name: that of the plan's file, with the format's end.
+    """Name of an export: that of the plan's file, with the format's ending.
 
     Raises:
         InputError: Another format.

@@ -1,9 +1,4 @@
-"""The files of a plan for MoveIt: each read back before any is published.
-
-Messages of ROS 2 as plain values, in metres: what both the scene and the goals are made of.
-
-The arm's URDF with holder and needle on its flange, as ROS reads it: metres, z along the needle.
-"""
+"""A plan for MoveIt: scene, goals and a URDF with the needle, in metres; each read back before any is published."""
 
 from __future__ import annotations
 
@@ -95,14 +90,14 @@ def _object(name: str, frame: str) -> dict[str, Any]:
 
 
 PATH_TOLERANCE_RAD, GOAL_TOLERANCE_RAD = 0.02, 0.002
-"""Beyond them the controller gives up: on the way 20 mm at a metre, at the end 2 mm."""
+"""Beyond them the controller gives up: along the path 20 mm at a metre, at the end 2 mm."""
 
 GOAL_TIME_S = 1
 """How much later than planned the arm may arrive."""
 
 
 def goal_messages(plan: Plan) -> dict[str, Any]:
-    """``approach`` and ``insertion``."""
+    """The goals ``approach`` and ``insertion``."""
     return {phase: _goal(plan, getattr(plan, phase)) for phase in SampledMotion._fields}
 
 
@@ -169,12 +164,12 @@ wait(done := sent.result().get_result_async()); print(done.result().result)
 
 
 def moveit_names(stem: str) -> tuple[str, ...]:
-    """The files' names for a plan's."""
+    """Names of the MoveIt files of a plan."""
     return tuple(f"{stem}.{end}" for end in (SCENE, GOALS, URDF, SENDER))
 
 
 def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> Mapping[str, str]:
-    """Name to text.
+    """Name to text of the MoveIt files.
 
     Args:
         plan: A plan that was checked against its case.
@@ -206,14 +201,14 @@ BOX, CYLINDER = 1, 3
 """Of ``shape_msgs/SolidPrimitive``."""
 
 GRAIN_M = 1e-6
-"""To what coordinates are rounded."""
+"""m to which coordinates are rounded."""
 
 
 class RosFrames(NamedTuple):
     """The links of an arm's URDF in which messages speak."""
 
     root: str
-    """The root, of a UR ``base_link``: the controller's base turned by 180 deg about z."""
+    """The root, of a UR ``base_link``: the controller's base rotated by 180 deg about z."""
     flange: str
     """The controller's flange, of a UR ``tool0``."""
     touching: tuple[str, ...]
@@ -223,7 +218,7 @@ class RosFrames(NamedTuple):
 
     @classmethod
     def of(cls, urdf: ArmUrdf) -> RosFrames:
-        """Those of an arm."""
+        """The frames of an arm."""
         last = [member.link.name for member in urdf.chain.bodies[-1]]
         touching = dict.fromkeys((last[0], "flange", urdf.chain.flange, *last[1:]))
         return cls(

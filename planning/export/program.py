@@ -1,17 +1,11 @@
-"""What a URScript program does, as numbers: the approach, the standoff, the insertion.
+"""The URScript program of a plan as numbers: approach, standoff and insertion; and the checks before it is written.
 
-The approach is the plan's own way: its straight joint segments from rest to rest are what ``movej`` runs between two
-waypoints, so the waypoints are found again in the samples. A smooth approach has no rests, and is streamed instead.
-The insertion is one ``movel``: the plan's tip runs straight at one orientation, and so does this move, on the one
-branch that leads on from the standoff without a jump.
-
-What a file of samples says: both phases over time. And whether that is what the plan says.
-
-The exported numbers against the arm's limits: positions, speeds and accelerations.
-
-The waypoints of a joint path, found again in its samples.
-
-Words and numbers in exported files: nothing that a plan names can leave its comment or its string.
+The approach runs along the plan's own path: its straight joint segments from rest to rest are what ``movej`` runs
+between two waypoints, so `corner_rows` finds the waypoints again in the samples. A smooth approach has no rests, and is
+streamed instead. The insertion is one ``movel``: the plan's tip runs straight at one orientation, and so does this
+move, on the one branch that leads on from the standoff without a jump.
+`check_trajectory` compares positions, speeds and accelerations with the arm's limits; `plain_text` keeps what a plan
+names inside its comment or string.
 """
 
 from __future__ import annotations
@@ -43,29 +37,16 @@ STREAM_S = SAMPLE_S
 """Period of a streamed approach: that of a CB3 controller, and four of an e-Series one."""
 
 MOST_SAMPLES = 200_000
-"""Of one phase: 27 minutes of a stream. The straight move is looked at in no more steps, however slow it is."""
-
-
-class JointMove(NamedTuple):
-    """One ``movej``: straight in joint angles."""
-
-    q: Floats
-    """Where it ends, shape (6,), rad."""
-    speed: float
-    """Peak speed of the joint that turns farthest, rad/s."""
-    acceleration: float
-    """Of the same joint, rad/s^2."""
-    blend_mm: float
-    """Radius about its end within which the tip may round the corner; 0 stops there."""
+"""Samples of one phase: 27 minutes of a stream. The straight move is checked in no more steps, however slow it is."""
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A URScript program's numbers: mm, rad, s, the controller's base frame.
+    """A URScript program as numbers: mm, rad, s, the controller's base frame.
 
     Attributes:
         tcp_mm: Needle tip in the flange frame, along z.
-        start_q: Shape (6,), where the arm must stand.
+        start_q: Shape (6,), the arm's joints at the start.
         moves: The approach as moves from rest to rest, or empty.
         stream_q: Shape (n, 6), the approach as angles every ``STREAM_S``, or n = 0.
         T_base_standoff: Shape (4, 4), needle tip before the insertion.
@@ -88,20 +69,24 @@ class Program:
     insertion_mm_s2: float
 
 
+class JointMove(NamedTuple):
+    """One ``movej``: straight in joint angles."""
+
+    q: Floats
+    """Where it ends, shape (6,), rad."""
+    speed: float
+    """Peak speed of the joint that turns farthest, rad/s."""
+    acceleration: float
+    """Peak acceleration of the same joint, rad/s^2."""
+    blend_mm: float
+    """Radius about its end within which the tip may round the corner; 0 stops there."""
+
+
 class _Ramp(NamedTuple):
     """Peak speed and acceleration of a trapezoid."""
 
     speed: float
     acceleration: float
-
-
-def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
-    """Rows of the approach's waypoints, both ends among them: one where nothing moves, none for a smooth approach."""
-    if np.abs(plan.approach.q - plan.approach.q[0]).max() <= STRAIGHT_RAD:
-        return np.zeros(1, dtype=np.intp)
-    rows = corner_rows(plan.approach.q)
-    straight = rests_at(plan.model, plan.approach, rows[1:-1])
-    return rows if straight else rows[:0]
 
 
 def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
@@ -140,6 +125,15 @@ def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
     )
 
 
+def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
+    """Rows of the approach's waypoints, both ends among them: one where nothing moves, none for a smooth approach."""
+    if np.abs(plan.approach.q - plan.approach.q[0]).max() <= STRAIGHT_RAD:
+        return np.zeros(1, dtype=np.intp)
+    rows = corner_rows(plan.approach.q)
+    straight = rests_at(plan.model, plan.approach, rows[1:-1])
+    return rows if straight else rows[:0]
+
+
 def straight_move(model: UrModel, program: Program) -> Trajectory:
     """The insertion as the controller runs it: the tip straight, a trapezoid in time, on the standoff's branch.
 
@@ -156,7 +150,7 @@ def straight_move(model: UrModel, program: Program) -> Trajectory:
     poses = np.repeat(program.T_base_target[None], len(times), axis=0)
     poses[:, :3, 3] = start + travelled[:, None] * (end - start) / length - program.tcp_mm * poses[:, :3, 2]
     branches = inverse(model, poses)
-    off = np.abs(wrap_to_pi(branches[0] - program.standoff_q)).max(axis=1)
+    off = np.abs(wrap_to_pi(branches[0] - program.standoff_q)).max(axis=1)  # by the joint farthest off
     if np.isnan(off).all():
         raise InputError("the arm does not reach its standoff", where="insertion", allowed="a pose within reach")
     q = branches[:, int(np.nanargmin(off))]
@@ -169,7 +163,7 @@ def straight_move(model: UrModel, program: Program) -> Trajectory:
 def _joint_move(trajectory: Trajectory, first: int, last: int, blend_mm: float) -> JointMove:
     """The move over the samples first..last, in the time that the plan takes."""
     q, times = trajectory.q[first : last + 1], trajectory.times_s[first : last + 1]
-    leading = int(np.argmax(np.abs(q[-1] - q[0])))
+    leading = int(np.argmax(np.abs(q[-1] - q[0])))  # movej's speed is that of the joint that moves farthest
     ramp = _ramp(np.abs(q[:, leading] - q[0, leading]), times)
     return JointMove(q[-1], ramp.speed, ramp.acceleration, blend_mm)
 
@@ -195,7 +189,7 @@ def _ramp(travelled: Floats, times: Floats) -> _Ramp:
 
 
 def stream_times(steps: int) -> Floats:
-    """Shape (steps + 1,), from 0, s."""
+    """Times of a stream from 0, shape (steps + 1,), s."""
     return np.asarray(STREAM_S * np.arange(steps + 1), dtype=np.float64)
 
 
@@ -216,13 +210,13 @@ def _insertion_ramp(plan: Plan, tips: Floats) -> _Ramp:
 
 def _trapezoid(length: float, speed: float, acceleration: float) -> tuple[Floats, Floats]:
     """Times and distances run, both (m,), from rest to rest, in equal steps of ``STREAM_S`` or, of a long one, more."""
-    speed = min(speed, math.sqrt(length * acceleration))
+    speed = min(speed, math.sqrt(length * acceleration))  # a triangle where the length is short
     ramp, plateau = speed / acceleration, length / speed - speed / acceleration
     end = 2.0 * ramp + plateau
     times = np.linspace(0.0, end, min(max(2, math.ceil(end / STREAM_S)), MOST_SAMPLES) + 1)
     early, late = np.minimum(times, ramp), np.maximum(times - ramp - plateau, 0.0)
     travelled = acceleration * early**2 / 2 + speed * (times - early) - acceleration * late**2 / 2
-    travelled[-1] = length
+    travelled[-1] = length  # sums of steps round
     return times, travelled
 
 
@@ -369,7 +363,7 @@ REST_SLACK = 1e-6
 
 
 def corner_rows(q: Floats) -> NDArray[np.intp]:
-    """Rows at which a path turns or turns back, with both ends: every other row lies between two of them.
+    """Rows of the corners and reversals of a path, with both ends; every other row lies between two of them.
 
     Splits at the row farthest from the chord until none is off (Douglas and Peucker 1973, in six dimensions). For a
     path of straight segments that row is always one of its waypoints.
@@ -406,7 +400,7 @@ def _turning_row(rows: Floats) -> int | None:
 
 
 def rests_at(model: UrModel, trajectory: Trajectory, rows: NDArray[np.intp]) -> bool:
-    """Whether the arm can be at rest at each of the rows: beside it no joint is faster than one step of braking allows.
+    """Whether the arm can be at rest at each row: next to it no joint is faster than one step of braking allows.
 
     Args:
         model: The arm: its acceleration limit.
@@ -420,7 +414,7 @@ def rests_at(model: UrModel, trajectory: Trajectory, rows: NDArray[np.intp]) -> 
 
 
 PLAIN = frozenset(string.ascii_letters + string.digits + " ._-+:/()")
-"""What may stand in a comment or a string of any of the formats: nothing that ends, escapes or nests one."""
+"""What may be in a comment or a string of any of the formats: nothing that ends, escapes or nests one."""
 
 LONGEST = 200
 """Characters of one name; a longer one is cut."""
@@ -456,7 +450,7 @@ def warning_lines(warnings: Sequence[str] | None) -> list[str]:
 
 
 def counted(warnings: Sequence[str]) -> str:
-    """How many there are, in words that can be read aloud."""
+    """A number of warnings in words that can be read aloud."""
     return f"{len(warnings)} warning{'s' if len(warnings) > 1 else ''}"
 
 

@@ -1,6 +1,6 @@
-"""Everything of a case and a chosen path that Slicer can show, as texts that were read back and found equal.
+"""A case and a chosen path as files for 3D Slicer, read back and found equal: scene, path, markers, entry area.
 
-The skin through which safe paths enter, as a surface between the entries of neighbouring directions.
+The entry area is the skin through which safe paths enter, as a surface between entries of neighbouring directions.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ _SHOWN = {
 
 @dataclass(frozen=True)
 class SceneNode:
-    """What a scene shows.
+    """One node of a scene.
 
     Attributes:
         kind: Of the node, by Slicer's name.
         name: As Slicer lists it.
-        file: Where it is stored, beside the scene.
+        file: Where it is stored, next to the scene.
     """
 
     kind: Kind
@@ -66,7 +66,7 @@ class SceneNode:
 
 
 def scene_text(nodes: Sequence[SceneNode]) -> str:
-    """The scene's file."""
+    """The scene as MRML text."""
     root = ElementTree.Element("MRML", version="Slicer4.4.0", userTags="")
     count: Counter[str] = Counter()
 
@@ -110,8 +110,8 @@ _AXES = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """What is to be shown.
+class SceneContent:
+    """Content of the files for Slicer.
 
     Attributes:
         name: Of the path, as Slicer lists it.
@@ -128,18 +128,18 @@ class Drawn:
 
 @dataclass(frozen=True, eq=False)
 class SlicerFiles:
-    """The files by their names, and what whoever opens them should know."""
+    """The files by their names, and notes for whoever opens them."""
 
     texts: Mapping[str, str]
     notes: tuple[str, ...]
 
 
-def slicer_files(case: Case, drawn: Drawn) -> SlicerFiles:
+def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
     """The files of a case and a path.
 
     Args:
         case: Its target and space.
-        drawn: The path, and what stands beside it.
+        drawn: The path, and what is next to it.
 
     Raises:
         InputError: A case in a frame of its own, which Slicer has no name for.
@@ -199,7 +199,7 @@ def _same(read: object, written: object, name: str) -> None:
 
 
 def markups_text(kind: Literal["Fiducial", "Line"], name: str, labels: Sequence[str], points_ct: Floats) -> str:
-    """The file of one markup.
+    """One markup as JSON text.
 
     Args:
         kind: ``Line`` has two points.

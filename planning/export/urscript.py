@@ -136,7 +136,7 @@ def _approach(program: Program) -> list[str]:
 
 
 def _of_warnings(warnings: Sequence[str] | None) -> str:
-    """What the popup says of the plan's warnings: how many, and how the first begins."""
+    """Warnings in the popup: how many, and how the first begins."""
     if warnings is None:
         return "Its warnings are not known. "
     if not warnings:
@@ -235,7 +235,7 @@ def read_urscript(text: str, *, where: Path) -> Program:
 
 
 def _number(value: float) -> str:
-    """Fixed point, no negative zero."""
+    """A number in fixed point, without a negative zero."""
     text = f"{value:.{DIGITS}f}"
     return text.lstrip("-") if float(text) == 0.0 else text
 

@@ -33,7 +33,7 @@ HARMLESS = (
     *("*sums", "*.sha256", "*.md5"),
 )
 """Names of what can hold no organ, in lower case: of file managers, of versions, what segmentation programs write
-beside their masks, cases, scenes, tables, lists of points, pictures and plain text."""
+with their masks, cases, scenes, tables, lists of points, pictures and plain text."""
 
 STRUCTURE_LIKE = re.compile(
     r"\.(nii|nrrd|nhdr|mha|mhd|hdr|img|mgz|mgh|mnc|npz|npy|dcm|stl|obj|ply|glb|gltf|vtp|vtk|vtu|3mf|wrl)(?![a-z0-9])",
@@ -41,17 +41,17 @@ STRUCTURE_LIKE = re.compile(
 )
 """Names of what may be a structure: of volumes and meshes, also those that are not read, packed, cut or renamed."""
 
-BESIDE = (".dvc", ".json")
-"""Endings of files about a file that lies beside them, whose name they have with or without its own ending."""
+ABOUT_MASK = (".dvc", ".json")
+"""Endings of files about a file next to them, whose name they have with or without its own ending."""
 
 PROBABILITIES, VOLUMES = (".npz", ".pkl"), (".nii.gz", ".nii", ".nrrd")
-"""Endings of what nnU-Net writes about each mask, and of the mask beside it."""
+"""Endings of what nnU-Net writes about each mask, and of the mask next to it."""
 
 THUMBNAILS = "@eaDir"
 """The folder in which a file server keeps previews, each named like the file that it shows."""
 
 APPLE_DOUBLE = "._"
-"""How the name of a file begins in which macOS keeps what another file system cannot, beside the file itself."""
+"""How the name of a file begins in which macOS keeps what another file system cannot, next to the file itself."""
 
 MOST_DEPTH, MOST_INSIDE = 6, 100_000
 """Folders in folders, and entries of each, that are looked through for something that is not accounted for."""
@@ -69,8 +69,8 @@ class Entry(NamedTuple):
     what: str
 
     @property
-    def said(self) -> str:
-        """Its name, and why it is not read."""
+    def line(self) -> str:
+        """Name of the entry, and why it is not read."""
         return f"{self.name} ({self.what or NOT_READ})"
 
 
@@ -130,16 +130,16 @@ def is_harmless(name: str, names: Collection[str]) -> bool:
     stem, _, _ = name.rpartition(".")
     if name.endswith(PROBABILITIES) and any(stem + end in names for end in VOLUMES):
         return True
-    about = next((name.removesuffix(end) for end in BESIDE if name.endswith(end)), name)
+    about = next((name.removesuffix(end) for end in ABOUT_MASK if name.endswith(end)), name)
     about = about.removeprefix(APPLE_DOUBLE)
-    if about != name and any(f"{one}.".startswith(f"{about}.") and not one.endswith(BESIDE) for one in names):
+    if about != name and any(f"{one}.".startswith(f"{about}.") and not one.endswith(ABOUT_MASK) for one in names):
         return True
-    told = not STRUCTURE_LIKE.search(name) or stem in names
-    return told and any(fnmatchcase(name.lower(), pattern) for pattern in HARMLESS)
+    inferred = not STRUCTURE_LIKE.search(name) or stem in names
+    return inferred and any(fnmatchcase(name.lower(), pattern) for pattern in HARMLESS)
 
 
 def is_passed_over(folder: Path) -> bool:
-    """Whether a folder is this program's output, or holds previews or versions: nothing in it is a patient's."""
+    """Whether a folder contains nothing of a patient: this program's output, previews or versions."""
     versions = folder.name.startswith(".") and is_harmless(folder.name, ())
     return versions or folder.name == THUMBNAILS or is_output_folder(folder)
 
@@ -153,7 +153,7 @@ def _holds_known(folder: Path, known: Callable[[Path], bool], depth: int) -> boo
 
 
 def structure_below(folder: Path) -> str:
-    """What is named like a volume or mesh below a folder, at any depth; "" if nothing is, and all of it was seen."""
+    """Path of something named like a volume or mesh below a folder; "" if there is none and all was seen."""
     seen, closed = 0, list[OSError]()
     for top, folders, files in os.walk(folder, onerror=closed.append, followlinks=True):
         folders[:] = [one for one in folders if not is_passed_over(Path(top, one))]

@@ -19,7 +19,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.text_names import check_name
 
 MAX_COORDINATE_MM = 100_000.0
-"""Farthest from the origin: no room is 100 m wide; beyond, a sentinel value or a broken float is likely."""
+"""Farthest from the origin: no workcell is 100 m wide; beyond, a sentinel value or a broken float is likely."""
 ROTATION_TOLERANCE = 1e-5
 """Largest entry of |R^T R - I|: files write 6 to 7 digits; at 500 mm this still is only 0.005 mm."""
 
@@ -30,7 +30,7 @@ _TRANSFORM_ALLOWED = (
 
 
 def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
-    """A rigid motion that may be trusted, or an error.
+    """A rigid motion that passed the guard: finite, a rotation, near the origin.
 
     Args:
         T: Shape (4, 4), maps coordinates between two frames, mm.
@@ -58,7 +58,7 @@ def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
 
 
 def guard_points(points: ArrayLike, names: Sequence[str], *, where: str | Path) -> NDArray[np.float64]:
-    """Named points that may be trusted, or an error.
+    """Named points that passed the guard: finite, near the origin, each name once.
 
     Args:
         points: Shape (n, 3), mm, any frame.
@@ -106,7 +106,7 @@ def _float_array(values: ArrayLike, *, what: str, where: str | Path, allowed: st
 
 
 def points_array(points: ArrayLike, names: Sequence[str], *, what: str, where: str | Path) -> NDArray[np.float64]:
-    """Points (n, 3), one or more, all finite; what each is, and its name, stand in the error."""
+    """Points (n, 3), one or more, all finite; what each is, and its name, are in the error."""
     allowed = f"three finite numbers per {what}, at least one {what}"
     array = _float_array(points, what=f"{what} list", where=where, allowed=allowed)
     if array.size == 0:

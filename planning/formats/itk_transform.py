@@ -1,22 +1,11 @@
 """Linear transforms of ITK, as text (.tfm, .txt) or HDF5 (.h5): what 3D Slicer, SimpleITK and ANTs write.
 
-Which frame a transform's points are in, no file says.
-Source: ITK, TxtTransformIO; Slicer's developer guide, "Transforms": a node's file goes from its parent.
-
-Linear transforms as ITK parametrises them, and the one matrix that they are together.
-
-Each states what ``TransformPoint`` does: y = M (x - c) + c + t, with x and y in LPS mm, M from the parameters and the
-centre of rotation c from the fixed ones. A composite applies its last part first.
-Source: ITK, MatrixOffsetTransformBase, Euler3DTransform (M = Rz Rx Ry, or Rz Ry Rx where its flag says ZYX),
-VersorRigid3DTransform, CompositeTransform.
-
-Transforms of ITK in HDF5 (.h5): the default of 3D Slicer for all transforms, and of ANTs for composites.
-
-A file has a group ``TransformGroup`` with groups ``0``, ``1``, ... of ``TransformType`` (one text),
-``TransformParameters`` and ``TransformFixedParameters``; files of ITK 4 spell both ``Tranform``. A composite is group 0
-without parameters, its parts the groups after it. What is read are the bytes that were hashed: nothing that points
-elsewhere is followed. The texts are found by `heap_text`: HDF5's own library never ends on some damaged heaps.
-Source: ITK, HDF5TransformIO. Needs the extra ``hdf5`` (h5py), which is imported only here.
+Each transform states what ``TransformPoint`` does: y = M (x - c) + c + t, with x and y in LPS mm, M from the parameters
+and the centre of rotation c from the fixed ones. A composite applies its last part first. In which frame a transform's
+points are, no file says.
+Source: ITK, TxtTransformIO, HDF5TransformIO, MatrixOffsetTransformBase, Euler3DTransform (M = Rz Rx Ry, or Rz Ry Rx
+where its flag says ZYX), VersorRigid3DTransform, CompositeTransform; Slicer's developer guide, "Transforms": a node's
+file goes from its parent.
 """
 
 from __future__ import annotations
@@ -56,7 +45,7 @@ def most_bytes(name: str) -> int:
 
 
 def parse_transform(data: bytes, path: Path) -> Floats:
-    """The rigid motion of a file: what it does to a point, shape (4, 4), mm.
+    """The rigid motion of points that a file states, shape (4, 4), mm.
 
     Args:
         data: The whole file.
@@ -108,7 +97,7 @@ def _numbers(stated: dict[str, str], key: str, where: str) -> Floats:
 
 
 def transform_text(T: Floats) -> str:
-    """The file of a motion that does this to a point, shape (4, 4), mm; it reads back to the same numbers.
+    """The text file of a motion of points, shape (4, 4), mm; it reads back to the same numbers.
 
     >>> print(transform_text(np.eye(4)).splitlines()[2])
     Transform: AffineTransform_double_3_3
@@ -154,7 +143,7 @@ class StatedTransform(NamedTuple):
 
 
 def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
-    """What the transforms of one file do to a point, shape (4, 4), mm; whether it is rigid is not looked at.
+    """The motion of points by the transforms of one file, shape (4, 4), mm; whether it is rigid is not checked.
 
     Raises:
         InputError: None, several that are no composite, or one of another kind or with other parameters.
@@ -181,7 +170,7 @@ def _check_kind(kind: str, where: str) -> None:
 
 
 def _motion(stated: StatedTransform, where: str) -> Floats:
-    """Of one part, shape (4, 4)."""
+    """The motion of points by one part, shape (4, 4)."""
     name = stated.kind.partition("_")[0]
     count, fixed_counts = _SIZES.get(name, _MATRIX_SIZES)
     _check_count(stated.parameters, (count,), "Parameters", where)
@@ -202,7 +191,7 @@ def _check_count(numbers: Floats, counts: tuple[int, ...], key: str, where: str)
 
 
 def _euler(angles: Floats, *, zyx: bool) -> Floats:
-    """Rotation of the angles about x, y and z, rad."""
+    """Rotation by the angles about x, y and z, rad."""
     x, y, z = (_about(axis, angle) for axis, angle in enumerate(angles))
     product: Floats = z @ y @ x if zyx else z @ x @ y
     return product
@@ -230,11 +219,12 @@ def _versor(v: Floats, where: str) -> Floats:
 
 
 MAX_STORED_BYTES = 4096
-"""Of one list of numbers: twelve doubles are 96; compressed ones cannot grow to more than a thousand times of this."""
+"""Bytes of one list of numbers: twelve doubles are 96; compressed ones cannot grow to more than a thousand times of
+this."""
 MAX_NUMBERS = 64
-"""Of one list: more than any linear transform has."""
+"""Numbers of one list: more than any linear transform has."""
 HEAP_HEAD_BYTES = 16
-"""Of a collection, and of each object in it."""
+"""Bytes of the head of a collection, and of each object in it."""
 _GROUP, _TYPE = "TransformGroup", "TransformType"
 _PARAMETERS = ("TransformParameters", "TranformParameters")
 _FIXED = ("TransformFixedParameters", "TranformFixedParameters")
@@ -248,6 +238,12 @@ _AS_TEXT = (
 
 def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
     """The transforms of a file in its order, linear or not; lists too long for a linear one come empty.
+
+    A file has a group ``TransformGroup`` with groups ``0``, ``1``, ... of ``TransformType`` (one text),
+    ``TransformParameters`` and ``TransformFixedParameters``; files of ITK 4 spell both ``Tranform``. A composite is
+    group 0 without parameters, its parts the groups after it. What is read are the bytes that were hashed: nothing
+    that points elsewhere is followed. The texts are found by `heap_text`: HDF5's own library never ends on some damaged
+    heaps. Needs the extra ``hdf5`` (h5py), which is imported only here.
 
     Args:
         data: The whole file.
@@ -287,7 +283,7 @@ def _own(h5py: Any, parent: Any, name: str, kind: type, where: str) -> Any:
 
 
 class _Members:
-    """What one transform's group holds."""
+    """The members of one transform's group."""
 
     def __init__(self, h5py: Any, group: Any, content: bytes, where: str) -> None:
         self._h5py, self._group, self._content, self._where = h5py, group, content, where

@@ -1,21 +1,13 @@
-"""Named points of other programs: CSV, Slicer markups (.mrk.json) and the older Slicer lists (.fcsv), in mm.
+"""Named points and joint recordings of other programs: CSV, Slicer markups (.mrk.json) and older Slicer lists (.fcsv).
 
 A CSV states its unit in the header (``name,x_mm,y_mm,z_mm``) and leaves the space to the case; Slicer's files state
-both. Whatever states a patient space arrives in LPS.
+both. Whatever states a patient space arrives in LPS, in mm. Source: Slicer documentation, "Markups" module, file
+formats, and its published schema of versions 1.0.0 to 1.0.3; in older files the coordinate system is a number. Version
+1.0.0 knows no ``coordinateUnits``: Slicer works in mm.
 
-Points as CSV: a header with the unit in it, then one point per line.
-
-Points of 3D Slicer: markups as JSON (.mrk.json), and the older fiducial lists (.fcsv).
-
-Source: Slicer documentation, "Markups" module, file formats, and its published schema of versions 1.0.0 to 1.0.3;
-in older files the coordinate system is a number. Version 1.0.0 knows no ``coordinateUnits``: Slicer works in mm.
-
-What a point file holds, before unit, space and the guard: the common result of its readers.
-
-The one gate for how an arm stood: joint angles and times that a file, a case or a controller states.
-
-A recording, a list of touches, a case's home and a live controller's word come through here: angles that a joint can
-have, in the unit that is stated, at times that do not run backwards. Whose arm: `planning/arm/kinematics.py`.
+`joint_readings` is the one gate for joint angles and times, of a recording, a list of touches, a case's home or a live
+controller: angles that a joint can have, in the stated unit, at times that do not run backwards. Whose arm they are of
+is checked in `planning/arm/kinematics.py`.
 """
 
 from __future__ import annotations
@@ -43,6 +35,177 @@ from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit, to_lps
+
+
+@dataclass(frozen=True, eq=False)
+class NamedPoints:
+    """Points with names, as guarded: finite, at least one, every name once.
+
+    Attributes:
+        names: Shape (n,), in the order of the file.
+        points: Shape (n, 3), mm, read-only, in ``space``.
+        space: LPS for patient data, LOCAL for a frame of its own, None where it is not stated (such as a robot's base).
+        kinds: Shape (n,), what each point is, where the file says so ("marker", "lesion").
+        joints: Shape (n, 6), rad, read-only: how the robot stood at the touch of each, where the file says so.
+    """
+
+    names: tuple[str, ...]
+    points: NDArray[np.float64]
+    space: Space | None
+    kinds: tuple[str, ...] | None = None
+    joints: NDArray[np.float64] | None = None
+
+    @brief
+    def __repr__(self) -> str:
+        named = ", ".join(self.names[:MOST_NAMED]) + (", ..." if len(self.names) > MOST_NAMED else "")
+        return f"{len(self.names)} points, {self.space or 'no space stated'}: {named}"
+
+    def __post_init__(self) -> None:
+        for name in ("points", "joints"):
+            if getattr(self, name) is not None:
+                array = np.array(getattr(self, name), dtype=np.float64)
+                array.setflags(write=False)
+                object.__setattr__(self, name, array)
+
+
+MAX_FILE_BYTES = 10_000_000
+"""A hundred thousand points; a larger file is no list of markers."""
+
+MOST_NAMED = 8
+"""Points that a line about a list names."""
+
+
+def read_points(
+    path: Path,
+    *,
+    default_space: Space | None = None,
+    default_unit: Unit | None = None,
+) -> NamedPoints:
+    """The points of one file, in mm; in LPS where the file or the caller names a patient space.
+
+    Args:
+        path: A .csv, .mrk.json or .fcsv file.
+        default_space: The space of a file that states none: the case's, or None for a robot's base.
+        default_unit: The unit of a file that states none; None refuses such a file.
+
+    Raises:
+        InputError: If it cannot be read, contradicts the caller, or its points fail the guard.
+    """
+    _reader(path, str(path))  # an unknown ending is refused before anything is read
+    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
+    return parse_points(data, path, default_space=default_space, default_unit=default_unit)
+
+
+def parse_points(
+    data: bytes,
+    path: Path,
+    *,
+    default_space: Space | None = None,
+    default_unit: Unit | None = None,
+) -> NamedPoints:
+    """As `read_points`, of a file that has been read; it is not opened again.
+
+    Args:
+        data: The whole file.
+        path: Its name, whose ending says the format.
+        default_space: As in `read_points`.
+        default_unit: As in `read_points`.
+
+    Raises:
+        InputError: As `read_points`, but for reading.
+    """
+    name = str(path)
+    raw = _reader(path, name)(data, name)
+    unit = raw.unit or default_unit
+    if unit is None:
+        raise InputError("no unit of length", where=name, allowed="x_mm,y_mm,z_mm in the header")
+    if raw.space is not None and default_space is Space.LOCAL:
+        message = f"points in {raw.space}, but the case has a local frame"
+        raise InputError(message, where=name, allowed="points in the case's own space, as CSV")
+    space = raw.space or default_space
+    points = np.array(raw.points, dtype=np.float64).reshape(-1, 3)
+    with np.errstate(over="ignore"):  # beyond the range of floats is infinite, which the guard refuses
+        points = points * unit.mm if space is None else to_lps(points, space) * unit.mm
+    guarded = guard_points(points, raw.names, where=name)
+    joints = None
+    if raw.joints_deg is not None:
+        joints = joint_readings(raw.joints_deg, "deg", where=name, names=raw.names)
+    return NamedPoints(tuple(raw.names), guarded, Space.LPS if space is Space.RAS else space, raw.kinds, joints)
+
+
+def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
+    reader = next((read for suffix, read in _READERS.items() if path.name.lower().endswith(suffix)), None)
+    if reader is None:
+        raise InputError(f"unknown point file {path.name!r}", where=where, allowed=", ".join(_READERS))
+    return reader
+
+
+def write_points(path: Path, points: NamedPoints) -> None:
+    """A CSV with ``name,x_mm,y_mm,z_mm``, and joints, that reads back to the same numbers; whole, or not at all.
+
+    The space is not written: a CSV speaks in the space of its case.
+
+    Raises:
+        InputError: If the place cannot be written to.
+    """
+    joints = points.joints is not None
+    header = ["name", *(["kind"] if points.kinds else []), "x_mm", "y_mm", "z_mm"]
+    header += JOINTS_DEG if joints else []
+    labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)
+    numbers = points.points if points.joints is None else np.hstack([points.points, np.degrees(points.joints)])
+    rows = [[*label, *map(repr, row)] for label, row in zip(labels, numbers.tolist(), strict=True)]
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    except OSError as error:
+        raise InputError(f"cannot be written ({error})", where=path, allowed="a folder to write to") from error
+    part = Path(name)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([header, *rows])
+        part.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot be written ({error})", where=path, allowed="a file name of a folder") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class RawPoints(NamedTuple):
+    """Points as their file states them; the guard has not seen them yet.
+
+    Attributes:
+        names: One per point.
+        points: Three coordinates per point, in ``unit`` and ``space``.
+        unit: None if the file states none.
+        space: None if the file states none.
+        kinds: One per point, if the file has them.
+        joints_deg: Six joint angles per point, if the file says how the robot stood there.
+    """
+
+    names: list[str]
+    points: list[tuple[float, float, float]]
+    unit: Unit | None
+    space: Space | None
+    kinds: tuple[str, ...] | None = None
+    joints_deg: list[tuple[float, ...]] | None = None
+
+
+def parse_coordinate(text: str, where: str) -> float:
+    """A finite decimal number.
+
+    Raises:
+        InputError: If the text is anything else, such as a decimal comma, NaN or an empty field.
+    """
+    allowed = "a finite number with a decimal point"
+    if "_" in text:  # Python would read 1_0 as 10
+        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed)
+    try:
+        number = float(text)
+    except ValueError as error:
+        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed) from error
+    if not math.isfinite(number):
+        raise InputError(f"{text[:40]!r} is not finite", where=where, allowed=allowed)
+    return number
+
 
 _ALLOWED = (
     "a header name,x_mm,y_mm,z_mm (or _cm, _m; kind, and q1_deg to q6_deg, may be added), "
@@ -125,12 +288,18 @@ def _unit(header: list[str], where: str) -> Unit | None:
 
 
 _MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, defined control points"
+
 _LINE_POINTS = 2
+
 _SPACES = {"LPS": Space.LPS, "RAS": Space.RAS, "0": Space.RAS, "1": Space.LPS}
+
 _FCSV_ALLOWED = "a Slicer fiducial list with '# CoordinateSystem = ' and '# columns = id,x,y,z,...,label,...'"
+
 _FCSV_DEFINED = "2"
 """Slicer 5 writes two fields more than its header names: whether the position is defined (2), and one other."""
+
 _FCSV_SYSTEM = "# coordinatesystem"
+
 _FCSV_COLUMNS = "# columns"
 
 
@@ -253,188 +422,21 @@ def _fcsv_fields(line: str, where: str) -> list[str]:
         raise InputError(f"{error}", where=where, allowed=_FCSV_ALLOWED) from error
 
 
-MAX_FILE_BYTES = 10_000_000
-"""A hundred thousand points; a larger file is no list of markers."""
-
 _READERS: Mapping[str, Callable[[bytes, str], RawPoints]] = MappingProxyType(
     {".csv": read_csv_points, ".mrk.json": read_markups_points, ".fcsv": read_fcsv_points}
 )
 
-
-MOST_NAMED = 8
-"""Points that a line about a list names."""
-
-
-@dataclass(frozen=True, eq=False)
-class NamedPoints:
-    """Points with names, as guarded: finite, at least one, every name once.
-
-    Attributes:
-        names: Shape (n,), in the order of the file.
-        points: Shape (n, 3), mm, read-only, in ``space``.
-        space: LPS for patient data, LOCAL for a frame of its own, None where nobody said (such as a robot's base).
-        kinds: Shape (n,), what each point is, where the file says so ("marker", "lesion").
-        joints: Shape (n, 6), rad, read-only: how the robot stood at the touch of each, where the file says so.
-    """
-
-    names: tuple[str, ...]
-    points: NDArray[np.float64]
-    space: Space | None
-    kinds: tuple[str, ...] | None = None
-    joints: NDArray[np.float64] | None = None
-
-    @brief
-    def __repr__(self) -> str:
-        named = ", ".join(self.names[:MOST_NAMED]) + (", ..." if len(self.names) > MOST_NAMED else "")
-        return f"{len(self.names)} points, {self.space or 'no space stated'}: {named}"
-
-    def __post_init__(self) -> None:
-        for name in ("points", "joints"):
-            if getattr(self, name) is not None:
-                array = np.array(getattr(self, name), dtype=np.float64)
-                array.setflags(write=False)
-                object.__setattr__(self, name, array)
-
-
-def read_points(
-    path: Path,
-    *,
-    default_space: Space | None = None,
-    default_unit: Unit | None = None,
-) -> NamedPoints:
-    """The points of one file, in mm; in LPS where the file or the caller names a patient space.
-
-    Args:
-        path: A .csv, .mrk.json or .fcsv file.
-        default_space: The space of a file that states none: the case's, or None for a robot's base.
-        default_unit: The unit of a file that states none; None refuses such a file.
-
-    Raises:
-        InputError: If it cannot be read, contradicts the caller, or its points fail the guard.
-    """
-    _reader(path, str(path))  # an unknown ending is refused before anything is read
-    data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
-    return parse_points(data, path, default_space=default_space, default_unit=default_unit)
-
-
-def parse_points(
-    data: bytes,
-    path: Path,
-    *,
-    default_space: Space | None = None,
-    default_unit: Unit | None = None,
-) -> NamedPoints:
-    """The same of a file that has been read; it is not opened again.
-
-    Args:
-        data: The whole file.
-        path: Its name, whose ending says the format.
-        default_space: As in `read_points`.
-        default_unit: As in `read_points`.
-
-    Raises:
-        InputError: As `read_points`, but for reading.
-    """
-    name = str(path)
-    raw = _reader(path, name)(data, name)
-    unit = raw.unit or default_unit
-    if unit is None:
-        raise InputError("no unit of length", where=name, allowed="x_mm,y_mm,z_mm in the header")
-    if raw.space is not None and default_space is Space.LOCAL:
-        message = f"points in {raw.space}, but the case has a local frame"
-        raise InputError(message, where=name, allowed="points in the case's own space, as CSV")
-    space = raw.space or default_space
-    points = np.array(raw.points, dtype=np.float64).reshape(-1, 3)
-    with np.errstate(over="ignore"):  # beyond the range of floats is infinite, which the guard refuses
-        points = points * unit.mm if space is None else to_lps(points, space) * unit.mm
-    guarded = guard_points(points, raw.names, where=name)
-    joints = None
-    if raw.joints_deg is not None:
-        joints = joint_readings(raw.joints_deg, "deg", where=name, names=raw.names)
-    return NamedPoints(tuple(raw.names), guarded, Space.LPS if space is Space.RAS else space, raw.kinds, joints)
-
-
-def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
-    reader = next((read for suffix, read in _READERS.items() if path.name.lower().endswith(suffix)), None)
-    if reader is None:
-        raise InputError(f"unknown point file {path.name!r}", where=where, allowed=", ".join(_READERS))
-    return reader
-
-
-def write_points(path: Path, points: NamedPoints) -> None:
-    """A CSV with ``name,x_mm,y_mm,z_mm``, and joints, that reads back to the same numbers; whole, or not at all.
-
-    The space is not written: a CSV speaks in the space of its case.
-
-    Raises:
-        InputError: If the place cannot be written to.
-    """
-    joints = points.joints is not None
-    header = ["name", *(["kind"] if points.kinds else []), "x_mm", "y_mm", "z_mm"]
-    header += JOINTS_DEG if joints else []
-    labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)
-    numbers = points.points if points.joints is None else np.hstack([points.points, np.degrees(points.joints)])
-    rows = [[*label, *map(repr, row)] for label, row in zip(labels, numbers.tolist(), strict=True)]
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    except OSError as error:
-        raise InputError(f"cannot be written ({error})", where=path, allowed="a folder to write to") from error
-    part = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([header, *rows])
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot be written ({error})", where=path, allowed="a file name of a folder") from error
-    finally:
-        part.unlink(missing_ok=True)
-
-
-class RawPoints(NamedTuple):
-    """Points as their file states them; the guard has not seen them yet.
-
-    Attributes:
-        names: One per point.
-        points: Three coordinates per point, in ``unit`` and ``space``.
-        unit: None if the file states none.
-        space: None if the file states none.
-        kinds: One per point, if the file has them.
-        joints_deg: Six joint angles per point, if the file says how the robot stood there.
-    """
-
-    names: list[str]
-    points: list[tuple[float, float, float]]
-    unit: Unit | None
-    space: Space | None
-    kinds: tuple[str, ...] | None = None
-    joints_deg: list[tuple[float, ...]] | None = None
-
-
-def parse_coordinate(text: str, where: str) -> float:
-    """A finite decimal number.
-
-    Raises:
-        InputError: If the text is anything else, such as a decimal comma, NaN or an empty field.
-    """
-    allowed = "a finite number with a decimal point"
-    if "_" in text:  # Python would read 1_0 as 10
-        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed)
-    try:
-        number = float(text)
-    except ValueError as error:
-        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed) from error
-    if not math.isfinite(number):
-        raise InputError(f"{text[:40]!r} is not finite", where=where, allowed=allowed)
-    return number
-
-
 AngleUnit = Literal["rad", "deg"]
 
 JOINTS_DEG = tuple(f"q{number}_deg" for number in range(1, 7))
+
 JOINTS_RAD = tuple(f"q{number}_rad" for number in range(1, 7))
+
 RTDE_JOINTS = tuple(f"actual_q_{number}" for number in range(6))
+
 RTDE_TOOL = tuple(f"actual_TCP_pose_{number}" for number in range(3))
 """Where the controller has its tool, m, base frame."""
+
 TIMES = ("time_s", "timestamp")
 
 MOST_RAD = np.radians([363.0, 363.0, 363.0, 363.0, 363.0, 720.0])
@@ -442,14 +444,15 @@ MOST_RAD = np.radians([363.0, 363.0, 363.0, 363.0, 363.0, 720.0])
 
 WHOLE_TURN = 2.0 * np.pi + 0.05
 """Six angles that all lie within it are none in degrees: an arm that lies stretched out, or radians."""
+
 _ALLOWED_JOINTS = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actual_q_0 to actual_q_5, one row a pose"
 
 
 class JointRecording(NamedTuple):
-    """Rows of a recording."""
+    """Rows of a recording of joints."""
 
     names: tuple[str, ...]
-    """What their ``name`` says, or their numbers."""
+    """Names of the rows, or their numbers."""
     q: Floats
     """Shape (n, 6), rad."""
     time_s: Floats | None

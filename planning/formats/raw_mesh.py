@@ -1,4 +1,4 @@
-"""What a mesh file holds, before unit, space and the guard: the common result of the readers beside this file."""
+"""A mesh file's contents before unit, space and the guard: the common result of the readers of mesh files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RawMesh(NamedTuple):
 
 
 def refuse(what: str, where: str, allowed: str) -> NoReturn:
-    """Raise the InputError that a reader ends with."""
+    """Raise a reader's InputError."""
     raise InputError(what, where=where, allowed=allowed)
 
 

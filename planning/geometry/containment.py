@@ -1,16 +1,13 @@
-"""Is a point inside a surface? By the winding number, or by rays; and it is said when the question has no answer.
+"""Whether a point lies inside a surface, by winding number or by rays, and where rays from a point cross it.
 
-How far a surface goes around a point: the winding number, and by rays, which do not ask how triangles are wound.
+Rays decide where triangles are wound against their neighbours; an open surface has no answer (`Side.UNKNOWN`).
 
-Where rays from one point cross a surface: every crossing, in float64, without a missed edge.
-
-All rays start at the target, so a triangle is met exactly by the rays inside the solid angle that it subtends. Rays are
-binned by direction; each triangle visits the bins that its bounding cone touches, and of their rays those inside of the
-cone: where a ray lies in the plane of a triangle far beside it, the edge functions are rounding alone.
-
-Corners are moved along the ray into a plane, each by its own numbers alone, so triangles that share corners share them
-there. On which side of an edge the ray passes is then told rightly or as both: a ray through an edge or a corner hits
-at least one of the triangles about it (Woop, Benthin and Wald, JCGT 2(1), 2013).
+All rays of `crossings` start at one point, so a triangle is hit exactly by the rays inside the solid angle that it
+subtends. Rays are binned by direction; each triangle visits the bins that its bounding cone touches, and of their rays
+those inside of the cone: where a ray lies in the plane of a triangle far from it, the edge functions are rounding
+alone. Corners are moved along the ray into a plane, each by its own numbers alone, so that triangles that share corners
+share them there. On which side of an edge the ray passes is then decided rightly or as both: a ray through an edge or a
+corner hits at least one of the triangles about it (Woop, Benthin and Wald, JCGT 2(1), 2013).
 """
 
 from __future__ import annotations
@@ -27,11 +24,11 @@ from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 RAYS, SEED = 5, 3
-"""Random directions that vote, always the same: where one of them happens to meet an edge, the others do not."""
+"""Random directions that vote, always the same: where one of them happens to hit an edge, the others do not."""
 
 
 class Side(Enum):
-    """Where a point lies."""
+    """Side of a surface on which a point lies."""
 
     INSIDE = "inside"
     OUTSIDE = "outside"
@@ -57,7 +54,7 @@ def side_of(mesh: TriangleMesh, point: NDArray[np.float64]) -> Side:
     return Side.INSIDE if inside else Side.OUTSIDE
 
 
-def holds(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
+def contains(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
     """Whether a point (3,), mm, lies inside a closed surface, see :func:`side_of`; not if the surface is open.
 
     Most points lie outside of a surface's box: of these nobody needs to know whether it is closed.
@@ -68,7 +65,7 @@ def holds(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
 
 
 def inside_each(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of many points (n, 3) lie inside a closed surface, shape (n,); those on an open one are not told apart.
+    """Which of many points (n, 3) lie inside a closed surface, shape (n,); points on the surface fall to either side.
 
     Raises:
         ValueError: The surface is open.
@@ -140,7 +137,7 @@ def _solid_angles(vertices, faces, points, found):  # type: ignore[no-untyped-de
 
 
 def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
-    """Of all directions from a point, the part in which a ray crosses the surface an odd number of times.
+    """Fraction of all directions from a point in which a ray crosses the surface an odd number of times.
 
     0 outside of a closed surface, 1 inside, in between for an open one; a triangle that is given twice counts once.
 
@@ -153,7 +150,7 @@ def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
 
 
 def hit_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
-    """Of all directions from a point, the part in which a ray meets the surface at all.
+    """Fraction of all directions from a point in which a ray hits the surface.
 
     1 inside a closed surface, and also in a hollow of it, of which `winding_number` is 0.
 
@@ -181,7 +178,7 @@ SAME_CROSSING_MM = 1e-6
 """Crossings of one ray closer than this are one: the ray runs through an edge or a corner."""
 
 USUAL_CROSSINGS = 4
-"""Of a ray: room for so many is made before they are counted; where there are more, they are found once again."""
+"""Crossings of a ray that space is made for before they are counted; for more, they are computed once again."""
 
 CONE_SLACK = 1e-9
 """Radians by which a bounding cone is widened against rounding."""
@@ -190,11 +187,11 @@ OUTSIDE = 1e-12
 """By so much less than a cone's is the cosine of a ray that is outside of it whatever rounding did."""
 
 DOUBTFUL = 1e-12
-"""A triangle seen so nearly edge-on that the share of its area across the ray is of rounding: where on it the ray is
+"""A triangle seen so nearly edge-on that the part of its area across the ray is rounding: where on it the ray is
 crossed is not known."""
 
 NUDGE = 1e-7
-"""Radians by which a ray through an edge or corner is turned when its crossings do not add up."""
+"""Radians by which a ray through an edge or corner is rotated when its crossings do not add up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,15 +230,15 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     rays = np.take(directions, order, axis=0)
     lengths = np.sqrt(np.einsum("ij,ij->i", rays, rays))
     origin = np.array(origin, dtype=np.float64)
-    room, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
-    while total > room:
-        room = total
-        ray, depth, face = np.empty(room, np.int64), np.empty(room), np.empty(room, np.int64)
-        way = np.empty(room, np.int64)
+    space, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
+    while total > space:  # space was too small: once more, with as much as was counted
+        space = total
+        ray, depth, face = np.empty(space, np.int64), np.empty(space), np.empty(space, np.int64)
+        way = np.empty(space, np.int64)
         binned = rays, lengths, order, starts, bins
         total = _visit(mesh.vertices, mesh.faces, origin, binned, length, ray, depth, face, way)
     ray, depth, face, way = ray[:total], depth[:total], face[:total], way[:total]
-    rows = np.lexsort((depth, ray))
+    rows = np.lexsort((depth, ray))  # by ray, then by depth
     ray, depth, face, way = ray[rows], depth[rows], face[rows], way[rows]
     fresh = np.ones(total, bool)
     fresh[1:] = (ray[1:] != ray[:-1]) | (depth[1:] - depth[:-1] > SAME_CROSSING_MM)
@@ -252,7 +249,7 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
 
 
 def _ways(way: Ints, fresh: Bools) -> Ints:
-    """Of crossings that are one, from one that is fresh to the next: the way that all have, 0 if they differ."""
+    """Direction in which merged crossings pass the surface, 0 if they differ, from each first one to the next."""
     starts = np.flatnonzero(fresh)
     if len(starts) == 0:
         return way
@@ -274,7 +271,7 @@ def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
 
     Shapes (n,) and (bins + 1,). There is about a ray a bin, as long as that gives no more than the most.
     """
-    count = min(MOST_POLAR_BINS, max(LEAST_POLAR_BINS, math.isqrt(len(directions) // 2)))
+    count = min(MOST_POLAR_BINS, max(LEAST_POLAR_BINS, math.isqrt(len(directions) // 2)))  # 2 count^2 bins
     polar = np.arccos(np.clip(directions[:, 2], -1, 1))
     azimuth = np.arctan2(directions[:, 1], directions[:, 0]) + np.pi
     row = np.minimum((polar * (count / np.pi)).astype(np.int64), count - 1)
@@ -287,7 +284,7 @@ def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
 
 @allocation_free()
 def _visit(vertices, faces, origin, binned, length, ray, depth, face, way):  # type: ignore[no-untyped-def]  # numba infers
-    """Count the crossings; write them too where the output arrays have room."""
+    """Count the crossings; write them too where the output arrays have space."""
     rays, lengths, order, starts, bins = binned
     found, per_radian = 0, bins / np.pi
     for f in range(len(faces)):
@@ -328,7 +325,7 @@ def _seen(vertices, row, origin):  # type: ignore[no-untyped-def]  # numba infer
 
 @allocation_free()
 def _beyond(a, b, c, length):  # type: ignore[no-untyped-def]  # numba infers
-    """Whether no ray from the origin crosses a triangle at a length or less, told by its corners' distances.
+    """Whether no ray from the origin crosses a triangle at a length or less, by its corners' distances.
 
     No point is nearer than the first corner less the longer side from it; two points are no farther apart than twice
     that side, which is what rounding can do to the depth of a ray that grazes the triangle's plane.
@@ -360,7 +357,7 @@ def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _length(x, y, z):  # type: ignore[no-untyped-def]  # numba infers
-    """Of a vector."""
+    """Length of a vector."""
     return np.sqrt(x * x + y * y + z * z)
 
 
@@ -378,7 +375,7 @@ def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # n
 
 @allocation_free()
 def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
-    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; and its way."""
+    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; and its direction."""
     p, q, r = _beside(a, u), _beside(b, u), _beside(c, u)
     wa, wb, wc = _turn(q, r), _turn(r, p), _turn(p, q)
     if not ((wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)):
@@ -435,12 +432,12 @@ def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
 
 
 def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
-    """Crossings, and of which rays they add up: as those of a ray from inside a closed surface must.
+    """Crossings, and which rays they are consistent for: as those of a ray from inside a closed surface.
 
     Such a ray leaves an odd number of times. Where triangles are wound alike it comes out and goes in by turns: if not,
-    one shell lies within another, or two share a wall, and the first crossing need not be the way out.
+    one shell lies within another, or two share a wall, and the first crossing need not be the exit.
 
-    A ray through an edge or corner may count twice or touch without crossing; it is turned by `NUDGE` and asked again.
+    A ray through an edge or corner may count twice or touch without crossing; it is rotated by `NUDGE` and tried again.
     """
     found = crossings(mesh, origin, directions)
     settled = _adds_up(mesh, found)
@@ -453,7 +450,7 @@ def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) ->
 
 
 def _adds_up(mesh: TriangleMesh, found: Crossings) -> Bools:
-    """Of which rays the crossings are odd and, on a closed surface wound alike, out and in by turns."""
+    """Which rays have an odd number of crossings and, on a closed surface wound alike, alternate out and in."""
     odd = found.count % 2 == 1
     if not (mesh.closed and mesh.wound_alike):
         return odd

@@ -1,4 +1,4 @@
-"""Smooth where a surface is smooth, sharp where it is sharp: which corners of triangles share a normal, and which."""
+"""Vertex normals that are smooth where a surface is smooth and separate where it has a crease."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 CREASE = np.radians(60.0)
-"""Two triangles that meet at more are faces of a thing with an edge. Steps of a meshed voxel mask stay below (55)."""
+"""Two triangles at a larger angle are faces of a thing with an edge. Steps of a meshed voxel mask stay below (55)."""
 
 COHERENT = 0.5
-"""Share of the areas about a corner that their sum keeps at least, where they are one side of a smooth surface. Of
+"""Fraction of the areas about a corner that their sum keeps at least, where they are one side of a smooth surface. Of
 triangles given both ways round, or wound against each other, it keeps less: their blend is no normal."""
 
 
 def split_at_creases(mesh: TriangleMesh) -> TriangleMesh:
-    """The same surface with one vertex for each smooth fan of triangles about a point.
+    """A surface with one vertex for each smooth fan of triangles about a point.
 
     A normal that is blended from the triangles of a vertex then never mixes two sides of a box, and mixes the
     triangles of a smooth surface even where the file stores each with corners of its own (as STL does). The order of
@@ -37,7 +37,7 @@ def split_at_creases(mesh: TriangleMesh) -> TriangleMesh:
 
 
 def _smooth_pairs(mesh: TriangleMesh, corner_vertex: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pairs of triangle corners (3 f + k) at one point, of two triangles that share an edge and meet smoothly."""
+    """Pairs of triangle corners (3 f + k) at one point, of two triangles that share an edge smoothly."""
     faces = np.repeat(np.arange(len(mesh.faces)), 3)
     first, second = corner_vertex.reshape(-1), np.roll(corner_vertex, -1, axis=1).reshape(-1)
     this, following = np.arange(3 * len(mesh.faces)), 3 * faces + (np.tile([1, 2, 0], len(mesh.faces)))
@@ -68,9 +68,9 @@ def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) 
 
     The triangle's own where those about one of its corners have no common side.
     """
-    asked = np.zeros(len(mesh.vertices), bool)
-    asked[mesh.faces[face]] = True
-    around = np.flatnonzero(asked[mesh.faces].any(axis=1))
+    marked = np.zeros(len(mesh.vertices), bool)
+    marked[mesh.faces[face]] = True
+    around = np.flatnonzero(marked[mesh.faces].any(axis=1))
     a, b, c = np.moveaxis(mesh.triangles[around], 1, 0)
     areas = np.cross(b - a, c - a)
     corners, at_vertex = mesh.faces[around].T.reshape(-1), np.empty_like(mesh.vertices)
@@ -84,8 +84,8 @@ def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) 
     weights = _corner_weights(mesh.triangles[face], points)
     own = _normals(TriangleMesh(mesh.vertices, mesh.faces[face]))
     normals = _unit(at_vertex)[mesh.faces[face]]
-    turned = np.where(np.einsum("ijk,ik->ij", normals, own) < 0.0, -1.0, 1.0)
-    blended = _unit(np.einsum("ij,ij,ijk->ik", weights, turned, normals))
+    signs = np.where(np.einsum("ijk,ik->ij", normals, own) < 0.0, -1.0, 1.0)
+    blended = _unit(np.einsum("ij,ij,ijk->ik", weights, signs, normals))
     coherent = (kept >= COHERENT * whole)[mesh.faces[face]].all(axis=1)
     return np.where(coherent[:, None], blended, own)
 

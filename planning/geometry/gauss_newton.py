@@ -20,7 +20,7 @@ from scipy.special import fdtrc
 from puncture_twin.planning.base.arrays import Floats
 
 X = TypeVar("X")
-"""What is estimated."""
+"""Type of the estimate."""
 
 NO_PIVOT = 1e-15
 """An eigenvalue of the normal equations below this fraction of the largest is rounding: no step is made along it."""
@@ -32,10 +32,10 @@ NOT_HIGHER = 1 + 1e-12
 """A cost that rises by no more than rounding has not risen."""
 
 MOST_DAMPINGS = 30
-"""Of one step; from 1e-6 by tens, far beyond any step that moves the estimate."""
+"""Dampings of one step; from 1e-6 by tens, far beyond any step that moves the estimate."""
 
 UNSEEN = 1e-6
-"""Relative length of a column beside the model's own below which the data cannot show it."""
+"""Relative length of a column outside of the model's own below which the data cannot show it."""
 
 
 class System(NamedTuple, Generic[X]):
@@ -58,7 +58,7 @@ class System(NamedTuple, Generic[X]):
 
 
 class Fit(NamedTuple, Generic[X]):
-    """Where Gauss-Newton ended."""
+    """Result of Gauss-Newton."""
 
     estimate: X
     system: System[X]
@@ -114,16 +114,16 @@ class _Normal(NamedTuple):
         information = system.information
         if not np.isfinite(information).all():
             raise np.linalg.LinAlgError("the normal equations are not finite")
-        values, axes = np.linalg.eigh(information)
+        values, axes = np.linalg.eigh(information)  # ascending
         return cls(values, axes, axes.T @ (system.slopes.T @ system.residuals), values > NO_PIVOT * values[-1])
 
     def step(self, damping: float) -> Floats:
         """The step under a damping, shape (p,)."""
-        damped = np.where(self.known, self.values + damping * self.values[-1], 1.0)
+        damped = np.where(self.known, self.values + damping * self.values[-1], 1.0)  # 1 only avoids a division by 0
         return np.asarray(-self.axes @ (np.where(self.known, 1.0 / damped, 0.0) * self.pull))
 
     def gain(self) -> float:
-        """By how much the undamped step would lower the cost, were the problem linear."""
+        """Decrease of the cost by the undamped step, were the problem linear."""
         return float(np.sum(self.pull[self.known] ** 2 / self.values[self.known]))
 
 
@@ -140,26 +140,26 @@ def _descend(
             step = normal.step(damping)
             after = moved(estimate, step)
             if system.cost(after) <= before * NOT_HIGHER:
-                return step, after, damping / 10 if damping > 1e-9 else 0.0
+                return step, after, damping / 10 if damping > 1e-9 else 0.0  # trust the model more again
             damping = max(10 * damping, 1e-6)
     return np.zeros(len(normal.values)), estimate, damping
 
 
 class Lacking(NamedTuple):
-    """What k unknowns that a linear model lacks would explain of its residuals."""
+    """Explanation of a linear model's residuals by k unknowns that it lacks."""
 
     found: Floats
     """Shape (k,): their values."""
     sd: Floats
     """Shape (k,): their standard deviations, by the residuals that they leave."""
     probability: float
-    """Of residuals that they explain so well, where all are zero: F(k, freedom)."""
+    """Chance of residuals that they explain so well, where all are zero: F(k, freedom)."""
     freedom: int
     """Residuals less p and k."""
     variance: float
-    """Of one residual, beside them."""
+    """Variance of one residual, with them."""
     variance_without: float
-    """Of one residual, as the model without them has it."""
+    """Variance of one residual, in the model without them."""
 
 
 def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> Lacking | None:
@@ -172,19 +172,19 @@ def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> 
         count: How many residuals count, where others have next to no weight; None for all.
     """
     basis, values, _ = np.linalg.svd(A, full_matrices=False)
-    basis = basis[:, values > UNSEEN * values[0]]
-    beside, left = more - basis @ (basis.T @ more), z - basis @ (basis.T @ z)
+    basis = basis[:, values > UNSEEN * values[0]]  # columns that depend on others count once
+    outside, left = more - basis @ (basis.T @ more), z - basis @ (basis.T @ z)
     (m, k), p = more.shape, basis.shape[1]
     m = m if count is None else count
     freedom = m - p - k
     size = np.linalg.norm(more, axis=0)
     if freedom < 1 or not (size > 0.0).all():
         return None
-    shown = np.linalg.svd(beside / size, compute_uv=False)
+    shown = np.linalg.svd(outside / size, compute_uv=False)
     if not shown[-1] > UNSEEN:
         return None
-    found = np.asarray(np.linalg.lstsq(beside, left, rcond=None)[0], dtype=np.float64)
-    before, after = float(left @ left), float(np.sum((left - beside @ found) ** 2))
-    f = np.inf if after == 0.0 else (before - after) / k / (after / freedom)
-    sd = np.sqrt(after / freedom * np.diag(np.linalg.inv(beside.T @ beside)))
+    found = np.asarray(np.linalg.lstsq(outside, left, rcond=None)[0], dtype=np.float64)
+    before, after = float(left @ left), float(np.sum((left - outside @ found) ** 2))
+    f = np.inf if after == 0.0 else (before - after) / k / (after / freedom)  # explained over left, by degree
+    sd = np.sqrt(after / freedom * np.diag(np.linalg.inv(outside.T @ outside)))
     return Lacking(found, sd, float(fdtrc(k, freedom, max(f, 0.0))), freedom, after / freedom, before / (m - p))

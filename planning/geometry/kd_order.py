@@ -98,7 +98,7 @@ def _select(records, rows, sample, low, high, middle, axis):  # type: ignore[no-
 
 @nb.njit(cache=True, nogil=True)
 def _expected(records, sample, low, high, middle, axis):  # type: ignore[no-untyped-def]  # numba infers
-    """What a sample of a range, sorted by insertion, has where the middle is: one of the range's own values."""
+    """Median of a sample of a range, sorted by insertion: one of the range's own values."""
     many = min(MOST_SAMPLED, 3 + (high - low) // SAMPLED)
     step = (high - low) // many
     for k in range(many):
@@ -112,7 +112,7 @@ def _expected(records, sample, low, high, middle, axis):  # type: ignore[no-unty
 
 @nb.njit(cache=True, nogil=True)
 def _part(records, rows, low, high, axis, pivot, equal):  # type: ignore[no-untyped-def]  # numba infers
-    """Bring what lies below a pivot, or equals it, to the front of a range; where the rest begins.
+    """Move what lies below a pivot, or equals it, to the front of a range; returns where the rest begins.
 
     Every record changes its place with the first of the rest, and only the border's step depends on it: no branch is
     guessed wrong. Rows are the records as integers, whose bits a copy keeps; unsigned numbers count from the front.

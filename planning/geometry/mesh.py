@@ -1,7 +1,4 @@
-"""A triangle mesh as the planner holds it: checked, read-only, in mm.
-
-Several meshes as the arrays of one cache entry, and back.
-"""
+"""Triangle meshes of the planner: checked, read-only, in mm; and several of them as the arrays of one cache entry."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ MIXED = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], n
 """Odd numbers without a pattern: weights of a place's coordinates, as bits, in a sum that tells nearly all apart."""
 
 BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-"""Of the unit cube about the origin, shape (8, 3)."""
+"""Corners of the unit cube about the origin, shape (8, 3)."""
 BOX_SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 """Its sides: corners in order, seen from outside to the left."""
 BOX_FACES = np.array([triangle for a, b, c, d in BOX_SIDES for triangle in ((a, b, c), (a, c, d))])
@@ -37,7 +34,7 @@ MOST_IN_ONE = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Vertices and triangles of one surface. Whoever holds one may trust that the guard has passed it.
+    """Vertices and triangles of one surface. Any instance may be trusted: the guard has passed it.
 
     Attributes:
         vertices: Shape (n, 3), float64, mm.
@@ -60,7 +57,7 @@ class TriangleMesh:
                 object.__setattr__(self, name, array)
 
     def known(self, *, closed: bool, wound_alike: bool) -> TriangleMesh:
-        """The same mesh, of which `closed` and `wound_alike` have been found before and need not be found again."""
+        """A mesh whose `closed` and `wound_alike` were found before and need not be found again."""
         vars(self).update(closed=closed, wound_alike=wound_alike)
         return self
 
@@ -122,7 +119,7 @@ class TriangleMesh:
 
     @property
     def nbytes(self) -> int:
-        """What vertices and faces hold."""
+        """Bytes of vertices and faces."""
         return self.vertices.nbytes + self.faces.nbytes
 
     @cached_property
@@ -134,18 +131,18 @@ class TriangleMesh:
 
     @cached_property
     def area(self) -> float:
-        """Of all triangles, mm^2."""
+        """Area of all triangles, mm^2."""
         a, b, c = np.moveaxis(self.triangles, 1, 0)
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
 
     @property
     def volume(self) -> float:
-        """What it encloses where it is closed, mm^3; negative where its triangles face inward."""
+        """Enclosed volume where the mesh is closed, mm^3; negative where its triangles face inward."""
         a, b, c = np.moveaxis(self.triangles - self.bounds.mean(axis=0), 1, 0)
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
     def transformed(self, T_b_a: NDArray[np.float64]) -> TriangleMesh:
-        """The same surface in frame b.
+        """The surface in frame b.
 
         Args:
             T_b_a: Shape (4, 4), maps coordinates of this mesh's frame a to frame b, mm.
@@ -178,7 +175,7 @@ def spread_on(mesh: TriangleMesh, count: int) -> Spread:
 
 
 def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Several surfaces of one frame as one; of one alone that itself."""
+    """Several surfaces of one frame as one mesh; a single one is returned itself."""
     if len(meshes) == 1:
         return meshes[0]
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]], dtype=np.int32)

@@ -1,19 +1,12 @@
-"""Rigid motions as poses and as twists.
+"""Rigid motions and rotations: poses, twists, rotation vectors, and frames from axes or points.
 
-Notation of Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018), and of `rotations`. A
-twist is τ = (ρ, ω): the translation (mm) first, then the rotation (rad). A pose T_b_a = [R, t; 0, 1] maps coordinates
-in frame a to frame b. Every function that takes poses (..., 4, 4) takes many at once, unless its shape says otherwise.
+Notation of Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018). A twist is τ = (ρ, ω):
+the translation (mm) first, then the rotation vector (rad); Ω = [ω]× is its cross-product matrix, φ = |ω|. A pose
+T_b_a = [R, t; 0, 1] maps coordinates in frame a to frame b. Every function that takes poses (..., 4, 4), vectors
+(..., 3) or rotations (..., 3, 3) takes many at once, unless its shape says otherwise.
 
-Rotations as rotation vectors: the exponential, the logarithm, and the cross product's matrix.
-
-What every command needs is computed here, to the last bit as scipy does it, whose import takes 0.04 s. Sines and
-cosines are therefore the C library's: numpy's own differ in the last bit.
-
-Notation of Solà, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics" (2018). A rotation vector is
-ω (rad), Ω = [ω]× its cross-product matrix, φ = |ω|. Every function that takes vectors (..., 3) or rotations (..., 3, 3)
-takes many at once, unless its shape says otherwise.
-
-Frames from axes or points: rotations whose columns are the axes.
+Rotations are computed to the last bit as scipy does it, whose import takes 0.04 s in every command. Sines and cosines
+are therefore the C library's: numpy's own differ in the last bit.
 """
 
 from __future__ import annotations
@@ -51,7 +44,7 @@ def apply(T_b_a: NDArray[np.floating[Any]], points_a: NDArray[np.floating[Any]])
 
 
 def rotated_about(T: Floats, center: Floats, change: Floats) -> Floats:
-    """A pose (4, 4) turned about a point (3,) of the frame that it leads to, then shifted.
+    """A pose (4, 4) rotated about a point (3,) of the frame that it leads to, then shifted.
 
     Args:
         T: Shape (4, 4), mm.
@@ -161,7 +154,7 @@ def frame_of_axes(z: Floats, x: Floats) -> Floats:
 def frame_along(z: Floats, down: Floats) -> Floats:
     """The rotation with a unit vector z (3,) as its z axis and x = down × z, made a unit vector; y is nearest to down.
 
-    A camera's frame, where z is its view and ``down`` (3,), not parallel to it, is down in its picture.
+    A camera's frame, where z is its view and ``down`` (3,), not parallel to it, is down in its image.
     """
     x = np.cross(down, z)
     return frame_xz(x / np.linalg.norm(x), z)

@@ -1,13 +1,9 @@
-"""In which space a file speaks, and the way from there to LPS.
+"""Spaces and units that a file may state, and conversion to LPS and mm.
 
 Patient spaces differ in the sign of two axes: LPS counts toward the patient's left and posterior, RAS toward
 right and anterior; both count toward superior. Neither is guessed: a file states its space, or the case does.
 
-The command line reads the names of spaces from here, so numpy is not imported.
-
-In which unit of length a file speaks.
-
-The command line reads the names of units from here, so numpy is not imported.
+The command line reads the names of spaces and units from here, so numpy is not imported.
 """
 
 from __future__ import annotations

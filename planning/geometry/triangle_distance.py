@@ -30,7 +30,7 @@ def squared_distance(points: NDArray[np.float64], triangles: NDArray[np.float64]
 
 @allocation_free()
 def _each(triangles, points, squares):  # type: ignore[no-untyped-def]  # numba infers
-    """One point from one triangle, row by row."""
+    """Squared distance of each point from its triangle, row by row."""
     for row in range(len(points)):
         squares[row] = to_triangle(triangles[row], points[row, 0], points[row, 1], points[row, 2])
 

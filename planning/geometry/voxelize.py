@@ -10,7 +10,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of
 from puncture_twin.planning.geometry.rigid import apply
 
 OFF_LINE = (0.000137, 0.000211)
-"""Voxels by which the lines pass beside the voxels' centres in j and k, so that none runs through an edge or a corner
+"""Voxels by which the lines pass next to the voxels' centres in j and k, so that none runs through an edge or a corner
 of a surface that was made on the same grid. A line that does all the same flips its voxels by one edge too many."""
 
 
@@ -31,7 +31,7 @@ def voxels_inside(mesh: TriangleMesh, T_ct_index: Floats, shape: tuple[int, ...]
 
 
 def mark_inside(mesh: TriangleMesh, T_ct_index: Floats, mask: Bools) -> None:
-    """Set the voxels of `voxels_inside` in a mask, beside those that are set; only the surface's box is looked at."""
+    """Add the voxels of `voxels_inside` to those set in a mask; only the surface's box is visited."""
     vertices = apply(np.linalg.inv(T_ct_index), mesh.vertices)
     corners = vertices[mesh.faces]
     if not mesh.closed:

@@ -1,7 +1,7 @@
-"""From home to a standoff pose: RRT-Connect to several goals, shortened, corners rounded, timed, and checked by FCL.
+"""The approach from home to a standoff pose: RRT-Connect to several goals, shortened, rounded, timed, checked by FCL.
 
 A fast checker proves whole segments (:class:`SegmentChecker`). With FCL alone a segment is checked at
-samples, which can miss something thin; the check of the finished motion is closer, and plans anew what it refuses.
+samples, which can miss something thin; the check of the finished motion is closer, and what it refuses is planned anew.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ CUT_FRACTION = 0.5
 """A corner is rounded from the middle of its shorter segment on: the farther, the faster."""
 
 HALVINGS = 5
-"""Of a rounding that is not free; then the arm stops at the corner."""
+"""Halvings of a rounding that is not free; then the arm stops at the corner."""
 
 CURVE_PIECES = 8
 """Straight pieces that stand for a rounding when it is chosen; the finished trajectory is checked sample by sample."""
@@ -130,7 +130,7 @@ def plan_approach(
 
 
 class _Ends:
-    """Home and goals; what a search has to know of them is found when it is first wanted."""
+    """Home and goals; which goals are free or cut off is found when first needed."""
 
     def __init__(self, checker: StateChecker, home: Floats, goals: Floats) -> None:
         self.checker, self.home, self.goals = checker, home, goals
@@ -142,7 +142,7 @@ class _Ends:
 
     @cached_property
     def cut(self) -> Cut | None:
-        """What tells which of the free goals are cut off from home; None for a checker whose boxes are not known."""
+        """The proof of which free goals are cut off from home; None for a checker whose boxes are not known."""
         if not isinstance(self.checker, CellChecker):
             return None
         points, goals = self.checker.points_of(UPPER_ARM), self.goals[self.open_goals]
@@ -169,7 +169,7 @@ def _timed(checker: StateChecker, waypoints: Floats, cuts: Floats, speeds: Speed
 
 
 def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentContact:
-    """What checks segments: the fast checker's proof, or FCL at samples."""
+    """The check of segments: the fast checker's proof, or FCL at samples."""
     if isinstance(checker, FastChecker):
         return checker.segment_checker()
 
@@ -182,7 +182,7 @@ def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentConta
 
 
 def _shortcut_check(checker: StateChecker) -> SegmentContact | None:
-    """What checks shortcuts: the fast checker's proof of their clearance; FCL alone has none."""
+    """The check of shortcuts: the fast checker's proof of their clearance; None for FCL alone."""
     return checker.segment_checker(CLEARANCE_MM) if isinstance(checker, FastChecker) else None
 
 
@@ -232,7 +232,7 @@ def _free_goals(checker: StateChecker, goals: Floats) -> NDArray[np.int64]:
 
 
 def _why_none(found: Connected, ends: _Ends, seed: int) -> str:
-    """Why there is no path, where that is proven; else how far the search came, and what was in the way."""
+    """Why there is no path, where that is proven; else how far the search came, and what blocked it."""
     cut, n_goals, n_free = ends.cut, len(ends.goals), len(ends.open_goals)
     busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
     n_off = 0 if cut is None else int(cut.off.sum())

@@ -1,15 +1,12 @@
 """Joint paths in time: past rounded corners without a stop, and straight insertions; from rest to rest, low in jerk.
 
-Corner. Between two straight segments with unit directions u and w the joints' velocity turns from v u to v w at one
+Corner. Between two straight segments with unit directions u and w the joints' velocity changes from v u to v w at one
 speed v of the path: dq/dt = v ((1 - f) u + f w) with f = 3 x^2 - 2 x^3, x = t / T. The curve leaves the one segment
 and joins the other at the distance d = v T / 2 from the corner, which fixes its shape whatever the speed. Each joint's
 speed stays between those of the two segments; its acceleration is at most 3/4 v^2 |w - u| / d and zero at both ends;
 its jerk is at most 3/2 v^3 |w - u| / d^2; the curve passes the corner at 3/16 d |w - u|, inside the triangle that it
-cuts off. On the segments between, ruckig changes the speed.
-
-How fast along a path: from one speed to another within speed, acceleration and jerk, by ruckig.
-
-Source: Berscheid and Kroeger 2021, "Jerk-limited real-time trajectory generation with arbitrary target states".
+cuts off. Between corners ruckig changes the speed (Berscheid and Kroeger 2021, "Jerk-limited real-time trajectory
+generation with arbitrary target states").
 """
 
 from __future__ import annotations
@@ -37,14 +34,14 @@ STANDSTILL_RAD = 1e-12
 """A segment on which no joint turns farther is no motion: rounding."""
 
 SAME_STEP = 1e-9
-"""Of a sample: a duration that is a whole number of samples but for this is one."""
+"""Fraction of a sample: a duration that is a whole number of samples but for this is one."""
 
 TIP_STEP_RAD = 0.005
-"""Of the samples at which the tip's speed along a path is looked at; between two of them it rises by at most 5e-5 of
-what the arm's whole reach would have: h^2 / 8 times the second derivative."""
+"""rad between the samples at which the tip's speed along a path is computed; between two of them it rises by at most
+5e-5 of what the arm's whole reach would have: h^2 / 8 times the second derivative."""
 
 TIP_FRACTION = 0.999
-"""Of the tip's speed limit that is used: what samples may miss."""
+"""Fraction of the tip's speed limit that is used: what samples may miss."""
 
 TINY = 1e-30
 """Below every rate that means anything: keeps divisions finite."""
@@ -54,7 +51,7 @@ SPLINE_SAMPLES = 8
 
 
 class _Straight(NamedTuple):
-    """A stretch of a segment."""
+    """A straight stretch of a segment."""
 
     start: Floats
     direction: Floats
@@ -89,7 +86,7 @@ _Stretch = _Straight | _Round
 
 
 class _Slow(NamedTuple):
-    """What slows an arm down beside its own limits."""
+    """Further speed limits besides the arm's own: the tip's."""
 
     speed_scale: float
     tip: TipLimit | None
@@ -103,7 +100,7 @@ class _Slow(NamedTuple):
 
 
 def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction: Floats) -> Floats:
-    """The curve past a corner.
+    """The curve past a corner, as in the module's equations.
 
     Args:
         corner: Shape (6,), rad.
@@ -116,7 +113,7 @@ def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction:
         Shape (m, 6), rad.
     """
     covered = fraction**3 - fraction**4 / 2.0  # of f, from 0 to the fraction
-    along, across = -1.0 + 2.0 * (fraction - covered), 2.0 * covered
+    along, across = -1.0 + 2.0 * (fraction - covered), 2.0 * covered  # of the two directions, over the cut
     return np.asarray(corner + cut * (along[:, None] * before + across[:, None] * after))
 
 
@@ -135,7 +132,7 @@ def follow(
         waypoints: Shape (k, 6), rad.
         cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there. None
             stops at all of them.
-        speed_scale: Share of the speed limits to use, above 0, at most 1.
+        speed_scale: Fraction of the speed limits to use, above 0, at most 1.
         tip: How fast the needle's tip may move; None for as fast as the joints take it.
 
     Returns:
@@ -147,8 +144,8 @@ def follow(
     waypoints = _checked_rows(waypoints)
     if not 0.0 < speed_scale <= 1.0:
         raise InputError(f"speed_scale = {speed_scale}", where="trajectory", allowed="above 0, at most 1")
-    cuts = np.zeros(max(0, len(waypoints) - 2)) if cuts is None else np.asarray(cuts, dtype=np.float64)
-    if not cuts.any():
+    cuts = np.zeros(max(0, len(waypoints) - 2)) if cuts is None else np.asarray(cuts, dtype=np.float64)  # one a corner
+    if not cuts.any():  # every waypoint is a stop: those without motion between go
         waypoints = waypoints[np.append(True, np.abs(np.diff(waypoints, axis=0)).max(axis=1) > STANDSTILL_RAD)]
         cuts = np.zeros(max(0, len(waypoints) - 2))
     if len(waypoints) == 1:
@@ -158,18 +155,18 @@ def follow(
 
 
 def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
-    """What the rounded corners leave of each segment, shape (k - 1,), rad."""
+    """Length of each segment between its rounded corners, shape (k - 1,), rad."""
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
     fits = cuts.shape == (len(lengths) - 1,) and bool((cuts >= 0.0).all() and (lengths > 0.0).all())
     straight = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts) if fits else lengths
     if not (fits and (straight >= -STANDSTILL_RAD).all()):
         allowed = "one a corner, two of them no longer than the segment between"
         raise InputError(f"cuts {cuts.tolist()} of {len(lengths)} segments", where="trajectory", allowed=allowed)
-    return np.asarray(straight.clip(0.0))
+    return np.asarray(straight.clip(0.0))  # two cuts may use a segment up, but for rounding
 
 
 def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slow: _Slow) -> Iterator[list[_Stretch]]:
-    """From stop to stop: straight stretches (``straight`` long, one a segment) and rounded corners in turn."""
+    """Straight stretches (``straight`` long, one a segment) and rounded corners in turn, from stop to stop."""
     steps = np.diff(waypoints, axis=0)
     directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
     rates = [_segment_rates(model, *ends, slow) for ends in pairwise(waypoints)]
@@ -180,7 +177,7 @@ def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slo
     speeds = _corner_speeds(round_speeds, straight, rates)
     run: list[_Stretch] = []
     for at, (direction, length) in enumerate(zip(directions, straight, strict=True)):
-        start = waypoints[at] + (cuts[at - 1] if at else 0.0) * direction
+        start = waypoints[at] + (cuts[at - 1] if at else 0.0) * direction  # behind the rounding before it
         if length > STANDSTILL_RAD:
             run.append(_Straight(start, direction, time_law(float(length), rates[at], speeds[at], speeds[at + 1])))
         if speeds[at + 1] == 0.0:
@@ -191,21 +188,21 @@ def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slo
 
 
 def _segment_rates(model: UrModel, start: Floats, end: Floats, slow: _Slow) -> Rates:
-    """What the limits of joints and tip allow along a segment."""
+    """Highest rates along a segment by the limits of joints and tip."""
     length = float(np.linalg.norm(end - start))
     direction = (end - start) / length
     fraction = np.maximum(np.abs(direction), TINY)
     limits = (slow.speed_scale * model.max_speeds, model.max_acceleration, MAX_JERK)
-    rates = Rates(*(float((limit / fraction).min()) for limit in limits))
+    rates = Rates(*(float((limit / fraction).min()) for limit in limits))  # the slowest joint decides
     along = np.linspace(0.0, 1.0, math.ceil(length / TIP_STEP_RAD) + 1)[:, None]
     return rates._replace(speed=min(rates.speed, slow.by_tip(model, start + along * (end - start), direction)))
 
 
 def _round_speed(model: UrModel, corner: Floats, before: Floats, after: Floats, cut: float, slow: _Slow) -> float:
-    """What acceleration, jerk and tip allow past a corner; 0 where the arm stops."""
+    """Highest speed past a corner by acceleration, jerk and tip; 0 where the arm stops."""
     if cut == 0.0:
         return 0.0
-    turn = max(TINY, float(np.abs(after - before).max()))
+    turn = max(TINY, float(np.abs(after - before).max()))  # |w - u| of the joint that changes most
     by_acceleration = math.sqrt(model.max_acceleration * cut / (0.75 * turn))
     by_jerk = (MAX_JERK * cut * cut / (1.5 * turn)) ** (1.0 / 3.0)
     x = np.linspace(0.0, 1.0, math.ceil(2.0 * cut / TIP_STEP_RAD) + 2)
@@ -216,13 +213,13 @@ def _round_speed(model: UrModel, corner: Floats, before: Floats, after: Floats, 
 
 def _corner_speeds(round_speeds: list[float], straight: Floats, rates: list[Rates]) -> list[float]:
     """The speed at each waypoint, 0 at the ends: what the corner allows, and what the segments can change it to."""
-    beside = [min(before.speed, after.speed) for before, after in pairwise(rates)]
-    speeds = [0.0, *(min(pair) for pair in zip(round_speeds, beside, strict=True)), 0.0]
+    slower = [min(before.speed, after.speed) for before, after in pairwise(rates)]
+    speeds = [0.0, *(min(pair) for pair in zip(round_speeds, slower, strict=True)), 0.0]
     for at in range(len(straight)):
         speeds[at + 1] = min(
             speeds[at + 1], reachable_speed(speeds[at], speeds[at + 1], float(straight[at]), rates[at])
         )
-    for at in range(len(straight) - 1, -1, -1):
+    for at in range(len(straight) - 1, -1, -1):  # backwards: what can be braked from
         speeds[at] = min(speeds[at], reachable_speed(speeds[at + 1], speeds[at], float(straight[at]), rates[at]))
     return speeds
 
@@ -234,7 +231,7 @@ def _sampled(waypoints: Floats, runs: Iterable[list[_Stretch]]) -> Trajectory:
         ends = np.cumsum([stretch.duration_s for stretch in run])
         steps = _steps(float(ends[-1]))
         times = ends[-1] * np.arange(1, steps + 1) / steps
-        which = np.minimum(np.searchsorted(ends, times), len(run) - 1)
+        which = np.minimum(np.searchsorted(ends, times), len(run) - 1)  # the last time may round beyond its end
         for at, stretch in enumerate(run):
             begin = ends[at] - stretch.duration_s
             rows.append(stretch.at((times[which == at] - begin).clip(0.0, stretch.duration_s)))
@@ -243,7 +240,7 @@ def _sampled(waypoints: Floats, runs: Iterable[list[_Stretch]]) -> Trajectory:
 
 
 def _steps(duration_s: float) -> int:
-    """How many samples a duration takes."""
+    """Number of samples in a duration."""
     return max(1, math.ceil(duration_s / SAMPLE_S - SAME_STEP))
 
 
@@ -295,10 +292,10 @@ def _tip_rates(model: UrModel, spline: scipy.interpolate.CubicSpline, max_tip_sp
     if not slope.any():
         raise InputError("no joint moves", where="trajectory", allowed="a motion")
     speed = min(max_tip_speed_mm_s, float((model.max_speeds / np.maximum(slope, TINY)).min()))
-    speed = min(speed, math.sqrt(model.max_acceleration / 2.0 / max(bend, TINY)))
-    speed = min(speed, (MAX_JERK / 3.0 / max(twist, TINY)) ** (1.0 / 3.0))
-    acceleration = model.max_acceleration / 2.0 / float(slope.max())
-    acceleration = min(acceleration, MAX_JERK / 9.0 / max(bend * speed, TINY))
+    speed = min(speed, math.sqrt(model.max_acceleration / 2.0 / max(bend, TINY)))  # half the limit to q2 v^2
+    speed = min(speed, (MAX_JERK / 3.0 / max(twist, TINY)) ** (1.0 / 3.0))  # a third to q3 v^3
+    acceleration = model.max_acceleration / 2.0 / float(slope.max())  # the other half to q1 a
+    acceleration = min(acceleration, MAX_JERK / 9.0 / max(bend * speed, TINY))  # a third of the jerk to 3 q2 v a
     return Rates(speed, acceleration, MAX_JERK / 3.0 / float(slope.max()))
 
 
@@ -310,10 +307,10 @@ def _checked_rows(q: Floats) -> Floats:
 
 
 LENGTH_SLACK = 1e-6
-"""Share of a length to spare for a change of speed: without, ruckig's rounding may miss the fit and take a detour."""
+"""Fraction of a length to spare for a change of speed: without, ruckig may miss the fit and take a detour."""
 
 BISECTIONS = 60
-"""Of an interval of speeds: to rounding."""
+"""Bisections of an interval of speeds: to rounding."""
 
 
 class Rates(NamedTuple):
@@ -340,7 +337,7 @@ class TimeLaw(NamedTuple):
 
 
 def _positions(profile: Profile, times_s: Floats) -> Floats:
-    """Where a profile of one degree of freedom is at some times (m,); as ``at_time`` says, in one go.
+    """Positions of a profile of one degree of freedom at times (m,), as ``at_time`` has them.
 
     Within each of its pieces the jerk is constant. An arm that starts above its limits brakes before them; none here
     does, and ``at_time`` knows how.

@@ -1,4 +1,4 @@
-"""A joint path, looked at closely: states between which no body moves far, the first contact, the least clearance."""
+"""Checks of a finished joint path: dense states, the first contact, and the least clearance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROUGHLY_MM = 10.0
 """To this the least clearance is sought first; then a fast checker passes over what it proves to be no nearer."""
 
 _At = tuple[int, float]
-"""A state and a body's distance there, mm."""
+"""Index of a state and a body's distance there, mm."""
 
 _Stretch = tuple[float, str, _At, _At]
 """Of a path: how near a body might come between two states, mm; the body; its ends."""
@@ -91,7 +91,7 @@ class _Path:
         self._moved = {body: np.concatenate([[0.0], np.cumsum(sweep)]) for body, sweep in sweeps.items()}
 
     def least(self, pair: str) -> Nearest:
-        """The least of one kind of distance."""
+        """The least of one kind of distance along the path."""
         if not isinstance(self._checker, FastChecker):
             return self._split(pair, CLEARANCE_STEP_MM)
         best, motion = self._split(pair, ROUGHLY_MM), self._checker.motion(self._q)

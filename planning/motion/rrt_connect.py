@@ -1,4 +1,4 @@
-"""RRT-Connect, by OMPL, over straight joint segments that somebody else checks.
+"""RRT-Connect, by OMPL, over straight joint segments that a given check decides; and OMPL's shortcuts of a path.
 
 Source: Kuffner and LaValle 2000, "RRT-Connect: an efficient approach to single-query path planning".
 
@@ -6,12 +6,8 @@ Nothing here depends on the clock: the planner stops after a number of samples, 
 for some of them in a row, so the same seed gives the same path.
 OMPL keeps one random generator for the whole process and reseeds it here; two plans must not run in two threads.
 
-OMPL's space of joint angles: its bounds, and its states as angles.
-
-OMPL measures distances in it with the wrist's joints counted for half: what a robot's arm touches is decided by the
-first three joints most of the time, and branches that reach farther in those find the way through a gap sooner.
-
-OMPL's shortcuts of a path, counted in steps, never in time.
+OMPL measures distances with the wrist's joints counted for half: what an arm touches is decided by the first three
+joints most of the time, and branches that reach farther in those pass a gap sooner.
 """
 
 from __future__ import annotations
@@ -39,12 +35,12 @@ HOME_TREE, GOAL_TREE = 0, 1
 """The planner's two trees."""
 
 STALLED = 1000
-"""When so many samples in a row have made a tree no larger, it is taken to be shut in. Beside a gantry, where most
-branches touch something, a tree that later found its way out grew every 25 samples."""
+"""When so many samples in a row have made a tree no larger, it is taken to be shut in. Next to a gantry, where most
+branches touch something, a tree that later found its exit grew every 25 samples."""
 
 
 class Connected(NamedTuple):
-    """What one run of the planner came to."""
+    """Result of one run of the planner."""
 
     waypoints: Floats | None
     """Shape (k, 6), rad: from home exactly to a goal exactly; None if it found no path."""
@@ -61,7 +57,7 @@ class Connected(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Where a run looks, and when it stops."""
+    """Where a run samples, and when it stops."""
 
     bounds: Floats
     """Shape (6, 2), rad: where samples are drawn; home and goals lie in it."""
@@ -172,7 +168,7 @@ class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without
         return True
 
     def _is_detour(self, q: Angles) -> bool:
-        """Whether no path by way of a state is short enough (Gammell, Srinivasa and Barfoot 2014)."""
+        """Whether no path through a state is short enough (Gammell, Srinivasa and Barfoot 2014)."""
         left = self._limits.shorter_than - math.dist(self._home, q)
         return left < math.inf and all(math.dist(q, goal) >= left for goal in self._goals)
 
@@ -188,8 +184,8 @@ def _with_exact_ends(waypoints: Floats, home: Floats, goals: Floats) -> tuple[Fl
 
 
 SegmentContact = Callable[[Floats, Floats], Contact | None]
-"""What the straight joint segment between two states (6,) meets; None when it is free, its end included. Of a segment
-that begins at a state known to be free the check gets that state first."""
+"""Contact of the straight joint segment between two states (6,); None when it is free, its end included. Of a
+segment that begins at a state known to be free the check gets that state first."""
 
 Angles = tuple[float, ...]
 """Six joint angles, rad."""
@@ -256,7 +252,7 @@ def seeded(seed: int) -> Iterator[None]:
 
 
 ROUNDS = 2
-"""Of shortcuts."""
+"""Rounds of shortcuts."""
 
 STEPS = 60
 """Shortcuts tried in each round. By itself OMPL tries as many as the path has vertices: few where branches are long."""

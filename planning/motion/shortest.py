@@ -1,11 +1,11 @@
-"""The shortest path found to any of several goals: straight, or by runs of the planner that each seek a shorter one.
+"""The shortest path found to any of several goals, or the proof that the upper arm cannot pass.
 
-A proof that no path leads from home to a goal: whatever the other joints do, the upper arm cannot get by.
+`shortest_path` tries straight lines, then runs of the planner that each seek a shorter path.
 
-The upper arm's place depends on the first two joints alone. Their angles are divided into cells. In a blocked cell one
-point of the upper arm lies, at the middle, deeper in a box than it can move within the cell, so the upper arm is in
-that box all over the cell. A path's first two angles pass from cell to cell, so one that is free stays among the cells
-that are not blocked and hang together. Where home and a goal are not among the same of them there is no path.
+Proof (`Cut`). The upper arm's place depends on the first two joints alone, whose angles are divided into cells. In a
+blocked cell one point of the upper arm lies, at the middle, deeper in a box than it can move within the cell, so the
+upper arm is in that box all over the cell. A path's first two angles pass from cell to cell, so a free one stays in one
+connected part of the cells that are not blocked. Where home and a goal lie in different parts there is no path.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from puncture_twin.planning.geometry.rigid import apply, inverse
 from puncture_twin.planning.motion.rrt_connect import Connected, Limits, SegmentContact, connect
 
 MAX_SAMPLES = 8000
-"""Of the planner, in the first run; half of them near home and goals. Beside the body tens of them do, beside a gantry
+"""Samples of the first run; half of them near home and goals. Next to the body tens of them do, at a gantry
 some hundred."""
 
 NEAR_RAD = math.pi
@@ -39,7 +39,7 @@ PATIENCE, LEAST_SAMPLES = 4, 500
 """A run for a shorter path gets so many times the samples that the first one took, or at least so many."""
 
 RUNS = 3
-"""Of the planner, while it might find a path that is much shorter; see ``SHORT_ENOUGH``."""
+"""Runs of the planner, while it might find a path that is much shorter; see ``SHORT_ENOUGH``."""
 
 SHORT_ENOUGH = 1.3
 """No run seeks a path shorter than one that is this many times as long as the straight line to the nearest goal."""
@@ -53,12 +53,12 @@ class Path(NamedTuple):
 
     @property
     def length(self) -> float:
-        """Of the joints' travel, rad."""
+        """Length of the joints' path, rad."""
         return math.fsum(starmap(math.dist, pairwise(self.waypoints.tolist())))
 
 
 class Task(NamedTuple):
-    """What a path is sought for."""
+    """A planning problem: ends, limits and checks of a path."""
 
     joint_limits: Floats
     """Shape (6, 2), rad."""
@@ -90,7 +90,7 @@ def direct_path(contact_of: SegmentContact, home: Floats, goals: Floats) -> Path
 
 
 def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> Path | Connected:
-    """The shortest path found to any goal, or what the run came to that found none.
+    """The shortest path found to any goal, or the result of the run that found none.
 
     No path is shorter than the straight line to its goal, so once there is one, only goals nearer than it is long are
     sought.
@@ -104,7 +104,7 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
     best = _straight(task.contact_of, task.home, task.goals, away)
     for run in range(RUNS):
         enough = math.inf if best is None else best.length
-        sought = [goal for goal, straight in enumerate(away) if straight * SHORT_ENOUGH < enough]
+        sought = [goal for goal, straight in enumerate(away) if straight * SHORT_ENOUGH < enough]  # worth a run
         if not sought:
             break
         found = _run(task._replace(goals=task.goals[sought]), best, seed + run, max_samples)
@@ -118,7 +118,7 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
 
 
 def _distances(home: Floats, goals: Floats) -> list[float]:
-    """From home to each goal, rad."""
+    """Joint distance from home to each goal, rad."""
     start = home.tolist()
     return [math.dist(start, goal) for goal in goals.tolist()]
 
@@ -134,7 +134,7 @@ def _straight(contact_of: SegmentContact, home: Floats, goals: Floats, away: lis
 def _run(task: Task, best: Path | None, seed: int, max_samples: int) -> Connected:
     """One run: where a path shorter than the best can lie; without one near home and goals first, then anywhere."""
     if best is not None:
-        spare = (best.length - np.abs(task.goals - task.home)).max(axis=0) / 2.0
+        spare = (best.length - np.abs(task.goals - task.home)).max(axis=0) / 2.0  # there and back along one joint
         limits = Limits(_box(task, spare.clip(0.0)), max_samples, best.length)
         return connect(task.contact_of, task.home, task.goals, limits, seed=seed, clear_of=task.clear_of)
     near = Limits(_box(task, NEAR_RAD), max_samples // 2)
@@ -168,7 +168,7 @@ CELL_RAD = np.radians(5.0)
 """Largest width of a cell: at the elbow a turn by half of it moves a UR3's upper arm by 11 mm."""
 
 MOST_POINTS = 48
-"""Of the upper arm that are looked at."""
+"""Points of the upper arm that are tested."""
 
 SLACK_MM = 0.01
 """A point must lie deeper than it moves by this: rounding, and what FCL may take for no contact."""
@@ -178,7 +178,7 @@ SAME_ANGLE = 1e-9
 
 
 class Cut:
-    """Which goals are cut off from home, and by which boxes; found when it is first wanted.
+    """Which goals are cut off from home, and by which boxes; found when it is first needed.
 
     Args:
         model: The arm.
@@ -190,7 +190,7 @@ class Cut:
 
     def __init__(self, model: UrModel, boxes: Sequence[Box], points: Floats, home: Floats, goals: Floats) -> None:
         self._model, self._boxes, self._home, self._goals = model, boxes, home, goals
-        self._points = points[:: max(1, -(-len(points) // MOST_POINTS))]
+        self._points = points[:: max(1, -(-len(points) // MOST_POINTS))]  # rounded up: at most that many
 
     @cached_property
     def off(self) -> Bools:
@@ -200,14 +200,14 @@ class Cut:
 
     @property
     def text(self) -> str:
-        """What the upper arm would have to pass through: the boxes in the cells around those of home."""
+        """Boxes that the upper arm would have to pass: those in the cells around home's."""
         around = ndimage.binary_dilation(self._parts == self._part(self._home), np.ones((3, 3)))
         named = Counter(self._boxes[box].name for box in self._blocking[around & (self._blocking >= 0)].tolist())
         return f"whatever the other joints do, {UPPER_ARM} would have to pass through " + " or ".join(sorted(named))
 
     @cached_property
     def _edges(self) -> list[Floats]:
-        """Of the cells, by joint."""
+        """Edges of the cells, by joint."""
         limits = self._model.joint_limits[:2]
         return [np.linspace(low, high, int(np.ceil((high - low) / CELL_RAD)) + 1) for low, high in limits]
 
@@ -252,7 +252,7 @@ class Cut:
 
 
 def _unturned(angles: Floats) -> tuple[Floats, Ints]:
-    """The different ones of some angles but for whole turns, and which of them each is."""
+    """Distinct angles modulo whole turns, and the index of each angle's."""
     turns = np.round((angles % (2.0 * np.pi)) / SAME_ANGLE).astype(np.int64)
     _, rows, which = np.unique(turns, return_index=True, return_inverse=True)
     return angles[rows], which

@@ -1,4 +1,4 @@
-"""Joint angles over time, and what they ask of the joints."""
+"""Joint trajectories: angles over time, and the highest rates that they need."""
 
 from __future__ import annotations
 

@@ -1,26 +1,21 @@
-"""How far a bevel can take a needle off its straight line, whatever side it points to and whatever it passes.
+"""Deflection of a needle with a bevel: its bound in any direction, its path through given tissues, and its shaft.
 
-The bound is the path of a bevel that never turns, all the way in the stiffest tissue of the case: the stiffer the
-tissue, the more a bevel steers. A stiff layer before soft ones can take it further: the allowance for that was found by
-search, not proven (what is proven of every order is several times as wide: docs/concepts/needle-and-tissue.md). Which
-needle it is does not matter for that search: with lengths over 1/lambda, only the shaft's own and the layers' are left.
-In given layers the path is linear in alpha, and a bevel that never turns goes furthest.
+**Bound** (`DeflectionBound`): the path of a bevel that never rotates, all the way in the stiffest tissue of the case:
+the stiffer the tissue, the more a bevel steers. A stiff layer before soft ones can take it further: the allowance for
+that was found by search, not proven (what is proven of every order is several times as wide:
+docs/concepts/needle-and-tissue.md). With lengths over 1/lambda, only the shaft's own and the layers' are left, so that
+search holds for any needle. In given layers the path is linear in alpha, and a bevel that never rotates goes furthest.
 
-The path that a bevel cuts, and the needle in it.
-
-A bevel cuts at an angle alpha to the shaft behind it. A lateral force at the tip of a bent beam alone gives a path that
-depends on the step; the path is kinematic (Webster et al., Int. J. Robotics Research 25, 2006):
+**Path**: a bevel cuts at an angle alpha to the shaft behind it. A lateral force at the tip of a bent beam alone gives a
+path that depends on the step; the path is kinematic (Webster et al., Int. J. Robotics Research 25, 2006):
 
     dy/ds = w'(tip) + alpha,   w(tip) = y(s)
 
 with w the shaft in the foundation of the path that was cut (mechanics: Misra et al., Int. J. Robotics Research 29,
 2010). Explicit in s, by the two-step formula of Adams and Bashforth.
 
-The shaft of a needle: gauges, stiffness, sag and the load at which it buckles. N and mm.
-
-Closed forms of Euler and Bernoulli, as in any handbook (Young and Budynas, Roark's Formulas for Stress and Strain).
-
-What a needle passes on its way: tissues, layer by layer.
+**Shaft**: gauges, stiffness, sag and the load at which it buckles, N and mm, by the closed forms of Euler and
+Bernoulli (Young and Budynas, Roark's Formulas for Stress and Strain).
 """
 
 from __future__ import annotations
@@ -50,7 +45,7 @@ MOST_SLENDER = 150.0
 
 @dataclass(frozen=True, eq=False)
 class DeflectionBound:
-    """The greatest deflection over depth.
+    """Greatest deflection over path length, to any side.
 
     Attributes:
         depth_mm: Shape (m,), of the tip in the tissue, from 0, ascending.
@@ -63,14 +58,14 @@ class DeflectionBound:
     sag_mm: float
 
     def at(self, path_length: Floats | float) -> Floats:
-        """For paths of these lengths, mm; that of the next depth of the table, and infinite beyond its end.
+        """Bound for paths of these lengths, mm: that of the table's next depth; infinite beyond its end.
 
         Args:
             path_length: Any shape, mm; NaN where there is none, which stays NaN.
         """
         length = np.asarray(path_length, dtype=np.float64)
         row = np.searchsorted(self.depth_mm, np.nan_to_num(length))
-        found = np.append(self.bevel_mm, np.inf)[np.minimum(row, len(self.bevel_mm))] + self.sag_mm
+        found = np.append(self.bevel_mm, np.inf)[np.minimum(row, len(self.bevel_mm))] + self.sag_mm  # inf past the end
         return np.asarray(np.where(np.isnan(length), np.nan, found))
 
 
@@ -96,7 +91,7 @@ def shortest_bend(shaft: Shaft) -> float:
 
 
 def stiffest_resolved(shaft: Shaft) -> float:
-    """Of tissues whose foundation bends a shaft over `shortest_bend` or more, the stiffest, N/mm^2."""
+    """The stiffest tissue whose foundation bends a shaft over `shortest_bend` or more, N/mm^2."""
     return 4 * shaft.bending_stiffness / shortest_bend(shaft) ** 4
 
 
@@ -115,7 +110,7 @@ class Bending:
     tissues: ByName[Tissue]
 
     def bound(self, longest_mm: float) -> DeflectionBound:
-        """How far it may bend, on paths up to a length, mm."""
+        """Bound of the deflection on paths up to a length, mm."""
         return deflection_bound(self.shaft, self.alpha, self.tissues.of_pattern.values(), longest_mm)
 
 
@@ -124,9 +119,10 @@ BANDS = 4
 
 
 class Shape(NamedTuple):
-    """Of n nodes: deflection (mm) and slope (rad), shape (n,), and forces, N and N mm.
+    """Bent shape of n nodes: deflection (mm) and slope (rad), shape (n,), and forces, N and N mm.
 
-    The tip's is what held it; the clamp's are what it bears of all that presses on the shaft, a moment about itself.
+    The tip's is that of its support; the clamp's are what it bears of all that presses on the shaft, a moment about
+    itself.
     """
 
     deflection: Floats
@@ -160,7 +156,7 @@ class Beam:
             tip_load: Lateral force on a free tip, N.
         """
         bands, load = self._bands(foundation), self._load(foundation, rest)
-        load[-2] += tip_load
+        load[-2] += tip_load  # the last two unknowns are the tip's w and w'
         free = bands[:, 2:]  # the first node is clamped
         right = load[2:].copy()
         if tip_mm is None:
@@ -175,7 +171,7 @@ class Beam:
         clamped[0, at], right[at] = 1.0, tip_mm
         found = scipy.linalg.solveh_banded(clamped, right, lower=True, check_finite=False)
         row = sum(free[below, at - below] * found[at - below] for below in range(1, BANDS))
-        force = row + free[0, at] * found[at] + free[1, at] * found[at + 1] - load[-2]
+        force = row + free[0, at] * found[at] + free[1, at] * found[at + 1] - load[-2]  # the row that was replaced
         return _shape(found, float(force), (bands, load))
 
     def _bands(self, foundation: Floats) -> Floats:
@@ -204,11 +200,11 @@ class Beam:
         for row in range(4):
             for column in range(row, 4):
                 each = bending[row, column] + foundation * bedding[row, column]
-                bands[column - row, row : row + 2 * self.elements : 2] += each
+                bands[column - row, row : row + 2 * self.elements : 2] += each  # two unknowns a node
         return bands
 
     def _load(self, foundation: Floats, rest: Floats) -> Floats:
-        """What the foundation pulls with, shape (2 (elements + 1),): the integral of k c N over each element."""
+        """Load by the foundation, shape (2 (elements + 1),): the integral of k c N over each element."""
         h, first, second = self.step, rest[:-1], rest[1:]
         load = np.zeros(2 * (self.elements + 1))
         load[0:-2:2] += foundation * h / 20 * (7 * first + 3 * second)
@@ -219,7 +215,7 @@ class Beam:
 
 
 def _shape(found: Floats, force: float, system: tuple[Floats, Floats]) -> Shape:
-    """With the clamped node in front, whose two rows of the system say what the clamp must hold against."""
+    """The shape with the clamped node in front, whose two rows give the clamp's reaction."""
     bands, load = system
     bears = load[0] - bands[2, 0] * found[0] - bands[3, 0] * found[1]
     moment = load[1] - bands[1, 1] * found[0] - bands[2, 1] * found[1]
@@ -228,20 +224,20 @@ def _shape(found: Floats, force: float, system: tuple[Floats, Floats]) -> Shape:
 
 
 STEP_MM = 1.0
-"""Of an insertion, at most. Where `step_for` asks for less it is shorter."""
+"""Step of an insertion, at most. Where `step_for` asks for less it is shorter."""
 
 OF_BENDING, OF_LENGTH = 1 / 16, 1 / 64
-"""Of a step over the length 1/rate within which a shaft bends in the stiffest tissue, and over the shaft's own. Halving
-it then changes a path by less than 1.5 % from the sixteenth step on, and by less than 3 % before: `tests/needle`
-samples what a case may declare. With steps of 1 mm alone it was 11 % in thin needles."""
+"""Ratio of a step to the length 1/rate within which a shaft bends in the stiffest tissue, and over the shaft's own.
+Halving it then changes a path by less than 1.5 % from the sixteenth step on, and by less than 3 % before:
+`tests/needle` samples what a case may declare. With steps of 1 mm alone it was 11 % in thin needles."""
 
 
 def step_for(shaft: Shaft, stiffest: float) -> float:
-    """The step in which an insertion is followed, mm.
+    """Step of an insertion's simulation, mm.
 
     Args:
         shaft: The needle's.
-        stiffest: The largest k that it meets, N/mm^2; rate = (k / 4 EI)^(1/4).
+        stiffest: The largest k on its path, N/mm^2; rate = (k / 4 EI)^(1/4).
     """
     rate = (stiffest / (4 * shaft.bending_stiffness)) ** 0.25
     return float(min(STEP_MM, OF_LENGTH * shaft.length_mm, OF_BENDING / max(rate, OF_BENDING / STEP_MM)))
@@ -258,7 +254,7 @@ class BevelPath:
         tip_force_n: Shape (m + 1,), the lateral force between tip and tissue as each depth was reached.
         largest_mm: Shape (m + 1,), the greatest deflection anywhere along the shaft, up to each depth.
         holder_n: Shape (m + 1,), the lateral force of the tissue that the holder bears at each depth.
-        holder_n_mm: Shape (m + 1,), its moment about where the shaft is held.
+        holder_n_mm: Shape (m + 1,), its moment about its clamp.
     """
 
     depth_mm: Floats
@@ -280,12 +276,12 @@ def bevel_path(shaft: Shaft, stiffness: Floats, alpha: Floats, step_mm: float) -
         step_mm: Length of a step: see `step_for`.
     """
     count = len(stiffness)
-    elements = max(round(shaft.length_mm / step_mm), count)
+    elements = max(round(shaft.length_mm / step_mm), count)  # the path may be as long as the shaft
     beam = Beam(shaft.bending_stiffness, step_mm, elements)
     cut, force, largest, holder, moment = np.zeros((5, count + 1))
     before, slope, shape = 0.0, 0.0, None
     for done in range(count):
-        ahead = 1.5 * slope - 0.5 * before
+        ahead = 1.5 * slope - 0.5 * before  # Adams and Bashforth, two steps
         cut[done + 1] = cut[done] + step_mm * (ahead + alpha[done])
         shape = _inserted(beam, stiffness[: done + 1], cut[: done + 2])
         before, slope, force[done + 1] = slope, float(shape.slope[-1]), shape.tip_force
@@ -372,18 +368,18 @@ class Shaft:
 
     @property
     def sag_mm(self) -> float:
-        """Of the free tip of a horizontal steel shaft: q L^4 / 8 EI, q its weight by length."""
+        """Sag of the free tip of a horizontal steel shaft, mm: q L^4 / 8 EI, q its weight by length."""
         weight = STEEL_N_MM3 * np.pi * (self.outer_mm**2 - self.inner_mm**2) / 4
         return weight * self.length_mm**4 / (8 * self.bending_stiffness)
 
     def buckling_n(self, *, pinned: bool) -> float:
-        """Axial load at which the shaft gives way: Euler's, its tip free, or pinned in the skin."""
+        """Axial load at which the shaft buckles, N: Euler's, its tip free, or pinned in the skin."""
         return (PINNED_TIP if pinned else FREE_TIP) * self.bending_stiffness / self.length_mm**2
 
 
 @dataclass(frozen=True)
 class Tissue:
-    """One tissue, as a needle feels it.
+    """Mechanical properties of one tissue.
 
     Attributes:
         stiffness_n_mm2: k, by which it holds the shaft: force by length of shaft and by deflection.

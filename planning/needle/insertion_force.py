@@ -54,17 +54,17 @@ class InsertionForce:
 
     @property
     def total_n(self) -> Floats:
-        """Shape (n,)."""
+        """Total force at each depth, shape (n,), N."""
         return np.asarray(self.capsule_n + self.cutting_n + self.friction_n)
 
     @property
     def peak_n(self) -> float:
-        """The greatest force."""
+        """The greatest force, N."""
         return float(self.total_n.max(initial=0.0))
 
     @property
     def work_n_mm(self) -> float:
-        """Of the arm: the force integrated over the samples."""
+        """Work of the arm, N mm: the force integrated over the samples."""
         return float(np.trapezoid(self.total_n, self.depth_mm))
 
 
@@ -85,7 +85,7 @@ def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> Inse
     for push in pushes:
         pushing = (depth >= push.start_mm) & (depth <= push.end_mm + ROUNDING_MM)
         capsule[pushing] = _spring(push, layers, depth[pushing])
-        cutting[pushing], inside[pushing] = 0.0, push.start_mm
+        cutting[pushing], inside[pushing] = 0.0, push.start_mm  # while it is pushed in nothing is cut
     friction = sum((_friction(layer, inside) for layer in layers), np.zeros(len(depth)))
     return InsertionForce(depth, capsule, cutting, friction, _energies(layers, pushes))
 
@@ -107,7 +107,7 @@ def _spring(push: Push, layers: Sequence[Layer], depth: Floats) -> Floats:
 
 
 def _friction(layer: Layer, inside: Floats) -> Floats:
-    """Of the shaft's length inside one layer."""
+    """Friction over the shaft's length inside one layer, N."""
     length = np.clip(inside, layer.start_mm, layer.end_mm) - layer.start_mm
     return np.asarray(layer.tissue.friction_n_mm * length)
 
@@ -117,7 +117,7 @@ def _energies(layers: Sequence[Layer], pushes: Sequence[Push]) -> tuple[float, f
     rupture = cutting = friction = 0.0
     for push in pushes:
         reach = next(layer.tissue.capsule_mm for layer in layers if layer.start_mm == push.start_mm)
-        rupture += push.force_n * (push.end_mm - push.start_mm) ** 3 / (3 * reach**2)
+        rupture += push.force_n * (push.end_mm - push.start_mm) ** 3 / (3 * reach**2)  # of P (x / d)^2
     end = layers[-1].end_mm if layers else 0.0
     for layer in layers:
         pushed = sum(max(0.0, min(p.end_mm, layer.end_mm) - max(p.start_mm, layer.start_mm)) for p in pushes)
@@ -135,4 +135,4 @@ def _unfelt(layer: Layer, push: Push) -> float:
     reached = min(push.end_mm, layer.end_mm)
     if push.end_mm <= layer.start_mm or reached <= low:
         return 0.0
-    return (reached - low) ** 2 / 2 + (reached - low) * (push.end_mm - reached)
+    return (reached - low) ** 2 / 2 + (reached - low) * (push.end_mm - reached)  # rising inside, then constant

@@ -1,9 +1,7 @@
 # mypy: disable-error-code="no-untyped-def"
-"""The arm as spheres, and whether they keep clear of the patient and the workcell: quick, and about right.
+"""The arm as bounding spheres, against the patient's distance field and the workcell's boxes: quick, and approximate.
 
-Only for choosing where to look: what a placement is worth says :func:`planning.reach.reach.assess_reach_all`.
-
-The patient as a field of signed distances, and the workcell's boxes: for quick tests of many arm poses.
+Only to choose where to look: what a placement is worth is decided by :func:`planning.reach.reach.assess_reach_all`.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.collision.bodies import prism, sphere_tree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
-BALL_MM = 30.0
+SPHERE_MM = 30.0
 """Bodies are cut until their spheres are no larger: half of a UR3 wrist's size."""
 
 FLANGE = 6
@@ -32,7 +30,7 @@ FLANGE = 6
 
 @dataclass(frozen=True, eq=False)
 class ArmSpheres:
-    """Spheres that enclose the links, the needle's holder and the tool, in bodies; not the needle.
+    """Bounding spheres of the links, the needle's holder and the tool, by body; not the needle.
 
     Attributes:
         centres: Shape (n, 3), mm, each in its body's frame.
@@ -58,7 +56,7 @@ class ArmSpheres:
         bodies.append([prism(tool.holder_diameter_mm / 2, end - start) + [0.0, 0.0, (start + end) / 2]])
         if tool.body is not None:
             bodies.append([piece.vertices for piece in tool.body.pieces])
-        trees = [sphere_tree(pieces, BALL_MM) for pieces in bodies]
+        trees = [sphere_tree(pieces, SPHERE_MM) for pieces in bodies]
         rows = [np.insert(tree.leaves, 0, 0) for tree in trees]  # row 0 is the root
         return cls(
             np.concatenate([tree.centres[kept] for tree, kept in zip(trees, rows, strict=True)]),
@@ -70,7 +68,7 @@ class ArmSpheres:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What the arm must not touch.
+    """Patient and boxes that the arm must not touch.
 
     Attributes:
         skin: The patient, CT frame.
@@ -178,12 +176,12 @@ def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
 
 @nb.njit(cache=True)
 def _is_clear(arm, surroundings, T_ct_base, frames, last):
-    """One state: first the sphere ``last`` (body, sphere) that touched last; then the far bodies before the near."""
+    """Whether one state is clear: first the sphere ``last`` (body, sphere), then far bodies before near ones."""
     centres, radii, starts, body_frames = arm
-    body, ball = last
-    if ball >= 0:
+    body, sphere = last
+    if sphere >= 0:
         T, first = frames[body_frames[body]], starts[body]
-        if _touches(surroundings, T_ct_base, T, centres[ball], radii[ball]) and _touches(
+        if _touches(surroundings, T_ct_base, T, centres[sphere], radii[sphere]) and _touches(
             surroundings, T_ct_base, T, centres[first], radii[first]
         ):
             return False
@@ -191,9 +189,9 @@ def _is_clear(arm, surroundings, T_ct_base, frames, last):
         T = frames[body_frames[body]]
         first = starts[body]
         if _touches(surroundings, T_ct_base, T, centres[first], radii[first]):
-            for ball in range(first + 1, starts[body + 1]):
-                if _touches(surroundings, T_ct_base, T, centres[ball], radii[ball]):
-                    last[0], last[1] = body, ball
+            for sphere in range(first + 1, starts[body + 1]):
+                if _touches(surroundings, T_ct_base, T, centres[sphere], radii[sphere]):
+                    last[0], last[1] = body, sphere
                     return False
     return True
 
@@ -270,7 +268,7 @@ class Boxes:
 
     @classmethod
     def of(cls, boxes: Sequence[Box]) -> Boxes:
-        """Of boxes whose ``T_base_box`` is their pose in that frame."""
+        """Boxes whose ``T_base_box`` is their pose in that frame, for compiled code."""
         poses = [np.linalg.inv(box.T_base_box) for box in boxes]
         halves = [np.asarray(box.size_mm) / 2 for box in boxes]
         return cls(np.array(poses).reshape(-1, 4, 4), np.array(halves).reshape(-1, 3))

@@ -1,4 +1,4 @@
-"""Which fraction of directions an arm may reach from a placement: kinematics of all, bounding spheres, then itself."""
+"""Estimated fraction of directions an arm reaches from a placement: kinematics, bounding spheres, self-contacts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from puncture_twin.planning.place.arm_spheres import ArmSpheres, Surroundings, b
 from puncture_twin.planning.place.mounts import Site, WantedDirections
 
 STATES = 3
-"""Of an insertion, from standoff to target: enough to see most of what ends it."""
+"""States of an insertion, from standoff to target: enough to see most of what ends it."""
 
 
 class Branches(NamedTuple):
@@ -106,23 +106,23 @@ class Estimator:
             self._fraction(found.margin.max(axis=1)), self._fraction(open_margin.max(axis=1)), fraction, margin
         )
 
-    def _open_margins(self, found_branches: Branches, T_ct_base: Floats) -> Floats:
+    def _open_margins(self, branches_reached: Branches, T_ct_base: Floats) -> Floats:
         """The margins of the branches that keep clear of the surroundings, shape (n, 8); 0 for the others.
 
         The branches of each direction are tested in the order of their margins. Where the arm itself does not
         count, those after the first clear one are left at 0: no answer depends on them.
         """
         model, spheres = self.model, _spheres(self.model, self.tool)
-        open_margin = np.zeros_like(found_branches.margin)
-        order = np.argsort(-found_branches.margin, axis=1, kind="stable")
+        open_margin = np.zeros_like(branches_reached.margin)
+        order = np.argsort(-branches_reached.margin, axis=1, kind="stable")
         rows = np.arange(len(order))
         for place in range(N_BRANCHES):
-            rows = rows[found_branches.margin[rows, order[rows, place]] > 0.0]
+            rows = rows[branches_reached.margin[rows, order[rows, place]] > 0.0]
             branches = order[rows, place]
             clear = clear_branches(
-                spheres, self.surroundings, T_ct_base, link_poses(model, found_branches.q[rows, branches])
+                spheres, self.surroundings, T_ct_base, link_poses(model, branches_reached.q[rows, branches])
             )
-            open_margin[rows[clear], branches[clear]] = found_branches.margin[rows[clear], branches[clear]]
+            open_margin[rows[clear], branches[clear]] = branches_reached.margin[rows[clear], branches[clear]]
             if not self.itself:
                 rows = rows[~clear]
         return open_margin

@@ -1,6 +1,6 @@
-"""The ways to mount an arm, where each may stand about the target, and the base's pose there as ``[robot.mount]``.
+"""Mounts of an arm: where each may be placed about the target, the base's pose there, and the directions to be reached.
 
-The organ-safe directions that an arm should hold: each with the solid angle that it stands for.
+A pose is written as ``[robot.mount]``; each organ-safe direction counts by the solid angle that it represents.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ AXIS_DIGITS = 6
 
 @dataclass(frozen=True)
 class Region:
-    """Where a base of one kind may stand, in the bed frame about the target.
+    """A region for bases of one kind, in the bed frame about the target.
 
     Attributes:
         mount: "floor", "rail", "ceiling" or "side".
@@ -120,7 +120,7 @@ class Site:
 
 
 def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
-    """Where the case lets a base stand.
+    """Regions of the case in which a base may be placed.
 
     Raises:
         InputError: A rail is wanted, and there is no table to which it belongs.
@@ -150,9 +150,9 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
 
 
 def default_reach_mm(model: UrModel, needle_length_mm: float) -> float:
-    """How far from the target a base may stand where the case says nothing."""
+    """Default distance of a base from the target, mm."""
     span = abs(model.a2) + abs(model.a3) + needle_length_mm + FREE_MM
-    return ROUNDS_MM * math.ceil(span / ROUNDS_MM)
+    return ROUNDS_MM * math.ceil(span / ROUNDS_MM)  # rounded up
 
 
 def _region(
@@ -170,7 +170,7 @@ def _side(facing: str, axis: tuple[int, int, int], bounds: MountBounds, reach: f
 
 
 def _rails(case: Case, table: Obstacle, T_ct_bed: Floats, reach: float) -> list[Region]:
-    """An upright base beside either long edge of the table, at about the height of its top."""
+    """Regions of an upright base along either long edge of the table, at about the height of its top."""
     half = np.abs(T_ct_bed[:3, :3].T) @ np.asarray(table.size_mm) / 2
     centre = T_ct_bed[:3, :3].T @ (np.asarray(table.center_mm) - T_ct_bed[:3, 3])
     bounds = case.place.rail
@@ -218,7 +218,7 @@ SAME_RING_DIGITS = 7
 
 @dataclass(frozen=True, eq=False)
 class WantedDirections:
-    """n directions.
+    """n directions to be reached, each with the solid angle that it represents.
 
     Attributes:
         outward_ct: Shape (n, 3), unit, from the target outward.
@@ -244,7 +244,7 @@ class WantedDirections:
         chosen = [int(np.argmax(self.weight))]
         cosine = self.outward_ct @ self.outward_ct[chosen[0]]
         while len(chosen) < count:
-            chosen.append(int(np.argmin(cosine)))
+            chosen.append(int(np.argmin(cosine)))  # farthest-point sampling
             cosine = np.maximum(cosine, self.outward_ct @ self.outward_ct[chosen[-1]])
         nearest = np.argmax(self.outward_ct @ self.outward_ct[chosen].T, axis=1)
         weight = np.bincount(nearest, self.weight, minlength=count).astype(np.float64)

@@ -1,12 +1,8 @@
-"""The search for a place to stand the arm: all regions coarsely, the best of each finely, the finalists exactly.
+"""The search for a placement of the arm: all regions coarsely, the best of each finely, the finalists exactly.
 
-What a placement is worth: the search's own answer for the arm, for every organ-safe direction.
-
-How far a tip is expected to miss from another stand of the arm, its markers touched anew from there.
-
-Where the needle itself cannot stand before the insertion, whatever holds it.
-
-The search's result on disk: ``placements.csv`` for a table, ``place.json`` with everything.
+A finalist is checked as the batch search checks it: the arm for every organ-safe direction, the expected tip error with
+the markers touched anew from there, and whether the needle can wait before the insertion at all.
+Results: ``placements.csv`` as a table, ``place.json`` with everything.
 """
 
 from __future__ import annotations
@@ -78,7 +74,7 @@ COARSE_DIRECTIONS = 64
 """Directions that a site is estimated with at first."""
 
 FINE_DIRECTIONS = 128
-"""And those near the best."""
+"""Directions that sites near the best are estimated with."""
 
 SEEDS = 10
 """Sites that are refined; each mount's best is among them."""
@@ -90,7 +86,7 @@ FINALISTS = 6
 """Sites that are checked exactly; each mount's best is among them."""
 
 FRACTION_DIGITS = 3
-"""Shares that agree to so many digits are equal; then the expected error decides, then the margin."""
+"""Fractions that agree to so many digits are equal; then the expected error decides, then the margin."""
 
 ERROR_DIGITS = 2
 """Expected errors (mm) that agree to so many digits are equal."""
@@ -98,7 +94,7 @@ ERROR_DIGITS = 2
 
 @dataclass(frozen=True)
 class RatedPlacement:
-    """A placement and its worth.
+    """A placement, checked and rated.
 
     Attributes:
         site: Where the base stands; None for where the case itself has it.
@@ -117,19 +113,19 @@ class RatedPlacement:
 
     @property
     def name(self) -> str:
-        """What the tables call it."""
+        """Name in the tables."""
         return "as in the case" if self.site is None else self.site.region.name
 
 
 @dataclass(frozen=True, eq=False)
 class PlaceSearch:
-    """What was found.
+    """Result of a search for placements.
 
     Attributes:
         T_ct_bed: Shape (4, 4), mm: the frame of the sites.
         coarse: Every site of the first lattice with its estimate.
         refined: How many more were estimated.
-        possible: Share of the directions, 0..1, in which the needle itself may stand at standoff; none can hold more.
+        possible: Fraction of directions, 0..1, in which the needle itself may stand at standoff; none can hold more.
         rated: Best first; the case's own placement is not among them.
         own: The case's own placement, checked; None where it has none.
     """
@@ -228,7 +224,7 @@ def _checked(
 
 
 def _worth(one: RatedPlacement) -> tuple[float, float, float]:
-    """Less is better: most directions, then the least expected error, then the widest margin."""
+    """Sort key, less is better: most directions, then the least expected error, then the widest margin."""
     expected = 0.0 if one.expected_mm is None else round(one.expected_mm, ERROR_DIGITS)
     return -round(one.verdict.fraction, FRACTION_DIGITS), expected, -one.verdict.margin
 
@@ -283,7 +279,7 @@ class _Refiner:
         return len(self._hoped)
 
     def refine(self, seeds: Sequence[Site], step_mm: float) -> list[tuple[Site, ReachEstimate]]:
-        """Where each seed ends, with its estimate; each end once."""
+        """End of each seed's walk, with its estimate; each end once."""
         ends = list(seeds)
         for halving in range(1, HALVINGS + 1):
             ends = self._leaders([[end, *_neighbours(end, step_mm / 2**halving)] for end in ends])
@@ -310,7 +306,7 @@ def _neighbours(site: Site, step_mm: float) -> list[Site]:
 
 
 def _score(estimate: ReachEstimate) -> tuple[float, float]:
-    """More is better."""
+    """Sort key of an estimate, more is better."""
     return round(estimate.fraction, FRACTION_DIGITS), estimate.margin
 
 
@@ -351,7 +347,7 @@ def _far(one: Site, other: Site, distance_mm: float) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The exact answer for one placement.
+    """Exact reach from one placement.
 
     Attributes:
         fraction: Solid angle of the reached directions over that of all that are wanted, 0..1.
@@ -402,7 +398,7 @@ class PlacementCheck:
 
     @cached_property
     def patient(self) -> TriangleMesh:
-        """CT frame: the skin, and what the CT shows outside of it."""
+        """Patient surface, CT frame: the skin, and what the CT shows outside of it."""
         return self.skin if self.outside is None else joined([self.skin, self.outside])
 
     def verdict(self, T_base_ct: Floats) -> Verdict:
@@ -463,7 +459,7 @@ def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Fl
 
 
 def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -> PoseError:
-    """The needle's pose error from another stand of the arm; arguments as above, the case with errors."""
+    """The needle's pose error from another placement; arguments as above, the case with errors."""
     assert case.errors is not None  # the caller has looked
     errors, old = replace(case.errors, found=False), registration.markers
     markers = MarkerPairs(old.names, old.points_ct, apply(T_base_ct, old.points_ct))
@@ -478,7 +474,7 @@ def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -
 def needle_can_start(
     tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections, padding_mm: float
 ) -> NDArray[np.bool_]:
-    """Whether the padded needle, at standoff, is clear of the skin: no placement can reach a direction where it is not.
+    """Whether the padded needle at standoff is clear of the skin: else no placement can reach the direction.
 
     Args:
         tool: With the needle.
@@ -510,7 +506,7 @@ COLUMNS = (
     *("rank", "placement", "along_mm", "across_mm", "height_mm", "share", "held", "asked", "margin", "home_contact"),
     *("base_x_mm", "base_y_mm", "base_z_mm"),
 )
-"""Of ``placements.csv``; the base's coordinates are in the case's space."""
+"""Columns of ``placements.csv``; the base's coordinates are in the case's space."""
 
 EXPECTED = "expected_error_mm"
 """A further column where the case declares errors and has markers."""

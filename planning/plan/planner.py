@@ -22,7 +22,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import reach_request
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
-from puncture_twin.planning.uncertainty.chance_model import keeps_limits
+from puncture_twin.planning.uncertainty.chance_model import satisfies_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 MAX_TRIES = 20
@@ -138,7 +138,7 @@ def _within_limits(
         return goals
     q = np.array([goal.insertion_q[-1] for goal in goals])
     outward = np.tile(candidates.outward_ct[row], (len(goals), 1))
-    kept = keeps_limits(context.chance, outward, q)
+    kept = satisfies_limits(context.chance, outward, q)
     if not kept.any():
         raise NoAnswerError("no configuration that an approach may end in keeps search.min_hit and max_touch")
     return [goal for goal, keeps in zip(goals, kept, strict=True) if keeps]

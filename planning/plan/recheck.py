@@ -16,7 +16,7 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.planning.uncertainty.chance_model import keeps_limits
+from puncture_twin.planning.uncertainty.chance_model import satisfies_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 SAME_DIRECTION = 1e-6
@@ -83,7 +83,7 @@ def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:
     """Refuse a plan that ends in a configuration beyond the case's limits of chances: the search's may be another."""
     if context.chance is None:
         return
-    if not keeps_limits(context.chance, plan.outward_ct[None], plan.insertion.q[-1:]).all():
+    if not satisfies_limits(context.chance, plan.outward_ct[None], plan.insertion.q[-1:]).all():
         what = "the configuration in which it ends does not keep search.min_hit and max_touch"
         raise InputError(what, where=path, allowed="plan again")
 

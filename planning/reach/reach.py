@@ -1,16 +1,8 @@
-"""Which directions the arm can reach and insert along: standoff pose, straight insertion, nothing touched on the path.
+"""Reach: which directions the arm can insert along, from a standoff pose straight to the target, without contact.
 
-Retraction is the same motion backwards, so what may be inserted may be withdrawn.
-
-The search for the first clear motion of each of many requests.
-
-Motions checked for contacts, of many directions at once.
-
-What keeps every branch of the arm from a flange pose.
-
-Where the approach may end: every roll, branch and whole turn on which the arm holds one direction.
-
-A small workcell, asked once: on a new machine it has every kernel of the arm compiled before a case needs it.
+`assess_reach_all` checks many directions: kinematics of all first (`survey`), then for each the motions that it
+allows, the best margin first, until one is clear. `approach_goals` lists where an approach to one direction may end.
+Retraction is the insertion backwards, so what may be inserted may be withdrawn.
 """
 
 from __future__ import annotations
@@ -51,7 +43,7 @@ from puncture_twin.planning.reach.survey import (
 
 
 def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAnswer:
-    """Of a request without a clear motion: what came farthest.
+    """The refusal of a request without a clear motion: that of the motion that came farthest.
 
     Args:
         model: The arm.
@@ -90,24 +82,6 @@ CHUNK = 256
 """Requests between two reports of progress."""
 
 
-def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswer]:
-    """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first.
-
-    Args:
-        checker: Checks contacts, in the base frame.
-        request: The direction.
-
-    Returns:
-        Empty where there is none.
-
-    Raises:
-        InputError: See :func:`assess_reach_all`.
-    """
-    found = _surveyed(checker, [request], ROLLS)[0]
-    tried = tried_all(checker, [(found, insertion) for insertion in found.insertions()])
-    return [answer for answer in tried if isinstance(answer, ReachAnswer)]
-
-
 def assess_reach_all(
     checker: StateChecker,
     requests: Sequence[ReachRequest],
@@ -137,8 +111,26 @@ def assess_reach_all(
     return answers
 
 
+def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswer]:
+    """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first.
+
+    Args:
+        checker: Checks contacts, in the base frame.
+        request: The direction.
+
+    Returns:
+        Empty where there is none.
+
+    Raises:
+        InputError: See :func:`assess_reach_all`.
+    """
+    found = _surveyed(checker, [request], ROLLS)[0]
+    tried = tried_all(checker, [(found, insertion) for insertion in found.insertions()])
+    return [answer for answer in tried if isinstance(answer, ReachAnswer)]
+
+
 def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[ReachAnswer]:
-    """Of each request; round by round the next motion of all that have no answer yet."""
+    """The reach answer of each request; round by round the next motion of all that have none yet."""
     surveys = _surveyed(checker, requests, n_rolls)
     search = FirstClear(surveys)
     _try_next(checker, search)
@@ -161,7 +153,7 @@ def _try_next(checker: StateChecker, search: FirstClear) -> bool:
 
 
 def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[Surveyed]:
-    """What kinematics alone says of the requests, which are checked first."""
+    """Kinematics of the requests, which are checked first."""
     for request in requests:
         if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
             allowed = f"the tool's {checker.tool.needle_length_mm}"
@@ -175,7 +167,7 @@ def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: 
 
 
 class NextMotions(NamedTuple):
-    """Of each request whose search goes on, the motion that is tried next."""
+    """The next motion to try of each request whose search goes on."""
 
     rows: Ints
     """Shape (m,): which requests."""
@@ -188,7 +180,7 @@ class NextMotions(NamedTuple):
 
 
 class FirstClear:
-    """The searches of many requests, side by side: of each the motions that kinematics allows, the best margin first.
+    """Searches of many requests, side by side: motions that kinematics allows, the best margin first.
 
     All motions of a request begin with the needle in the same place, and needle and holder are round about its axis: if
     they were clear of patient and boxes once, they need not be checked again.
@@ -212,7 +204,7 @@ class FirstClear:
         self._round_clear = np.zeros(len(surveyed), np.bool_)
 
     def next_motions(self) -> NextMotions:
-        """What is tried next; of no requests where all searches are over."""
+        """The motions to try next; of no requests where all searches are over."""
         rows = np.flatnonzero(self._left.any(axis=1))
         at = self._left[rows].argmax(axis=1)
         branches, rolls = self._branches[rows, at], self._rolls[rows, at]
@@ -252,7 +244,7 @@ class FirstClear:
     def _tried(
         self, checker: StateChecker, motions: NextMotions, at: int, contact: Contact | None
     ) -> ReachAnswer | Blocked:
-        """What comes of one of the motions, which touches so at its standoff."""
+        """Result of one motion with this contact, or none, at its standoff."""
         if contact is not None:
             return blocked_at_standoff(contact)
         found, branch, roll = self._surveyed[motions.rows[at]], int(motions.branches[at]), int(motions.rolls[at])
@@ -266,7 +258,7 @@ ROLL_BODIES = frozenset({"wrist_3", "tool"})
 
 
 class Blocked(NamedTuple):
-    """Where a motion ends early, and whether another roll on the same branch would touch the same."""
+    """Depth at which a motion ends early, its reason, and whether another roll on the same branch has it too."""
 
     depth_mm: float
     detail: str
@@ -296,7 +288,7 @@ def tried_all(checker: StateChecker, motions: Sequence[tuple[Surveyed, Insertion
 
 
 def blocked_at_standoff(contact: Contact) -> Blocked:
-    """What a contact at its standoff makes of a motion."""
+    """The block that a contact at the standoff means for a motion."""
     detail = f"{contact.body} touches {contact.other} at standoff"
     return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
 
@@ -322,7 +314,7 @@ def tried(checker: StateChecker, found: Surveyed, insertion: Insertion) -> Reach
 
 
 def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
-    """What keeps every branch from one flange pose (4, 4), in mm: one sentence for people."""
+    """Why no branch of the arm reaches one flange pose (4, 4), mm: one sentence for people."""
     place = (
         f"the flange would stand {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
     )
@@ -337,7 +329,7 @@ def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
 
 
 def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
-    """By how much upper arm and forearm are too short (or too long, folded) to reach each flange pose.
+    """Length by which upper arm and forearm are too short (or too long, folded) for each flange pose.
 
     Args:
         model: The arm.
@@ -380,11 +372,11 @@ NEAREST = 4
 def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats) -> list[ReachAnswer]:
     """The motions that may follow an approach, nearest to home first; empty if the arm does not reach the direction.
 
-    Each answer of :func:`every_reach`, and the same with any joint turned by whole turns, as long as all of the
+    Each answer of :func:`every_reach`, and the same with any joint rotated by whole turns, as long as all of the
     insertion stays within the limits.
 
     Args:
-        checker: Judges contacts, in the base frame.
+        checker: Checks contacts, in the base frame.
         request: The direction.
         q_home: Shape (6,), rad.
 
@@ -413,7 +405,9 @@ def _rotated(checker: StateChecker, answer: ReachAnswer) -> list[ReachAnswer]:
 
 
 NEEDLE = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
+
 STANDOFF_MM = 120.0
+
 TARGET = np.array([360.0, 20.0, 100.0])
 """In the middle of the body, mm, base frame."""
 
@@ -421,23 +415,24 @@ OUTWARD = np.array([[0.0, 0.0, 1.0], [-0.3, 0.2, 0.93], [0.9, 0.1, 0.3], [0.3, 0
 """Two directions that the arm reaches, and two that it does not."""
 
 CORNERS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+
 FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-"""Of an octahedron, seen from outside counterclockwise."""
+"""Faces of an octahedron, counterclockwise from outside."""
 
 
 def small_workcell() -> FastChecker:
-    """A UR3, a body over a table, something else beside it; mm, base frame."""
+    """A UR3, a body over a table, something else next to it; mm, base frame."""
     table = Box("table", pose(np.eye(3), TARGET - [0.0, 0.0, 220.0]), (300.0, 300.0, 20.0))
-    body, beside = octahedron(TARGET, 80.0), octahedron(TARGET - [0.0, 200.0, 100.0], 40.0)
-    return FastChecker(ur_model("ur3"), NEEDLE, [table], body, outside=beside, padding_mm=1.0)
+    body, outside = octahedron(TARGET, 80.0), octahedron(TARGET - [0.0, 200.0, 100.0], 40.0)
+    return FastChecker(ur_model("ur3"), NEEDLE, [table], body, outside=outside, padding_mm=1.0)
 
 
-def ask_arm(checker: FastChecker) -> list[ReachAnswer]:
-    """Of each of the small workcell's directions whether the arm reaches it."""
+def check_small_workcell(checker: FastChecker) -> list[ReachAnswer]:
+    """Reach of the small workcell's directions: compiles every kernel of the arm before a case needs it."""
     outward = OUTWARD / np.linalg.norm(OUTWARD, axis=1, keepdims=True)
     return assess_reach_all(checker, [ReachRequest(TARGET, u, NEEDLE.needle_length_mm, STANDOFF_MM) for u in outward])
 
 
 def octahedron(at: Floats, radius_mm: float) -> TriangleMesh:
-    """Six corners so far from a place (3,), mm."""
+    """Corners (6, 3) at a distance from a place (3,), mm."""
     return TriangleMesh(at + radius_mm * CORNERS, FACES)

@@ -1,6 +1,6 @@
-"""Where tip and flange wait before the insertion, and how far from the target the needle's axis is checked.
+"""Standoff: where tip and flange wait before the insertion, and how far out the needle's axis is checked.
 
-How far from the skin the tip waits before the insertion, for a case that does not say.
+A case may state it; else the tip waits so far from the skin that the needle clears it (`skin_gaps`).
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ def standoffs(needle: Needle, path_length: Floats | float, skin_angle: Floats | 
 
 
 def waiting_flange(needle: Needle, path_length: Floats | float, skin_angle: Floats | float) -> Floats:
-    """How far from the target, along the needle, the flange is while the tip waits; see `standoffs`; mm."""
+    """Distance of the waiting flange from the target along the needle, mm; see `standoffs`."""
     return np.asarray(needle.length_mm + standoffs(needle, path_length, skin_angle))
 
 
 def farthest_flange(needle: Needle, max_skin_angle: float) -> float:
-    """How far out the flange can be while the tip waits, on the longest path at the steepest angle (rad), mm."""
+    """Largest distance of the waiting flange: on the longest path at the steepest angle (rad), mm."""
     return float(waiting_flange(needle, needle.shaft_mm, max_skin_angle))
 
 
 def own_paths(case: Case, skin: Skin, outward_ct: Floats, shift_ct: Floats | float = 0.0) -> SkinPaths:
-    """The skin along paths, ``outward_ct`` (n, 3), unit, to the case's target, or to one that is shifted, mm."""
+    """Skin paths of directions ``outward_ct`` (n, 3), unit, to the case's target, or to a shifted one, mm."""
     farthest = farthest_flange(case.needle, case.search.max_skin_angle)
     return skin_paths(skin, case.target_ct + shift_ct, outward_ct, farthest)
 
 
 def axis_lengths(case: Case, structures: Sequence[Structure], paths: SkinPaths) -> Floats:
-    """How far from the target n needles' axes are checked against k structures, shape (n, k), mm.
+    """Lengths to which n needle axes are checked against k structures, shape (n, k), mm.
 
     Against the body's structures up to where the flange ends; against what is outside of the body up to where it waits
     along this path. Where no tip ever waits, for want of skin or beyond a limit, that is where any could at most.

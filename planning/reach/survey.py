@@ -1,10 +1,6 @@
-"""What kinematics alone says of many directions: every branch and roll.
+"""Kinematics of straight insertions: every branch and roll of many directions, without any collision check.
 
-What the arm has to reach for one direction, and whether it does.
-
-The path of each branch along the needle, by inverse kinematics.
-
-A straight insertion as states so close to one another that what holds at them holds between them.
+A path along the needle is sampled so closely that what is true of its states is true between them.
 """
 
 from __future__ import annotations
@@ -27,12 +23,88 @@ from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.state_checker import Contact, SweptBodies, motion_bounds
 
+
+@dataclass(frozen=True, eq=False)
+class ReachRequest:
+    """One direction that the arm shall reach along.
+
+    Attributes:
+        target_base: Shape (3,), mm: the lesion, base frame.
+        outward_base: Shape (3,), unit: from the target out of the body, base frame.
+        needle_length_mm: Flange to tip.
+        standoff_mm: Tip to target before the insertion starts.
+
+    Raises:
+        InputError: If something is not finite, the direction not a unit vector, or a length not positive.
+    """
+
+    target_base: Floats
+    outward_base: Floats
+    needle_length_mm: float
+    standoff_mm: float
+
+    def __post_init__(self) -> None:
+        for name in ("target_base", "outward_base"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
+                raise InputError(f"{name} = {array}", where="reach request", allowed="three finite numbers")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if abs(math.hypot(*self.outward_base.tolist()) - 1.0) > SAME_UNIT:
+            raise InputError(f"outward_base = {self.outward_base}", where="reach request", allowed="a unit vector")
+        for name in ("needle_length_mm", "standoff_mm"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise InputError(f"{name} = {getattr(self, name)}", where="reach request", allowed="finite and above 0")
+
+
+SAME_UNIT = 1e-9
+"""Tolerance of a unit direction's length."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReachAnswer:
+    """Whether and how the arm reaches along one direction.
+
+    Attributes:
+        reachable: The verdict.
+        reason: ``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``.
+        depth_mm: How far the needle was inserted from standoff when it was blocked; None for other reasons.
+        detail: One sentence for people: what touched what, or what was missing; empty when reachable.
+        contact: What touched what, where that was the reason.
+        roll: Turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable.
+        branch: Index among the eight branches of ``inverse``; -1 when not reachable.
+        insertion_q: Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable.
+        insertion_depth_mm: Shape (m,), mm inserted from standoff at each row.
+        margin: 0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the
+            three singularity terms. 0 when not reachable.
+    """
+
+    reachable: bool
+    reason: Reason
+    depth_mm: float | None
+    detail: str
+    contact: Contact | None
+    roll: float
+    branch: int
+    insertion_q: Floats
+    insertion_depth_mm: Floats
+    margin: float
+
+    @classmethod
+    def refused(
+        cls, reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None
+    ) -> ReachAnswer:
+        """The answer for a direction that the arm does not reach, or not to the target."""
+        return cls(False, reason, depth_mm, detail, contact, math.nan, -1, np.empty((0, 6)), np.empty(0), 0.0)
+
+    def __post_init__(self) -> None:
+        self.insertion_q.setflags(write=False)
+        self.insertion_depth_mm.setflags(write=False)
+
+
 MAX_SWEEP_MM = 2.0
 """Between two collision checks no body point moves farther, so that it is never more than half of this from where it
 was checked."""
-
-MARGIN_DIGITS = 9
-"""Margins that agree to this many digits are equal, so that rounding does not choose between mirrored branches."""
 
 
 class Insertion(NamedTuple):
@@ -48,7 +120,7 @@ class Insertion(NamedTuple):
 
 
 class Surveyed(NamedTuple):
-    """What kinematics alone says of one request; see :class:`Survey`."""
+    """Kinematics of one request; see :class:`Survey`."""
 
     request: ReachRequest
     line: NeedleLine
@@ -73,10 +145,14 @@ class Surveyed(NamedTuple):
                 yield Insertion(self.line, branch, float(self.rolls[roll]), turn, self.starts[branch] + turn)
 
 
+MARGIN_DIGITS = 9
+"""Margins that agree to this many digits are equal, so that rounding does not choose between mirrored branches."""
+
+
 def surveyed(
     model: UrModel, requests: Sequence[ReachRequest], lines: Sequence[NeedleLine], rolls: Floats
 ) -> list[Surveyed]:
-    """What kinematics says of each request.
+    """Kinematics of each request.
 
     Args:
         model: The arm.
@@ -101,7 +177,7 @@ def _depths(standoff_mm: float) -> Floats:
 
 
 class Survey(NamedTuple):
-    """What kinematics alone says of many directions, every branch and roll."""
+    """Kinematics of many directions, every branch and roll."""
 
     stop_at: NDArray[np.int64]
     """Shape (n, 8): index of the sample at which the path ends, -1 where it reaches the target."""
@@ -120,7 +196,7 @@ def survey(
     depths_mm: Sequence[Floats],
     rolls: Floats,
 ) -> Survey:
-    """Every branch and roll of many straight insertions, each turned as far from the joint limits as whole turns allow.
+    """Every branch and roll of many straight insertions, by whole turns as far from the joint limits as possible.
 
     Args:
         model: The arm.
@@ -240,84 +316,6 @@ def _rolled(limits, rolls, full, reached, margins, turns):  # type: ignore[no-un
             margins[i] = margin
 
 
-SAME_UNIT = 1e-9
-"""How far a direction's length may be from 1."""
-
-
-@dataclass(frozen=True, eq=False)
-class ReachRequest:
-    """One direction to reach along.
-
-    Attributes:
-        target_base: Shape (3,), mm: the lesion, base frame.
-        outward_base: Shape (3,), unit: from the target out of the body, base frame.
-        needle_length_mm: Flange to tip.
-        standoff_mm: Tip to target before the insertion starts.
-
-    Raises:
-        InputError: If something is not finite, the direction not a unit vector, or a length not positive.
-    """
-
-    target_base: Floats
-    outward_base: Floats
-    needle_length_mm: float
-    standoff_mm: float
-
-    def __post_init__(self) -> None:
-        for name in ("target_base", "outward_base"):
-            array = np.array(getattr(self, name), dtype=np.float64)
-            if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
-                raise InputError(f"{name} = {array}", where="reach request", allowed="three finite numbers")
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        if abs(math.hypot(*self.outward_base.tolist()) - 1.0) > SAME_UNIT:
-            raise InputError(f"outward_base = {self.outward_base}", where="reach request", allowed="a unit vector")
-        for name in ("needle_length_mm", "standoff_mm"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise InputError(f"{name} = {getattr(self, name)}", where="reach request", allowed="finite and above 0")
-
-
-@dataclass(frozen=True, eq=False)
-class ReachAnswer:
-    """Whether and how the arm reaches along one direction.
-
-    Attributes:
-        reachable: The verdict.
-        reason: ``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``.
-        depth_mm: How far the needle was inserted from standoff when it was blocked; None for other reasons.
-        detail: One sentence for people: what touched what, or what was missing; empty when reachable.
-        contact: What touched what, where that was the reason.
-        roll: Turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable.
-        branch: Index among the eight branches of ``inverse``; -1 when not reachable.
-        insertion_q: Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable.
-        insertion_depth_mm: Shape (m,), mm inserted from standoff at each row.
-        margin: 0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the
-            three singularity terms. 0 when not reachable.
-    """
-
-    reachable: bool
-    reason: Reason
-    depth_mm: float | None
-    detail: str
-    contact: Contact | None
-    roll: float
-    branch: int
-    insertion_q: Floats
-    insertion_depth_mm: Floats
-    margin: float
-
-    @classmethod
-    def refused(
-        cls, reason: Reason, depth_mm: float | None, detail: str, contact: Contact | None = None
-    ) -> ReachAnswer:
-        """Of a direction that the arm does not reach, or not to the target."""
-        return cls(False, reason, depth_mm, detail, contact, math.nan, -1, np.empty((0, 6)), np.empty(0), 0.0)
-
-    def __post_init__(self) -> None:
-        self.insertion_q.setflags(write=False)
-        self.insertion_depth_mm.setflags(write=False)
-
-
 def every_branch(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Floats:
     """Every branch's path along the needle at roll 0. A roll adds to q6 and to nothing else.
 
@@ -379,7 +377,7 @@ def fill_branch_path(lengths, R, target, outward, distances, branch, turn, q):  
 
 
 class Sampled(NamedTuple):
-    """A motion's states and where they are."""
+    """States of a motion and their distances from the standoff."""
 
     q: Floats
     """Shape (m, 6), rad; NaN from where the branch first does not exist."""
@@ -428,6 +426,6 @@ def _sampled(  # type: ignore[no-untyped-def]  # numba infers
         link_frames(lengths, q, frames)
         motion_bounds(frames, q, bodies[0], bodies[1], bounds)
         worst = bounds.max()
-        if not worst > most_mm:  # NaN: the branch ends on the way
+        if not worst > most_mm:  # NaN: the branch ends early
             return q, depths
         samples = math.ceil((samples - 1) * worst / most_mm) + 1

@@ -1,6 +1,7 @@
-"""All that a person needs to find a path again at the patient: the one table that terminal, JSON and page show.
+"""One path as a person finds it again at the patient: skin entry, nearest marker, and angles in the scanner.
 
-How far the skin entry lies from a marker, along the patient's own axes.
+`entry_facts` makes the one table that terminal, JSON and page show; the entry lies so far from a marker along the
+patient's own axes.
 """
 
 from __future__ import annotations
@@ -15,16 +16,10 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
-LEAST_IN_PLANE = 1e-6
-"""Of a unit vector: a needle that runs along the patient has no angle within the slice."""
-
-MOST_TILT = np.radians(30.0)
-"""To which gantries of CT scanners tilt at most."""
-
 
 @dataclass(frozen=True, eq=False)
 class EntryFacts:
-    """One path from outside to the target, for whoever stands at the patient.
+    """One path from outside to the target, as described to a person at the patient.
 
     Attributes:
         space: Of the case: what a person typed is answered in it.
@@ -39,7 +34,7 @@ class EntryFacts:
     planes: NeedlePlanes | None
 
     def rows(self) -> tuple[tuple[str, str], ...]:
-        """What it is, and how a person reads it."""
+        """Pairs of a label and its text for people."""
         stated: list[tuple[str, str]] = []
         if self.place is not None:
             point = ", ".join(f"{mm:.1f}" for mm in self.entry_mm)
@@ -67,7 +62,7 @@ class EntryFacts:
 
 
 def entry_facts(case: Case, markers: Sequence[Landmark], entry_ct: Floats, outward_ct: Floats) -> EntryFacts:
-    """Describe a path.
+    """Skin entry, nearest landmark and scanner angles of one path.
 
     Args:
         case: Its space and target.
@@ -96,7 +91,7 @@ class NeedlePlanes(NamedTuple):
     gantry_tilt: float
 
     def rows(self) -> tuple[tuple[str, str], ...]:
-        """What it is, and how a person reads it."""
+        """Pairs of a label and its text for people."""
         beyond = f", more than the usual {np.degrees(MOST_TILT):.0f}" if abs(self.gantry_tilt) > MOST_TILT else ""
         seen = _angle(self.in_plane, " from the front", ", hub to the left", ", hub to the right")
         along = _angle(self.out_of_plane, "", ", hub toward the head", ", hub toward the feet")
@@ -113,8 +108,15 @@ class NeedlePlanes(NamedTuple):
         return {name: angle if np.isfinite(angle) else None for name, angle in angles.items()}
 
 
+LEAST_IN_PLANE = 1e-6
+"""Least part of a unit direction within the slice: a needle along the patient has no angle there."""
+
+MOST_TILT = np.radians(30.0)
+"""rad: gantries of CT scanners tilt no farther."""
+
+
 def _angle(angle: float, of: str, positive: str, negative: str) -> str:
-    """An angle with its side; none for what is shown as 0."""
+    """An angle as text with its side; no side for what is shown as 0."""
     size = f"{abs(np.degrees(angle)):.1f}"
     side = "" if float(size) == 0.0 else positive if angle > 0 else negative
     return f"{size} deg{of}{side}"
@@ -129,7 +131,7 @@ def needle_planes(outward_ct: Floats) -> NeedlePlanes:
 
 
 LEAST_MM = 0.5
-"""What a ruler on the skin does not show; words are in whole mm."""
+"""mm: a ruler on the skin does not show less; texts are in whole mm."""
 
 PATIENT = (
     (0, "to the left", "to the right"),

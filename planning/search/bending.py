@@ -1,13 +1,8 @@
-"""Directions on which a needle that bends, to any side, may come into a margin.
+"""The needle that bends: which directions it makes unsafe, and what one insertion does to needle and arm.
 
-The shaft is nowhere further from its straight axis than the bound of its path's length, so a clearance of margin and
-bound is enough whatever side the bevel points to.
-
-One insertion of a needle that bends: where its bevel takes it, and what the arm feels.
-
-The tissues along one path, from the skin to the target.
-
-What lies along one path: the CT's Hounsfield units beside the structures that the case names there.
+The shaft is nowhere farther from its straight axis than the bound of its path's length (`DeflectionBound`), so a
+clearance of margin and bound is enough whatever side the bevel points to: `with_bending` rejects what has less.
+`insertion_along` follows one path through its tissues (`path_layers`), `stretches` through the CT.
 """
 
 from __future__ import annotations
@@ -26,7 +21,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.naming import REST
-from puncture_twin.planning.geometry.containment import crossings, holds
+from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.needle.deflection import (
     Bending,
     BevelPath,
@@ -81,7 +76,7 @@ def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance:
 
 
 class Insertion(NamedTuple):
-    """A bevel that never turns, along one path; N and mm."""
+    """The insertion along one path with a bevel that never rotates; N and mm."""
 
     path: BevelPath
     force: InsertionForce
@@ -90,11 +85,11 @@ class Insertion(NamedTuple):
 
     @property
     def tip_mm(self) -> float:
-        """By how much the tip misses a straight line, to the side to which the bevel points."""
+        """Deviation of the tip from a straight line, to the side to which the bevel points, mm."""
         return float(self.path.cut_mm[-1])
 
     def lines(self, greatest_mm: float) -> list[str]:
-        """For a person.
+        """Lines of text for a person.
 
         Args:
             greatest_mm: The bound that the search keeps.
@@ -110,7 +105,7 @@ class Insertion(NamedTuple):
 def insertion_along(
     bending: Bending, anatomy: Anatomy, end_ct: Floats, outward_ct: Floats, path_length: float
 ) -> Insertion:
-    """The insertion along one direction.
+    """Deflection, forces and buckling of the insertion along one direction.
 
     Args:
         bending: Of the case.
@@ -156,7 +151,7 @@ def check_tissues(case: Case, anatomy: Anatomy) -> None:
 def path_layers(
     bending: Bending, anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_length: float
 ) -> tuple[Layer, ...]:
-    """What a needle passes, the skin first. In nested structures the smallest counts, by its box.
+    """The tissue layers of a path, skin first; in nested structures the smallest box counts.
 
     A surface is a capsule where it is entered. That of the rest is the skin: coming out of an organ there is none.
 
@@ -232,17 +227,17 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
     around = np.array([inside_at(s, target_ct, outward_ct, depths) for s in anatomy.checked if s.mesh.closed])
     names = np.array([s.name for s in anatomy.checked if s.mesh.closed], dtype=object)
     keys = [(*names[around[:, row]], "" if depth <= path_length else "outside") for row, depth in enumerate(depths)]
-    found, first = [], 0
+    parts, first = [], 0
     for key, group in groupby(keys):
         rows = slice(first, first + len(list(group)))
         first = rows.stop
         end = depths[rows][-1] + PROFILE_STEP_MM
-        found.append(Stretch(float(depths[rows][0]), float(end), tuple(filter(None, key)), *_range(hu[rows])))
-    return tuple(found)
+        parts.append(Stretch(float(depths[rows][0]), float(end), tuple(filter(None, key)), *_range(hu[rows])))
+    return tuple(parts)
 
 
 def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
-    """At which depths the path is inside a closed structure: the parity of the crossings before.
+    """Which depths of a path are inside a closed structure, by the parity of the crossings before.
 
     Args:
         structure: Closed.
@@ -255,7 +250,7 @@ def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depth
     if not np.any(np.all((low <= points) & (points <= high), axis=1)):
         return np.zeros(len(depths), bool)
     crossed = np.sort(crossings(structure.mesh, target_ct, outward_ct[None]).depth)
-    inside = holds(structure.mesh, target_ct)
+    inside = contains(structure.mesh, target_ct)
     return np.asarray((np.searchsorted(crossed, depths) % 2 == 1) != inside)
 
 

@@ -1,6 +1,6 @@
-"""Chances of a search's candidates, and their refusal where a chance breaks the case's limit.
+"""Chances to hit and to touch of a search's candidates, and their rejection where a chance breaks the case's limit.
 
-To first order for all; by line sampling where a limit may decide, and where people are shown them, as `check` has them.
+To first order for all; by line sampling where a limit may decide, and where people are shown them, as in `check`.
 For the best of them the chance to touch anything too, all structures linearised together.
 """
 
@@ -66,7 +66,7 @@ def with_chances(
 
 
 def limited(case: Case, candidates: Candidates) -> Candidates:
-    """Reject what is too unlikely to hit, or too likely to touch."""
+    """Reject candidates too unlikely to hit, or too likely to touch."""
     chances, least = candidates.chances, case.search.min_hit
     assert chances is not None
     if least is not None:
@@ -84,14 +84,14 @@ def limited(case: Case, candidates: Candidates) -> Candidates:
 
 
 def _rejected(candidates: Candidates, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Candidates:
-    """With some rows rejected: each by a structure, shape (m,), and a number, shape (m,)."""
+    """The candidates with some rows rejected, each by a structure, shape (m,), and a number, shape (m,)."""
     arrays = {field.name: getattr(candidates.verdict, field.name).copy() for field in fields(candidates.verdict)}
     arrays["reason"][rows], arrays["structure"][rows], arrays["amount"][rows] = reason.value, structure, amount
     return replace(candidates, verdict=Verdict(**arrays))
 
 
 BEST = 200
-"""Of the ranked candidates: how many get the dearer chances."""
+"""How many of the ranked candidates get the chances that cost more."""
 
 
 REFINED_FROM = 1 / 60
@@ -99,7 +99,7 @@ REFINED_FROM = 1 / 60
 side at all is 56 times that to one side at 3.5 standard deviations, and less for less."""
 
 ROWS_AT_ONCE = 4096
-"""Of candidates: a table of gradients of 60 structures stays below 20 MB."""
+"""Candidates at once: a table of gradients of 60 structures stays below 20 MB."""
 
 
 def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidates:
@@ -108,7 +108,7 @@ def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidate
     assert chances is not None
     if not np.isfinite(limits).any():
         return candidates
-    greatest = np.fmax(chances.touch, _touch_bounds(candidates, model))
+    greatest = np.fmax(chances.touch, _touch_bounds(candidates, model))  # first order may be too low
     rows = np.flatnonzero((greatest >= REFINED_FROM * limits).any(axis=1) & np.isfinite(chances.hit))
     return with_refined(candidates, model, rows) if len(rows) else candidates
 
@@ -116,7 +116,7 @@ def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidate
 def _touch_bounds(candidates: Candidates, model: ChanceModel) -> Floats:
     """Shape (n, k), of the safe candidates' chances to touch; NaN for others."""
     error, columns = model.error, model.columns
-    surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])
+    surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])  # in the worst direction
     bounds, rows = np.full((len(candidates), len(columns)), np.nan), np.flatnonzero(candidates.safe)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
         length = float(own_lengths(model.case, model.anatomy, candidates.outward_ct[part])[:, columns].max())
@@ -129,7 +129,7 @@ def _touch_bounds(candidates: Candidates, model: ChanceModel) -> Floats:
 
 
 def with_refined(candidates: Candidates, model: ChanceModel, rows: Ints) -> Candidates:
-    """Refine some rows."""
+    """The chances with some rows refined by line sampling."""
     chances = candidates.chances
     assert chances is not None
     names = [field.name for field in fields(chances) if field.name != "structures"]
@@ -139,7 +139,7 @@ def with_refined(candidates: Candidates, model: ChanceModel, rows: Ints) -> Cand
 
 
 def with_best_refined(candidates: Candidates, model: ChanceModel | None) -> Candidates:
-    """Refine what is shown: the best of all, and the best of every window.
+    """Refine the candidates that people are shown: the best of all, and the best of every window.
 
     Those that break a limit then are rejected, and the rest ranked again, until no new one is among them.
 
@@ -155,7 +155,7 @@ def with_best_refined(candidates: Candidates, model: ChanceModel | None) -> Cand
 
 
 def _shown(candidates: Candidates) -> Ints:
-    """Rows that people are shown, and whose chances are of first order yet."""
+    """Rows that people are shown, and whose chances are still of first order."""
     assert candidates.chances is not None
     best = [window.best for window in find_windows(candidates).windows]
     shown = np.unique(np.append(candidates.ranked[:BEST], best)).astype(np.int64)
@@ -193,7 +193,7 @@ def joint_touch_chance(
     chances = np.empty(len(cov_ct))
     for row, cov in enumerate(cov_ct):
         values, axes = np.linalg.eigh(cov)
-        root = axes * np.sqrt(np.maximum(values, 0.0))
+        root = axes * np.sqrt(np.maximum(values, 0.0))  # a covariance may be singular
         change = sizes[:, None] * (draws @ (near.gradient[row] @ root).T + off * surfaces[row])
         chances[row] = np.mean(np.any(change < threshold_mm - near.distance[row], axis=1))
     return chances

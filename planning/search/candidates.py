@@ -19,18 +19,18 @@ from puncture_twin.planning.case.entry import AngleGrid
 from puncture_twin.planning.uncertainty.chance_model import Chances
 
 ARM_CHECKED = "checked"
-"""What ``Candidates.arm_note`` says where a safe candidate is one that the arm can reach and insert along."""
+"""``Candidates.arm_note`` where "safe" includes that the arm can reach and insert along the candidate."""
 
 
 CONE_OF_GRID, CONE_CERTIFIED = "grid", "certificate"
 """Where a safe cone comes from: the directions of the search, or the proof of all between them."""
 
 NOT_SEEN = "not seen: image or mesh ends"
-"""In place of the skin, by whose end it is found, what is said of a path into what nobody scanned."""
+"""Named in place of the skin for a path that leaves the scanned region."""
 
 
 ANGLE_DIGITS = 9
-"""Of an angle in degrees: a grid's 59.99999999999999 is 60; 1e-9 degrees move no needle by a nanometre."""
+"""Decimals of an angle in degrees: 59.99999999999999 is 60; 1e-9 degrees move no needle by a nanometre."""
 
 
 class Columns:
@@ -64,7 +64,7 @@ class Verdict(Columns):
 
     @property
     def not_seen(self) -> Bools:
-        """Shape (n,), whether the reason is that nobody scanned the body there, and no structure's clearance."""
+        """Shape (n,), whether the reason is that the body was not scanned there, and no structure's clearance."""
         return (self.reason == Reason.UNKNOWN_REGION.value) & np.isnan(self.amount)
 
     @property
@@ -73,7 +73,7 @@ class Verdict(Columns):
         return np.where(self.not_seen, NOT_SEEN, self.structure)
 
     def of(self, rows: Ints) -> Verdict:
-        """Those of some rows."""
+        """The verdicts of some rows."""
         return Verdict(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
@@ -113,7 +113,7 @@ class Clearance(Columns):
 
 @dataclass(frozen=True, eq=False)
 class ArmColumns(Columns):
-    """What the arm answers.
+    """Whether and how the arm reaches each candidate.
 
     Attributes:
         reachable: Shape (n,), 1 yes, 0 no, -1 not queried.
@@ -127,7 +127,7 @@ class ArmColumns(Columns):
 
     @classmethod
     def unknown(cls, count: int) -> ArmColumns:
-        """Of an arm that was not queried."""
+        """The columns of ``count`` candidates for which the arm was not queried."""
         return cls(np.full(count, -1, np.int8), np.full(count, np.nan), np.full((count, 6), np.nan))
 
 
@@ -147,13 +147,13 @@ class Ranking(Columns):
 
     @classmethod
     def none(cls, count: int) -> Ranking:
-        """Of candidates that nobody has ranked."""
+        """The ranking of ``count`` candidates that are not ranked."""
         return cls(np.full(count, np.nan), np.zeros(count, np.int32), np.zeros(count, bool))
 
 
 @dataclass(frozen=True, eq=False)
 class BreathingColumns(Columns):
-    """What the breath leaves of each candidate that is safe for the organs where the CT shows them.
+    """Verdict over the breath of each candidate that is safe for the organs where the CT shows them.
 
     Attributes:
         safe_all_phases: Shape (n,), safe for the organs at every phase, if inserted at that phase.
@@ -224,7 +224,7 @@ class Candidates(Columns):
         return f"theta {np.degrees(self.theta[row]):g} deg, beta {np.degrees(self.beta[row]):g} deg"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
+        """HTML for a notebook."""
         return candidates_html(self)
 
     @property
@@ -245,7 +245,7 @@ class Candidates(Columns):
 
     @property
     def safe_text(self) -> str:
-        """What a person reads for a safe candidate: never "safe" alone with an unchecked arm, or a breath."""
+        """Text for a safe candidate: never "safe" alone with an unchecked arm, or a breath."""
         safe = "safe" if self.arm_checked else "safe for the organs"
         return safe if self.breathing is None else f"{safe} {self.breathing.safe_when}"
 

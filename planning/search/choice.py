@@ -1,6 +1,6 @@
 """Which candidate a person wants: the best, one of a rank or window, of two angles, or of an entry into the skin.
 
-A list of directions in a file: points of entry, or angles; each row one direction.
+`choose` returns the rows of one choice; `read_entries` and `read_targets` read many choices from a file, one a row.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FILES = (".mrk.json", ".fcsv", ".csv")
 """Endings of files that may hold an entry."""
 
 MOST_POINTS = 2
-"""Of such a file: both ends of a line."""
+"""Points in a file with one entry, at most: both ends of a line."""
 
 LEAST_LEVER_MM = 1.0
 """A point nearer to the target than this gives no direction."""
@@ -41,7 +41,7 @@ LEAST_LEVER_MM = 1.0
 
 @dataclass(frozen=True)
 class Choice:
-    """What a person wanted; with nothing stated the best candidate that the arm can approach.
+    """A person's choice of a candidate; with nothing stated, the best one that the arm can approach.
 
     Attributes:
         angles: θ and β, rad.
@@ -61,7 +61,7 @@ class Choice:
 
     @property
     def of_grid(self) -> bool:
-        """Whether a search's result has to be looked at."""
+        """Whether the choice is made among the results of a search."""
         return self.angles is None and self.entry_mm is None and self.entry_file is None
 
     def text(self, space: Space) -> str:
@@ -76,7 +76,7 @@ class Choice:
 
 
 BEST = Choice()
-"""Nothing stated."""
+"""The choice with nothing stated."""
 
 
 class Pick(NamedTuple):
@@ -87,7 +87,7 @@ class Pick(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """Candidates, and those of their rows that are wanted, the most wanted first."""
+    """Candidates, and the rows of them that were chosen, in the order of preference."""
 
     candidates: Candidates
     rows: Ints
@@ -104,11 +104,11 @@ def choose(context: CaseContext, candidates: Candidates, choice: Choice) -> Chos
     Args:
         context: Of the case.
         candidates: The search of its grid.
-        choice: What a person wanted.
+        choice: The person's choice.
 
     Raises:
         InputError: A rank or window that there is not, or a point that is no skin entry.
-        NoAnswerError: Nothing is safe, or what was wanted is rejected: says why.
+        NoAnswerError: Nothing is safe, or the chosen direction is rejected: says why.
     """
     if not choice.of_grid:
         return choose_stated(context, choice)
@@ -237,11 +237,11 @@ def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
 ANGLES = ("theta_deg", "beta_deg")
 ALLOWED_ANGLES = "a header with theta_deg and beta_deg, and perhaps name; then as many fields in every line"
 GREATEST = (180.0, 360.0)
-"""Of the two angles, degrees."""
+"""The largest θ and β, degrees."""
 
 
 class Listed(NamedTuple):
-    """One row.
+    """One row of a list of directions or targets.
 
     Attributes:
         number: 1 for the first.
@@ -257,7 +257,7 @@ class Listed(NamedTuple):
 
 
 class ReadList(NamedTuple):
-    """A file's rows, the file, and what is odd about it."""
+    """The rows of a list, its file, and warnings about it."""
 
     rows: tuple[Listed, ...]
     input: Input
@@ -291,7 +291,7 @@ def read_targets(path: Path, case: Case, choice: Choice) -> ReadList:
 
 
 def _unfinished(data: bytes, path: Path) -> tuple[str, ...]:
-    """Of a list that is read line by line and may be cut within a number."""
+    """Warnings about a list that may have been cut within a number."""
     return unfinished_warnings(data, path.name) if path.suffix.lower() in (".csv", ".fcsv") else ()
 
 

@@ -1,6 +1,6 @@
-"""What makes a candidate safe for the organs or not: the constraints, in the order in which a reason is given.
+"""The constraints that reject a candidate, in the order in which its reason is given: organs and skin, then the arm.
 
-Which of the candidates that the organs allow the arm can reach and insert along.
+`first_broken` checks skin and organs of all candidates at once, `with_reach` the arm for those that they leave.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from puncture_twin.planning.search.candidates import ARM_CHECKED, ArmColumns, Ca
 Column = NDArray[Any] | str | float
 
 SKIN = "skin"
-"""Its name in the reasons."""
+"""The skin's name in the reasons."""
 
 
 def first_broken(
@@ -84,18 +84,18 @@ def first_broken(
 
 
 def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:
-    """Column of the structure that lacks most of its margin, shape (n,); equal lacks go to the one met first.
+    """Column of the structure that lacks most of its margin, shape (n,); of equal ones the first along the needle.
 
     0 where none lacks any.
     """
     count = len(clearances.clearance)
-    worst, most, met = np.zeros(count, np.int64), np.full(count, -np.inf), np.full(count, np.inf)
+    worst, most, reached = np.zeros(count, np.int64), np.full(count, -np.inf), np.full(count, np.inf)
     for column, structure in enumerate(structures):
         rows = np.flatnonzero(clearances.violated[:, column])
         lack, depth = structure.margin_mm - clearances.clearance[rows, column], clearances.depth[rows, column]
-        more = (lack > most[rows]) | ((lack == most[rows]) & (depth < met[rows]))
+        more = (lack > most[rows]) | ((lack == most[rows]) & (depth < reached[rows]))
         rows = rows[more]
-        worst[rows], most[rows], met[rows] = column, lack[more], depth[more]
+        worst[rows], most[rows], reached[rows] = column, lack[more], depth[more]
     return worst
 
 
@@ -128,7 +128,7 @@ def _first_of(candidates: Candidates, reasons: tuple[Reason, ...]) -> int | None
 
 @dataclass(frozen=True, eq=False)
 class ArmReach:
-    """Checks whether the arm reaches a candidate: the workcell, and where the patient is in it."""
+    """The arm in its workcell, as the check of candidates needs it, and where the patient is."""
 
     checker: CellChecker
     T_base_ct: Floats
@@ -157,12 +157,12 @@ def with_reach(case: Case, candidates: Candidates, reach: ArmReach, progress: Co
 
 
 def reach_request(case: Case, candidates: Candidates, row: int, T_base_ct: Floats) -> ReachRequest:
-    """What the arm has to reach for one candidate."""
+    """The reach request of one candidate: its needle line and standoff."""
     return reach_requests(case, candidates, np.array([row]), T_base_ct)[0]
 
 
 def reach_requests(case: Case, candidates: Candidates, rows: Ints, T_base_ct: Floats) -> list[ReachRequest]:
-    """What the arm has to reach for some candidates."""
+    """The reach requests of some candidates."""
     R, target = T_base_ct[:3, :3], T_base_ct[:3, :3] @ case.target_ct + T_base_ct[:3, 3]
     lengths = standoffs(case.needle, candidates.path.length[rows], candidates.path.skin_angle[rows]).tolist()
     outward = [R @ candidates.outward_ct[row] for row in rows]

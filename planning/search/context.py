@@ -1,6 +1,7 @@
-"""A case, read and ready to be asked: its structures, its engine, and the arm in its workcell.
+"""One case, prepared: structures, clearance engine, the arm in its workcell, and every question about them.
 
-What else would be safe: with less assumed beyond the image, and with a shorter needle of the catalogue.
+`prepare` reads a case once; `CaseContext` then searches its grid, checks and explains single directions, and gives
+errors and provenance. A search also reports what else would be safe (`alternatives`).
 """
 
 from __future__ import annotations
@@ -40,20 +41,20 @@ from puncture_twin.planning.search.bedside import EntryFacts, Landmark, entry_fa
 from puncture_twin.planning.search.bending import check_tissues
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.constraints import ArmReach
-from puncture_twin.planning.search.doubt import Doubt, doubt_of
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import breath_warnings
 from puncture_twin.planning.search.search import organ_candidates, search
 from puncture_twin.planning.search.sides import Side, sides_of
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, uncertainty_breakdown
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
-"""Who measures clearance: the fast exact engine, or FCL alone as the plain reference."""
+"""Clearance engines by name: the fast exact engine, and FCL alone as the plain reference."""
 
 COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
-"""What each of them counts while it measures."""
+"""The unit of each engine's progress."""
 
 NO_BASE = "the case does not say where the robot's base is"
 ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]; or a check without the arm"
@@ -61,11 +62,11 @@ ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]; or
 
 @dataclass(frozen=True, eq=False)
 class CaseContext:
-    """What every question about a case needs, read once.
+    """A prepared case: everything that questions about it need, read once.
 
     Attributes:
         placement: Where the patient lies for the robot, or None when the case does not say.
-        reach: Who answers for the arm, or None without a placement.
+        reach: The checker of the arm, or None without a placement.
         chance: Of the declared errors; None where the case declares none, or the arm is not checked.
         stages: How long reading took; later stages are added as they happen.
     """
@@ -92,18 +93,18 @@ class CaseContext:
 
     @property
     def pose_error(self) -> PoseError | None:
-        """Of the needle, where the case declares errors and has markers, also where the arm is not checked."""
+        """The needle's pose error, if the case declares errors and has markers, also where the arm is not checked."""
         return pose_error(self.case, None if self.placement is None else self.placement.registration)
 
     @cached_property
     def sides(self) -> tuple[Side, ...]:
-        """From where a needle can come, and where the case's grid looks."""
+        """Open sides of the body around the target, and which of them the case's grid covers."""
         return sides_of(self.case, self.anatomy)
 
     def search(self) -> Candidates:
         """Check the case's whole grid."""
         with self.stages.time("search"):
-            found = search(
+            candidates = search(
                 self.case,
                 self.anatomy,
                 self.engine,
@@ -112,25 +113,25 @@ class CaseContext:
                 chance=self.chance,
                 progress=partial(self.watcher.count, "directions of the arm"),
             )
-            others = tuple(alternatives(self.case, self.anatomy, self.engine, found))
-        return replace(found, arm_note=self.arm, findings=others)
+            others = tuple(alternatives(self.case, self.anatomy, self.engine, candidates))
+        return replace(candidates, arm_note=self.arm, findings=others)
 
     def check(self, theta: float, beta: float) -> Candidates:
         """Check a single direction (rad)."""
         directions = self.case.direction(theta, beta)
-        found = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
-        return replace(found, arm_note=self.arm)
+        candidates = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
+        return replace(candidates, arm_note=self.arm)
 
     def explain(self, theta: float, beta: float) -> Explanation:
-        """Check a single direction (rad), and say what it was checked against and how sure it is."""
-        found = self.check(theta, beta)
-        known = found.chances is not None and np.isfinite(found.chances.hit[0])
-        doubt = self.doubt_at(found.outward_ct[0], found.arm.q_insertion[0]) if known else None
-        facts = self.entry_facts(found.path.entry_ct[0], found.outward_ct[0])
-        return Explanation(self.case, self.anatomy, found, facts, doubt)
+        """Check a single direction (rad), with everything it was checked against and its uncertainty."""
+        candidates = self.check(theta, beta)
+        known = candidates.chances is not None and np.isfinite(candidates.chances.hit[0])
+        breakdown = self.breakdown_at(candidates.outward_ct[0], candidates.arm.q_insertion[0]) if known else None
+        facts = self.entry_facts(candidates.path.entry_ct[0], candidates.outward_ct[0])
+        return Explanation(self.case, self.anatomy, candidates, facts, breakdown)
 
     def entry_facts(self, entry_ct: Floats, outward_ct: Floats) -> EntryFacts:
-        """A path for whoever stands at the patient: its skin entry (3,), mm, and its direction outward (3,), unit."""
+        """Skin entry (3,), mm, and outward direction (3,), unit, described to a person at the patient."""
         registration = None if self.placement is None else self.placement.registration
         if registration is None:
             return entry_facts(self.case, (), entry_ct, outward_ct)
@@ -138,12 +139,12 @@ class CaseContext:
         markers = tuple(Landmark(f"marker {name}", point) for name, point in named)
         return entry_facts(self.case, markers, entry_ct, outward_ct)
 
-    def doubt_at(self, outward_ct: Floats, q: Floats) -> Doubt | None:
-        """How sure one direction (3,) is in one configuration (6,), rad, as of a plan; None without declared errors."""
-        return None if self.chance is None else doubt_of(self.chance, outward_ct, q)
+    def breakdown_at(self, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown | None:
+        """Uncertainty breakdown of a direction (3,) at joints (6,), rad, as of a plan; None without declared errors."""
+        return None if self.chance is None else uncertainty_breakdown(self.chance, outward_ct, q)
 
     def region_ct(self, q: Floats) -> Floats | None:
-        """Within x' inv(region) x <= 1 about the target the tip is expected in 95 of 100, shape (3, 3), mm^2, CT axes.
+        """The tip's 95 % region about the target: x' inv(region) x <= 1, shape (3, 3), mm^2, CT axes.
 
         Args:
             q: Shape (6,), rad, the tip on the target; NaN where the arm does not reach it.
@@ -166,11 +167,11 @@ class CaseContext:
             case, outward = self.case, self.case.directions().outward_ct
             meshes = tuple(structure.mesh for structure in self.anatomy.checked)
             length, rng = own_lengths(case, self.anatomy, outward), np.random.default_rng(case.rehearsal.seed)
-            found = self.engine.measure(case.target_ct, outward, length)
-            return cross_check(found, meshes, case.target_ct, outward, length, count=count, rng=rng)
+            distances = self.engine.measure(case.target_ct, outward, length)
+            return cross_check(distances, meshes, case.target_ct, outward, length, count=count, rng=rng)
 
     def provenance(self) -> dict[str, Any]:
-        """Where a result comes from: case, inputs, version, grid."""
+        """Provenance of a result: case, inputs, version, grid."""
         return {
             "case": self.case.name,
             "inputs": inputs_document(self.case.inputs),
@@ -193,13 +194,13 @@ def prepare(
     options: CaseOptions = NO_OPTIONS,
     memory: Memory = NO_MEMORY,
 ) -> CaseContext:
-    """Read a case and everything that it names.
+    """Prepare a case: read it and everything that it names.
 
     Args:
         path: Case file, or the folder that holds ``case.toml``.
         arm: Whether the arm is checked too; None checks it where the case says where its base is.
         engine: A name of `ENGINES`.
-        watcher: Whoever shows progress.
+        watcher: Shows progress.
         target_ct: Another target than the case's, shape (3,), mm.
         options: What is stated in place of what the case file states.
         memory: What this process keeps from one case to the next; the answer is the same.
@@ -224,21 +225,21 @@ def prepare(
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
         watcher.step("anatomy", "whether all fits together")
         read = (*case.warnings, *anatomy.warnings)
-        found = (
+        collected = (
             *(Finding("reading", Severity.WARNING, one) for one in read),
             *anatomy.findings,
             *findings(case, anatomy, placement, cache),
             *(Finding("breathing", Severity.WARNING, one) for one in breath_warnings(case, anatomy)),
         )
         check_tissues(case, anatomy)
-        shown = tuple(one.sentence for one in found if one.severity is not Severity.NOTE)
-        anatomy = replace(anatomy, warnings=shown, findings=found)
+        shown = tuple(one.sentence for one in collected if one.severity is not Severity.NOTE)
+        anatomy = replace(anatomy, warnings=shown, findings=collected)
         case.files.release()
         memory.limit(MEMORY_BYTES)
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
-        kept = {"cache": cache} if engine == "fast" else {}
-        measurer = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **kept)
+        cache_option = {"cache": cache} if engine == "fast" else {}
+        measurer = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **cache_option)
         reach = None
         if arm is not False and placement is not None:
             reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, memory), placement.T_base_ct)
@@ -248,17 +249,17 @@ def prepare(
 
 
 def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Iterator[Finding]:
-    """What else would be safe for the organs; ``found`` are the case's directions, ranked."""
-    more = hangs_on_beyond(case, anatomy, candidates)
+    """Findings on what else would be safe for the organs, from the ranked candidates of the case."""
+    more = safe_without_beyond(case, anatomy, candidates)
     if more:
-        said = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
-        yield Finding("hangs_on_beyond_image", Severity.NOTE, said, {"directions": more})
+        text = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
+        yield Finding("hangs_on_beyond_image", Severity.NOTE, text, {"directions": more})
     if case.needle.lengths_mm:
         yield _catalogue(case, anatomy, engine, candidates)
 
 
-def hangs_on_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) -> int:
-    """How many directions are kept from being safe by that alone by which a body is wider beyond its image."""
+def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) -> int:
+    """How many directions only the assumed body beyond the image keeps from being safe."""
     clearance, named = candidates.clearance, candidates.verdict.structure == BEYOND_IMAGE
     others = ~np.isnan(clearance.margins) & (np.array(clearance.structures) != BEYOND_IMAGE)
     rows = np.flatnonzero(named & (clearance.distance[:, others] >= clearance.margins[others]).all(axis=1))
@@ -278,10 +279,10 @@ def _catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates
         length: organ_candidates(replace(case, needle=case.needle.of_length(length)), anatomy, engine, directions).safe
         for length in sorted(case.needle.lengths_mm)
     }
-    said = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
+    text = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
     best = [window.best for window in find_windows(candidates).windows]
     shortest = [next((length for length, rows in safe.items() if rows[row]), np.nan) for row in best]
     fits = ", ".join(f"{length:g} mm" for length in shortest)
     numbers = {"lengths_mm": list(safe), "safe": [float(rows.sum()) for rows in safe.values()], "shortest_mm": shortest}
-    said += f"; the shortest that fits the best path of each window: {fits or 'none'}"
-    return Finding("needle_catalogue", Severity.NOTE, f"needles, safe for the organs: {said}", numbers)
+    text += f"; the shortest that fits the best path of each window: {fits or 'none'}"
+    return Finding("needle_catalogue", Severity.NOTE, f"needles, safe for the organs: {text}", numbers)

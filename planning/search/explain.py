@@ -19,10 +19,10 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.bending import Insertion, Stretch, insertion_along, stretches
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.doubt import Doubt
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
 
 NEAREST = 8
-"""Structures that are listed where nobody wants all: a case has a hundred, and those far away decide nothing."""
+"""Structures listed by default: a case has a hundred, and those far away decide nothing."""
 
 COARSE_VOXEL_MM = 1.0
 """A surface drawn around voxels of this size is somewhere within half of it."""
@@ -35,7 +35,7 @@ UNITS = {
     Reason.HIT_UNLIKELY.value: "chance to hit",
     Reason.TOUCH_LIKELY.value: "chance to touch",
 }
-"""Of the number that fell short, by reason; of all others it is a clearance in mm."""
+"""Unit of the number that fell short, by reason; for all others it is a clearance in mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +45,15 @@ class Explanation:
     Attributes:
         candidates: A search's result with this candidate alone.
         facts: The same path for whoever stands at the patient.
-        doubt: How sure it is; None where the case declares no errors, or the candidate was rejected before.
-        read: What was read beside the case to choose it.
+        breakdown: How sure it is; None where the case declares no errors, or the candidate was rejected before.
+        read: What was read besides the case to choose it.
     """
 
     case: Case
     anatomy: Anatomy
     candidates: Candidates
     facts: EntryFacts
-    doubt: Doubt | None = None
+    breakdown: UncertaintyBreakdown | None = None
     read: tuple[Input, ...] = ()
 
     @brief
@@ -77,8 +77,8 @@ class Explanation:
 
     def clearances(self) -> dict[str, float]:
         """Structure to clearance, mm."""
-        found = self.candidates.clearance
-        return dict(zip(found.structures, map(float, found.distance[0]), strict=True))
+        clearance = self.candidates.clearance
+        return dict(zip(clearance.structures, map(float, clearance.distance[0]), strict=True))
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees; null where there is no number."""
@@ -122,27 +122,27 @@ class Explanation:
         }
 
     def _breathing(self) -> dict[str, Any]:
-        """Only of a case that declares its breathing."""
-        found = self.candidates.breathing
-        if found is None:
+        """The key ``breathing``, of a case that declares its breathing."""
+        breathing = self.candidates.breathing
+        if breathing is None:
             return {}
         values = {
-            "safe_all_phases": bool(found.safe_all_phases[0]),
-            "worst_phase": finite(found.worst_phase[0]),
-            "breathing_clearance_mm": finite(found.clearance[0]),
+            "safe_all_phases": bool(breathing.safe_all_phases[0]),
+            "worst_phase": finite(breathing.worst_phase[0]),
+            "breathing_clearance_mm": finite(breathing.clearance[0]),
             "safe_means": self.candidates.safe_text,
         }
         return {"breathing": values}
 
     def _chances(self) -> dict[str, Any]:
-        """Only of a case that declares errors, so that others keep their keys."""
+        """The key ``chances``, of a case that declares errors."""
         if self.case.errors is None:
             return {}
-        return {"chances": None if self.doubt is None else self.doubt.summary()}
+        return {"chances": None if self.breakdown is None else self.breakdown.summary()}
 
     @cached_property
     def along_path(self) -> tuple[Stretch, ...]:
-        """The CT along the path, beside the structures; empty without a CT."""
+        """Hounsfield units and structures along the path; empty without a CT."""
         row = self.candidates
         return stretches(self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path.length[0]))
 
@@ -154,7 +154,7 @@ class Explanation:
         return [head, *self._reason()]
 
     def text(self, most: int | None = NEAREST) -> str:
-        """All of it for a person.
+        """The whole explanation for a person.
 
         Args:
             most: How many structures are listed, the nearest first; None lists all.
@@ -163,7 +163,7 @@ class Explanation:
             [
                 f"case {self.case.name}",
                 *self.head(),
-                *self._doubt(),
+                *self._breakdown(),
                 *self._path(),
                 self._target(),
                 *self._bending(),
@@ -180,9 +180,9 @@ class Explanation:
     def _reason(self) -> list[str]:
         return [] if self.safe else ["  because " + reason_text(self.candidates, 0)]
 
-    def _doubt(self) -> list[str]:
-        if self.doubt is not None:
-            return [f"  {line}" for line in self.doubt.lines()]
+    def _breakdown(self) -> list[str]:
+        if self.breakdown is not None:
+            return [f"  {line}" for line in self.breakdown.lines()]
         return [] if self.case.errors is None else [f"  {NO_CHANCES}"]
 
     def _path(self) -> list[str]:
@@ -203,7 +203,7 @@ class Explanation:
 
     @cached_property
     def insertion(self) -> Insertion | None:
-        """Where the needle bends to, and what it feels; None without tissue, or without an entry."""
+        """Deflection and forces along the path; None without tissue, or without an entry."""
         row, bending = self.candidates, self.case.bending
         if bending is None or np.isnan(row.path.length[0]):
             return None
@@ -215,21 +215,21 @@ class Explanation:
         return self.insertion.lines(float(self.candidates.deflection[0]))
 
     def _needle(self) -> dict[str, Any]:
-        """Only of a case that declares its tissue."""
+        """The key ``bending``, of a case that declares its tissue."""
         if self.candidates.deflection is None:
             return {}
-        found = self.insertion
+        insertion = self.insertion
         values = {
             "deflection_bound_mm": finite(self.candidates.deflection[0]),
-            "deflection_mm": None if found is None else found.tip_mm,
-            "peak_force_n": None if found is None else found.force.peak_n,
-            "buckling_free_n": None if found is None else found.buckling_free_n,
-            "buckling_pinned_n": None if found is None else found.buckling_pinned_n,
+            "deflection_mm": None if insertion is None else insertion.tip_mm,
+            "peak_force_n": None if insertion is None else insertion.force.peak_n,
+            "buckling_free_n": None if insertion is None else insertion.buckling_free_n,
+            "buckling_pinned_n": None if insertion is None else insertion.buckling_pinned_n,
         }
         return {"bending": values}
 
     def _breath(self) -> list[str]:
-        """The least clearance of all phases that the gate lets through."""
+        """Text of the least clearance of all phases that the gate lets through."""
         found, breathing = self.candidates.breathing, self.case.breathing
         if found is None or breathing is None or np.isnan(found.clearance[0]):
             return []
@@ -267,7 +267,7 @@ class Explanation:
             margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
             lines.append(
                 f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.{decimals(structure)}f} {margin}"
-                + _beside(float(clearances[column]), bool(short[column]))
+                + _clearance_note(float(clearances[column]), bool(short[column]))
             )
         left = len(order) - len(shown)
         return [*lines, f"  and {left} more, farther away"] if left else lines
@@ -291,18 +291,18 @@ class Explanation:
 
 
 def decimals(structure: Structure) -> int:
-    """Of a clearance, in mm, as people read it: a surface drawn around coarse voxels has no hundredths."""
+    """Decimals of a clearance in mm for people: a surface drawn around coarse voxels has no hundredths."""
     return 1 if structure.voxel_mm >= COARSE_VOXEL_MM else 2
 
 
-def _beside(clearance_mm: float, short: bool) -> str:
-    """What a clearance means for people: one below zero is a needle that goes through."""
-    said = ["too close"] * short + ["crossed"] * (clearance_mm < 0)
-    return f"  {', '.join(said)}" if said else ""
+def _clearance_note(clearance_mm: float, short: bool) -> str:
+    """Text after a clearance: too close, or crossed where it is below zero."""
+    notes = ["too close"] * short + ["crossed"] * (clearance_mm < 0)
+    return f"  {', '.join(notes)}" if notes else ""
 
 
 def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
-    """What to say where a longer needle would free more directions than this one does."""
+    """Warnings where a longer needle would free more directions than this one does."""
     short = candidates.verdict.reason == Reason.TOO_LONG.value
     crossed = (candidates.clearance.distance < candidates.clearance.margins).any(axis=1)
     freed = short & ~crossed & (candidates.path.skin_angle <= case.search.max_skin_angle)
@@ -323,12 +323,12 @@ def reason_text(candidates: Candidates, row: int) -> str:
         parts.append(f"({candidates.verdict.named[row]})")
     if np.isfinite(candidates.verdict.depth[row]):
         parts.append(f"at {candidates.verdict.depth[row]:.1f} mm from the target")
-    said = " ".join(parts)
+    text = " ".join(parts)
     if np.isfinite(candidates.verdict.amount[row]):
-        said += _amount_text(candidates, row)
+        text += _amount_text(candidates, row)
     if candidates.verdict.detail[row]:
-        said += f" - {candidates.verdict.detail[row]}"
-    return said
+        text += f" - {candidates.verdict.detail[row]}"
+    return text
 
 
 def deep_text(clearance_mm: float) -> str:
@@ -342,7 +342,7 @@ def deep_text(clearance_mm: float) -> str:
 
 
 def _amount_text(candidates: Candidates, row: int) -> str:
-    """The number that fell short; a clearance ends at minus the radius, how much deeper an axis is nobody measures."""
+    """Text of the number that fell short; a negative clearance ends at minus the radius."""
     reason, amount = str(candidates.verdict.reason[row]), float(candidates.verdict.amount[row])
     margin = _margin(candidates, row) if reason == Reason.TOO_CLOSE.value else np.nan
     if reason not in UNITS and amount < 0:
@@ -353,7 +353,7 @@ def _amount_text(candidates: Candidates, row: int) -> str:
 
 
 def _margin(candidates: Candidates, row: int) -> float:
-    """What the structure that the reason names demands, mm."""
+    """Margin of the structure that the reason names, mm."""
     found = candidates.clearance
     return float(found.margins[found.structures.index(str(candidates.verdict.structure[row]))])
 

@@ -1,14 +1,9 @@
-"""Skin and organs at all positions of the breath, and between them; what the gate lets through decides the verdict.
+"""The breath in the search: skin, organs and arm at every position of it, and between positions.
 
-The arm at every phase that the gate lets through: the target, the skin and what lies on it are elsewhere there.
-
-Skin and organs at every phase of the breath, if the needle is inserted at that phase.
-
-At the position s the target is at t + s b d, and a structure of weight w is displaced by s w b d. Seen from the
-structure, the needle starts at t + s b (1 - w) d: the surfaces stay where they are, and the engine prepared for them is
-asked for another target. What moves with the target (w = 1) is not measured again.
-
-The weight of every structure of a case that breathes: how much of the target's motion it follows; what to warn.
+At the position s the target is at t + s b d, and a structure of weight w is displaced by s w b d (amplitude b, unit
+direction d). Seen from the structure, the needle starts at t + s b (1 - w) d: the surfaces stay where they are, and
+their engine measures from another target. What moves with the target (w = 1) is not measured again.
+What the gate lets through decides the verdict.
 """
 
 from __future__ import annotations
@@ -38,76 +33,6 @@ from puncture_twin.planning.reach.standoff import axis_lengths, own_paths
 from puncture_twin.planning.search.bending import bent_verdict
 from puncture_twin.planning.search.candidates import ArmColumns, BreathingColumns, Candidates, Verdict
 from puncture_twin.planning.search.constraints import ArmReach, first_broken, with_reach
-
-LEAST_MM = 0.1
-"""Positions this near to each other are not parted: what is not shown to be clear there counts as too close."""
-
-
-class _Gap(NamedTuple):
-    """Between the positions low and high: m candidates, k structures, what both leave over the margins, (m, k), mm."""
-
-    rows: Ints
-    columns: Ints
-    low: float
-    high: float
-    at_low: Floats
-    at_high: Floats
-    deflection: Floats
-
-    def of(self, rows: Bools, columns: Bools) -> _Gap:
-        """Of some candidates and structures."""
-        part = np.ix_(rows, columns)
-        ends = self.at_low[part], self.at_high[part]
-        return _Gap(self.rows[rows], self.columns[columns], self.low, self.high, *ends, self.deflection[rows])
-
-
-def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
-    """The verdict with those rejected that no measurement shows to be clear between two positions.
-
-    Args:
-        body: The case.
-        verdict: Of the candidates, with what is rejected at the two positions.
-        low: The one position.
-        high: The other, of the same candidates.
-    """
-    deflection = np.fmax(low.deflection, high.deflection)
-    columns = np.arange(len(body.demanding))
-    return _checked(body, verdict, _Gap(low.rows, columns, low.s, high.s, low.excess, high.excess, deflection))
-
-
-def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
-    moves = body.moves_mm(gap.low, gap.high)[gap.columns]
-    least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]
-    short = (least < 0) & (moves > 0) & (verdict.reason[gap.rows] == Reason.NONE.value)[:, None]
-    rows, columns = short.any(axis=1), short.any(axis=0)
-    if not rows.any():
-        return verdict
-    gap, least, middle = gap.of(rows, columns), least[np.ix_(rows, columns)], (gap.low + gap.high) / 2
-    if moves[columns].max() <= LEAST_MM:
-        nearest = _names(body, gap, least)
-        return rejected_at(
-            verdict, gap.rows, _too_close(nearest, np.full(len(nearest), np.nan)), body.breathing, middle
-        )
-    excess = body.excess_at(gap.rows, middle, gap.columns)
-    left = excess - gap.deflection[:, None]
-    bad = left.min(axis=1) < 0
-    column = left[bad].argmin(axis=1)
-    amount = excess[bad][np.arange(len(column)), column] + body.margins[gap.columns[column]]
-    close = _too_close(_names(body, gap, left)[bad], amount)
-    verdict = rejected_at(verdict, gap.rows[bad], close, body.breathing, middle)
-    verdict = _checked(body, verdict, gap._replace(high=middle, at_high=excess))
-    return _checked(body, verdict, gap._replace(low=middle, at_low=excess))
-
-
-def _names(body: BreathingBody, gap: _Gap, left: Floats) -> Texts:
-    """The structure that leaves each candidate least."""
-    names = np.array([body.anatomy.checked[column].name for column in body.demanding], dtype=object)
-    return np.asarray(names[gap.columns[left.argmin(axis=1)]])
-
-
-def _too_close(names: Texts, amount: Floats) -> Verdict:
-    blank, reason = np.full(len(names), "", dtype=object), np.full(len(names), Reason.TOO_CLOSE.value, dtype=object)
-    return Verdict(reason, names, np.full(len(names), np.nan), amount, blank)
 
 
 def with_breathing(
@@ -154,7 +79,7 @@ def with_breathing_reach(case: Case, anatomy: Anatomy, candidates: Candidates, r
         case: The case; nothing is done where it declares no breathing.
         anatomy: Its structures.
         candidates: Checked with the arm where the CT shows the body.
-        reach: Who checked it.
+        reach: The checker of the arm.
     """
     breathing = case.breathing
     if breathing is None:
@@ -188,7 +113,7 @@ def _at_phase(
 
 
 def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float) -> Anatomy:
-    """The anatomy with what an arm may touch, the skin and what lies outside of the body, where the breath puts it."""
+    """The anatomy at a position of the breath: skin and what lies outside of the body, which an arm may touch."""
     inside, outside = np.split(weights.structures, [len(anatomy.structures)])
     del inside  # an arm does not come to it
     return replace(
@@ -204,7 +129,7 @@ def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s
 def _with_moved_solids(
     case: Case, anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float, T_base_ct: Floats
 ) -> Case:
-    """The case with its obstacles and gantry, which the arm's checker takes from there, where their weights say."""
+    """The case with obstacles and gantry moved as their weights say: the arm's checker takes them from it."""
     names = [one.name for one in anatomy.checked]
     of = dict(zip(names, weights.structures.tolist(), strict=True))
 
@@ -228,8 +153,107 @@ def _moved(mesh: TriangleMesh, by_ct: Floats) -> TriangleMesh:
 
 
 @dataclass(frozen=True, eq=False)
+class BreathingBody:
+    """A case that breathes, measured at any position of the breath.
+
+    Attributes:
+        case: The case.
+        breathing: Of the case.
+        anatomy: Its structures.
+        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
+        weights: Of skin and structures.
+        bound: How far the needle may bend; None bends nothing.
+        candidates: The candidates, checked where the CT shows the body.
+    """
+
+    case: Case
+    breathing: Breathing
+    anatomy: Anatomy
+    engine: ClearanceEngine
+    weights: MovingWeights
+    bound: DeflectionBound | None
+    candidates: Candidates
+
+    @cached_property
+    def lengths(self) -> Floats:
+        """Lengths to which the n axes are checked against the k structures, shape (n, k), mm.
+
+        Up to the farthest place at which the flange waits at any position.
+        """
+        case, checked, outward = self.case, self.anatomy.checked, self.candidates.outward_ct
+        at = [axis_lengths(case, checked, self.paths(outward, s)) for s in self.breathing.positions.tolist()]
+        return np.asarray(np.max(at, axis=0))
+
+    def paths(self, outward_ct: Floats, s: float) -> SkinPaths:
+        """Skin paths (n, 3) at a position; entries in the moved skin's own coordinates."""
+        moved = (1 - self.weights.skin) * self.breathing.moved_ct(s)
+        return own_paths(self.case, self.anatomy.skin, outward_ct, moved)
+
+    @property
+    def demanding(self) -> Ints:
+        """Columns of the structures with a margin."""
+        return np.flatnonzero([one.demands_margin for one in self.anatomy.checked])
+
+    @property
+    def margins(self) -> Floats:
+        """Margins of the structures with one, shape (k,), mm."""
+        return np.array([self.anatomy.checked[column].margin_mm for column in self.demanding], dtype=np.float64)
+
+    def moves_mm(self, low: float, high: float) -> Floats:
+        """How far each structure with a margin moves against the target between two positions, shape (k,)."""
+        weights = self.weights.structures[self.demanding]
+        return np.asarray(abs(high - low) * self.breathing.amplitude_mm * np.abs(1 - weights))
+
+    def at(self, rows: Ints, s: float) -> Phase:
+        """The phase of candidates ``rows`` (m,) at a position, as if inserted there."""
+        case, checked, outward = self.case, self.anatomy.checked, self.candidates.outward_ct[rows]
+        moved = self.breathing.moved_ct(s)
+        paths = self.paths(outward, s)
+        shifts = moved[None] * (1 - self.weights.structures)[:, None]
+        clearances = self._clearances(rows, shifts)
+        limit = case.search.max_skin_angle
+        verdict = first_broken(paths, clearances, checked, needle=case.needle, max_skin_angle=limit)
+        deflection = np.zeros(len(rows)) if self.bound is None else self.bound.at(paths.path_length)
+        if self.bound is not None:
+            verdict = bent_verdict(verdict, checked, clearances.clearance, deflection)
+        clearance = clearances.clearance[:, self.demanding]
+        return Phase(s, rows, verdict, clearance, clearance - self.margins, deflection)
+
+    def excess_at(self, rows: Ints, s: float, columns: Ints) -> Floats:
+        """Clearance beyond the margins of some structures at a position, shape (m, c), mm.
+
+        Args:
+            rows: Shape (m,), which candidates.
+            s: The position.
+            columns: Shape (c,), which of the structures with a margin.
+        """
+        case, which = self.case, self.demanding[columns]
+        distance, weights = np.empty((len(rows), len(columns))), self.weights.structures[which]
+        for weight in np.unique(weights):
+            group = np.flatnonzero(weights == weight)
+            origin = case.target_ct + (1 - weight) * self.breathing.moved_ct(s)
+            part, length = self.engine.of(which[group]), self.lengths[np.ix_(rows, which[group])]
+            distance[:, group] = part.measure(origin, self.candidates.outward_ct[rows], length, shown=False).distance
+        return np.asarray(distance - case.needle.radius_mm - self.margins[columns])
+
+    def _clearances(self, rows: Ints, shifts_ct: Floats) -> Clearances:
+        """Clearances to all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
+        checked, candidates, radius = self.anatomy.checked, self.candidates, self.case.needle.radius_mm
+        clearance = candidates.clearance.distance[rows].copy()
+        depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
+        moved = [one.demands_margin and (one.outside or by.any()) for one, by in zip(checked, shifts_ct, strict=True)]
+        for shift in np.unique(shifts_ct[moved], axis=0):
+            columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & moved)
+            structures, length = tuple(checked[column] for column in columns), self.lengths[np.ix_(rows, columns)]
+            target, outward, part = self.case.target_ct + shift, candidates.outward_ct[rows], self.engine.of(columns)
+            at = measure(part, structures, target, outward, length=length, radius=radius)
+            clearance[:, columns], depth[:, columns], violated[:, columns] = at.clearance, at.depth, at.violated
+        return Clearances(clearance, depth, violated)
+
+
+@dataclass(frozen=True, eq=False)
 class Phase:
-    """What some candidates are at one position of the breath.
+    """Verdict and clearances of some candidates at one position of the breath.
 
     Attributes:
         s: The position.
@@ -249,123 +273,24 @@ class Phase:
 
     @property
     def safe(self) -> Bools:
-        """Shape (m,)."""
+        """Which of the candidates are safe at this position, shape (m,)."""
         return np.asarray(self.verdict.reason == Reason.NONE.value)
 
     @property
     def least_excess(self) -> Floats:
-        """Shape (m,), mm; minus infinity where something else than a clearance rejects."""
+        """Least clearance beyond a margin, shape (m,), mm; minus infinity where another reason rejects."""
         near = np.isin(self.verdict.reason, CLEARANCES) | self.safe
         return np.asarray(np.where(near, self.excess.min(axis=1, initial=np.inf), -np.inf))
 
     def of(self, which: Bools) -> Phase:
-        """Of some of the candidates; ``which`` of shape (m,)."""
+        """The phase of some of the candidates; ``which`` of shape (m,)."""
         rows = np.flatnonzero(which)
         arrays = (self.clearance[rows], self.excess[rows], self.deflection[rows])
         return Phase(self.s, self.rows[rows], self.verdict.of(rows), *arrays)
 
 
 CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE_BENDS.value)
-"""Reasons whose number is a clearance, the only one that is told of a phase."""
-
-
-@dataclass(frozen=True, eq=False)
-class BreathingBody:
-    """A case that breathes, ready to be asked for any position.
-
-    Attributes:
-        case: The case.
-        breathing: Of the case.
-        anatomy: Its structures.
-        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        weights: Of skin and structures.
-        bound: How far the needle may bend; None bends nothing.
-        found: The candidates, checked where the CT shows the body.
-    """
-
-    case: Case
-    breathing: Breathing
-    anatomy: Anatomy
-    engine: ClearanceEngine
-    weights: MovingWeights
-    bound: DeflectionBound | None
-    found: Candidates
-
-    @cached_property
-    def lengths(self) -> Floats:
-        """How far the axes of the n candidates are checked against the k structures, shape (n, k), mm.
-
-        Up to the farthest place at which the flange waits at any position.
-        """
-        case, checked, outward = self.case, self.anatomy.checked, self.found.outward_ct
-        at = [axis_lengths(case, checked, self.paths(outward, s)) for s in self.breathing.positions.tolist()]
-        return np.asarray(np.max(at, axis=0))
-
-    def paths(self, outward_ct: Floats, s: float) -> SkinPaths:
-        """The skin along paths (n, 3) at a position; entries in the moved skin's own coordinates."""
-        moved = (1 - self.weights.skin) * self.breathing.moved_ct(s)
-        return own_paths(self.case, self.anatomy.skin, outward_ct, moved)
-
-    @property
-    def demanding(self) -> Ints:
-        """Columns of the structures with a margin."""
-        return np.flatnonzero([one.demands_margin for one in self.anatomy.checked])
-
-    @property
-    def margins(self) -> Floats:
-        """Of these, shape (k,), mm."""
-        return np.array([self.anatomy.checked[column].margin_mm for column in self.demanding], dtype=np.float64)
-
-    def moves_mm(self, low: float, high: float) -> Floats:
-        """How far each structure with a margin moves against the target between two positions, shape (k,)."""
-        weights = self.weights.structures[self.demanding]
-        return np.asarray(abs(high - low) * self.breathing.amplitude_mm * np.abs(1 - weights))
-
-    def at(self, rows: Ints, s: float) -> Phase:
-        """Some candidates, ``rows`` (m,), at a position, as if inserted there."""
-        case, checked, outward = self.case, self.anatomy.checked, self.found.outward_ct[rows]
-        moved = self.breathing.moved_ct(s)
-        paths = self.paths(outward, s)
-        shifts = moved[None] * (1 - self.weights.structures)[:, None]
-        clearances = self._clearances(rows, shifts)
-        limit = case.search.max_skin_angle
-        verdict = first_broken(paths, clearances, checked, needle=case.needle, max_skin_angle=limit)
-        deflection = np.zeros(len(rows)) if self.bound is None else self.bound.at(paths.path_length)
-        if self.bound is not None:
-            verdict = bent_verdict(verdict, checked, clearances.clearance, deflection)
-        clearance = clearances.clearance[:, self.demanding]
-        return Phase(s, rows, verdict, clearance, clearance - self.margins, deflection)
-
-    def excess_at(self, rows: Ints, s: float, columns: Ints) -> Floats:
-        """What the surfaces of some structures leave over their margins at a position, shape (m, c), mm.
-
-        Args:
-            rows: Shape (m,), which candidates.
-            s: The position.
-            columns: Shape (c,), which of the structures with a margin.
-        """
-        case, which = self.case, self.demanding[columns]
-        distance, weights = np.empty((len(rows), len(columns))), self.weights.structures[which]
-        for weight in np.unique(weights):
-            group = np.flatnonzero(weights == weight)
-            origin = case.target_ct + (1 - weight) * self.breathing.moved_ct(s)
-            part, length = self.engine.of(which[group]), self.lengths[np.ix_(rows, which[group])]
-            distance[:, group] = part.measure(origin, self.found.outward_ct[rows], length, shown=False).distance
-        return np.asarray(distance - case.needle.radius_mm - self.margins[columns])
-
-    def _clearances(self, rows: Ints, shifts_ct: Floats) -> Clearances:
-        """To all k structures with the target shifted for each, ``shifts_ct`` of shape (k, 3), mm."""
-        checked, found, radius = self.anatomy.checked, self.found, self.case.needle.radius_mm
-        clearance = found.clearance.distance[rows].copy()
-        depth, violated = np.zeros(clearance.shape), np.zeros(clearance.shape, bool)
-        moved = [one.demands_margin and (one.outside or by.any()) for one, by in zip(checked, shifts_ct, strict=True)]
-        for shift in np.unique(shifts_ct[moved], axis=0):
-            columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & moved)
-            structures, length = tuple(checked[column] for column in columns), self.lengths[np.ix_(rows, columns)]
-            target, outward, part = self.case.target_ct + shift, found.outward_ct[rows], self.engine.of(columns)
-            at = measure(part, structures, target, outward, length=length, radius=radius)
-            clearance[:, columns], depth[:, columns], violated[:, columns] = at.clearance, at.depth, at.violated
-        return Clearances(clearance, depth, violated)
+"""Reasons whose number is a clearance, the only one that is reported of a phase."""
 
 
 def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:
@@ -389,13 +314,75 @@ def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Brea
     return Verdict(**arrays)
 
 
-SAFE_WHEN = (
-    "breathing: a safe direction is safe {when}: checked at {count} positions, and clearances between them; a needle "
-    "in place moves with the organ and bends"
-)
-PLANS = "breathing: plans and rehearsals go to the target where the CT shows it (s = {s:g}), the patient at rest there"
-OPEN = "breathing: the gate is open {part:.0%} of the time, if the breath follows the curve"
-OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside of the gate (s <= {gate:g})"
+def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
+    """The verdict with those candidates rejected that no measurement shows to be clear between two positions.
+
+    Args:
+        body: The case.
+        verdict: Of the candidates, with what is rejected at the two positions.
+        low: The one position.
+        high: The other, of the same candidates.
+    """
+    deflection = np.fmax(low.deflection, high.deflection)
+    columns = np.arange(len(body.demanding))
+    return _checked(body, verdict, _Gap(low.rows, columns, low.s, high.s, low.excess, high.excess, deflection))
+
+
+class _Gap(NamedTuple):
+    """The interval between two positions: m candidates, k structures, excess over the margins (m, k), mm, at both."""
+
+    rows: Ints
+    columns: Ints
+    low: float
+    high: float
+    at_low: Floats
+    at_high: Floats
+    deflection: Floats
+
+    def of(self, rows: Bools, columns: Bools) -> _Gap:
+        """The interval for some candidates and structures."""
+        part = np.ix_(rows, columns)
+        ends = self.at_low[part], self.at_high[part]
+        return _Gap(self.rows[rows], self.columns[columns], self.low, self.high, *ends, self.deflection[rows])
+
+
+LEAST_MM = 0.1
+"""mm of motion below which an interval is not divided: what is not shown to be clear counts as too close."""
+
+
+def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
+    moves = body.moves_mm(gap.low, gap.high)[gap.columns]
+    least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]  # no clearance falls faster than it moves
+    short = (least < 0) & (moves > 0) & (verdict.reason[gap.rows] == Reason.NONE.value)[:, None]
+    rows, columns = short.any(axis=1), short.any(axis=0)
+    if not rows.any():
+        return verdict
+    gap, least, middle = gap.of(rows, columns), least[np.ix_(rows, columns)], (gap.low + gap.high) / 2
+    if moves[columns].max() <= LEAST_MM:
+        nearest = _names(body, gap, least)
+        return rejected_at(
+            verdict, gap.rows, _too_close(nearest, np.full(len(nearest), np.nan)), body.breathing, middle
+        )
+    excess = body.excess_at(gap.rows, middle, gap.columns)
+    left = excess - gap.deflection[:, None]
+    bad = left.min(axis=1) < 0
+    column = left[bad].argmin(axis=1)
+    amount = excess[bad][np.arange(len(column)), column] + body.margins[gap.columns[column]]
+    close = _too_close(_names(body, gap, left)[bad], amount)
+    verdict = rejected_at(verdict, gap.rows[bad], close, body.breathing, middle)
+    verdict = _checked(body, verdict, gap._replace(high=middle, at_high=excess))
+    return _checked(body, verdict, gap._replace(low=middle, at_low=excess))
+
+
+def _names(body: BreathingBody, gap: _Gap, left: Floats) -> Texts:
+    """Name of the structure with the least excess for each candidate."""
+    names = np.array([body.anatomy.checked[column].name for column in body.demanding], dtype=object)
+    return np.asarray(names[gap.columns[left.argmin(axis=1)]])
+
+
+def _too_close(names: Texts, amount: Floats) -> Verdict:
+    blank, reason = np.full(len(names), "", dtype=object), np.full(len(names), Reason.TOO_CLOSE.value, dtype=object)
+    return Verdict(reason, names, np.full(len(names), np.nan), amount, blank)
 
 
 class MovingWeights(NamedTuple):
@@ -406,7 +393,7 @@ class MovingWeights(NamedTuple):
 
 
 def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> MovingWeights:
-    """The weights that a case states for its structures.
+    """The weight of every structure of a case that breathes: how much of the target's motion it follows.
 
     The target's own structure moves with the target, and obstacles and the gantry, which the case file describes, not
     at all.
@@ -430,14 +417,26 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
 
 
 def _by_itself(case: Case, structure: Structure) -> float | None:
-    """The weight of what needs no statement; None of all else."""
+    """The weight of a structure that needs no statement; None of all others."""
     if structure.name in {case.target_structure, BEYOND_IMAGE}:  # which the breath has widened already
         return 1.0
     return 0.0 if structure.source == OF_CASE_FILE else None
 
 
+SAFE_WHEN = (
+    "breathing: a safe direction is safe {when}: checked at {count} positions, and clearances between them; a needle "
+    "in place moves with the organ and bends"
+)
+
+PLANS = "breathing: plans and rehearsals go to the target where the CT shows it (s = {s:g}), the patient at rest there"
+
+OPEN = "breathing: the gate is open {part:.0%} of the time, if the breath follows the curve"
+
+OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside of the gate (s <= {gate:g})"
+
+
 def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
-    """The warnings of a case; none where it declares no breathing.
+    """Warnings about what a breathing case's verdicts mean; none where it declares no breathing.
 
     Raises:
         InputError: See `moving_weights`.
@@ -447,10 +446,10 @@ def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
         return ()
     moving_weights(case, breathing, anatomy)
     count = int(breathing.in_window.sum())
-    said = [SAFE_WHEN.format(when=breathing.window_text, count=count)]
+    warnings = [SAFE_WHEN.format(when=breathing.window_text, count=count)]
     if breathing.gate is not None:
-        said.append(OPEN.format(part=fraction_within(breathing.gate, breathing.exponent)))
-    said.append(PLANS.format(s=breathing.scanned_at))
+        warnings.append(OPEN.format(part=fraction_within(breathing.gate, breathing.exponent)))
+    warnings.append(PLANS.format(s=breathing.scanned_at))
     if breathing.gate is not None and breathing.scanned_at > breathing.gate:
-        said.append(OUTSIDE_GATE.format(s=breathing.scanned_at, gate=breathing.gate))
-    return tuple(said)
+        warnings.append(OUTSIDE_GATE.format(s=breathing.scanned_at, gate=breathing.gate))
+    return tuple(warnings)

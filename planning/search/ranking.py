@@ -1,6 +1,6 @@
-"""Which of the safe candidates to prefer: a weighted cost of six terms, and the Pareto front of the same terms.
+"""The order of the safe candidates: a weighted cost of six terms, and the Pareto front of the same terms.
 
-How far a needle may be off and still be safe for the organs, as far as the grid tells.
+One of the terms is the safe cone: by how much a needle may be off and still be safe, as far as the grid tells.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach", "safe_cone
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """The order of n safe candidates, by their cost.
+    """Cost, rank and Pareto front of n safe candidates.
 
     Attributes:
         terms: Shape (n, 6), each in 0..1, 0 is best, columns as `TERMS`.
@@ -123,9 +123,9 @@ def rank(
         ],
         axis=1,
     )
-    terms = np.clip(np.nan_to_num(terms, nan=1.0), 0, 1)
+    terms = np.clip(np.nan_to_num(terms, nan=1.0), 0, 1)  # what is not known counts as worst
     factors = np.array([getattr(weights, term) for term in TERMS])
-    cost = terms @ factors / max(factors.sum(), np.finfo(float).tiny)
+    cost = terms @ factors / max(factors.sum(), np.finfo(float).tiny)  # all weights may be 0
     order = np.argsort(np.round(cost, TIE_DIGITS), kind="stable")
     ranks = np.empty(len(cost), np.int32)
     ranks[order] = np.arange(1, len(cost) + 1)
@@ -137,7 +137,7 @@ def _risk(min_clearance: Floats, touch_chance: Floats | None) -> Floats:
     by_clearance = 1 - np.clip(min_clearance, 0, COMFORT_MM) / COMFORT_MM
     if touch_chance is None:
         return np.asarray(by_clearance)
-    decades = np.log10(np.maximum(touch_chance, NO_RISK) / NO_RISK) / -np.log10(NO_RISK)
+    decades = np.log10(np.maximum(touch_chance, NO_RISK) / NO_RISK) / -np.log10(NO_RISK)  # 0 at 1e-6, 1 at 1
     return np.where(np.isnan(touch_chance), by_clearance, np.minimum(decades, 1.0))
 
 
@@ -147,18 +147,18 @@ def pareto_front(terms: Floats) -> NDArray[np.bool_]:
     In ascending order of the sum a row can be dominated only by earlier ones, and then by one of the front.
     """
     front = np.zeros(len(terms), bool)
-    kept: list[int] = []
+    front_rows: list[int] = []
     for row in np.lexsort((*terms.T, terms.sum(axis=1))):
-        others = terms[kept]
+        others = terms[front_rows]
         dominated = np.all(others <= terms[row], axis=1) & np.any(others < terms[row], axis=1)
         if not dominated.any():
             front[row] = True
-            kept.append(int(row))
+            front_rows.append(int(row))
     return front
 
 
 DIAGONAL = np.sqrt(2.0)
-"""Of a cell, in steps, at the equator; nearer to the poles cells are narrower."""
+"""Diagonal of a cell, in steps, at the equator; nearer to the poles cells are narrower."""
 
 
 def with_grid_cone(candidates: Candidates) -> Candidates:
@@ -175,11 +175,11 @@ def with_grid_cone(candidates: Candidates) -> Candidates:
 
 
 def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
-    """By how much each safe direction may be off, in any direction, shape (number of safe ones,), rad.
+    """Safe cone of each safe direction: how far it may be off in any direction, shape (safe ones,), rad.
 
     The angle to the nearest direction of the grid that is not safe, or to the nearest beyond the grid, less a cell's
     diagonal. A disc as wide as that diagonal holds a direction of the grid; so where such a disc fits into what is not
-    safe, beside its border, the cone ends before it. What is thinner may pass between the directions: only a
+    safe, at its border, the cone ends before it. What is thinner may pass between the directions: only a
     certificate excludes that.
 
     Args:
@@ -197,9 +197,9 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
 
 
 def _border(grid: AngleGrid, safe: Bools) -> Bools:
-    """Directions among which, or beyond the grid, is one that is not safe and nearest to a safe one, whichever it is.
+    """Unsafe directions next to a safe one, or at the grid's end: among them is one nearest to any safe direction.
 
-    They are not safe themselves, and lie beside a safe one or at an end of the azimuths. From any other, the step
+    They are not safe themselves, and lie next to a safe one or at an end of the azimuths. From any other, the step
     towards the safe one, first in azimuth the shorter way and then in θ, stays in the grid and ends nearer (at a pole
     in the same direction) in one that is not safe either.
     """

@@ -1,6 +1,6 @@
 """The batch search: a case in, one checked row per direction out.
 
-`search` is the list of its stages; `organ_candidates` the first of them: path, clearance and verdict of every
+`search` is the list of its stages; `organ_candidates` is the first of them: path, clearance and verdict of every
 direction for skin and organs, without the arm.
 """
 
@@ -15,7 +15,7 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, measure
-from puncture_twin.planning.geometry.containment import crossings, holds
+from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.reach.standoff import axis_lengths, own_lengths, own_paths
 from puncture_twin.planning.search.bending import with_bending
 from puncture_twin.planning.search.candidate_chances import with_best_refined, with_chances, with_joint_chances
@@ -63,7 +63,7 @@ def search(
 
 
 def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> AxisDistances:
-    """How far the needle's axis is from every structure in every direction."""
+    """Distances of the needle's axis from every structure in every direction."""
     outward = directions.outward_ct
     return engine.measure(case.target_ct, outward, own_lengths(case, anatomy, outward))
 
@@ -138,12 +138,12 @@ def inside_length(structure: Structure, target_ct: Floats, outward_ct: Floats, p
     Crossings alternate between leaving and entering, so the length is their alternating sum, closed by the path's
     end where the path ends inside.
     """
-    found = crossings(structure.mesh, target_ct, outward_ct)
-    starts_inside = holds(structure.mesh, target_ct)
+    crossing = crossings(structure.mesh, target_ct, outward_ct)
+    starts_inside = contains(structure.mesh, target_ct)
     limit = np.nan_to_num(path_length, nan=0.0)
-    number = np.arange(len(found.ray)) - found.first[found.ray]
+    number = np.arange(len(crossing.ray)) - crossing.first[crossing.ray]  # 0 for a ray's first crossing
     sign = np.where((number % 2 == 0) == starts_inside, 1.0, -1.0)
-    signed = sign * np.minimum(found.depth, limit[found.ray])
-    inside = np.bincount(found.ray, weights=signed, minlength=len(outward_ct))
-    ends_inside = (found.count % 2 == 0) == starts_inside
+    signed = sign * np.minimum(crossing.depth, limit[crossing.ray])  # what is beyond the skin cancels
+    inside = np.bincount(crossing.ray, weights=signed, minlength=len(outward_ct))
+    ends_inside = (crossing.count % 2 == 0) == starts_inside
     return np.asarray(np.maximum(inside + np.where(ends_inside, limit, 0.0), 0.0))

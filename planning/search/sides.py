@@ -1,4 +1,4 @@
-"""The sides of a body, each as far as a needle can come from there: where a grid should look, and where one looked."""
+"""Open sides of the body around a target: from where a needle can come, and which of them the case's grid covers."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.search.explain import finite
 
 STEP = np.radians(10.0)
-"""Between the directions that look around: each side has about a hundred of them."""
+"""rad between the directions that are tested: each side has about a hundred of them."""
 
 LEAST_OPEN = 0.1
-"""Of a side's solid angle: what is less than that open is no side to puncture from."""
+"""Open fraction of a side's solid angle below which it is no side to puncture from."""
 
 LEAST_SEARCHED = 0.4
-"""Of a side's: a grid about the front holds half of what is to the right and to the left."""
+"""Fraction of a side's directions from which on a grid covers it: a grid about the front holds half of what is to the
+right and to the left."""
 
 ROUND_ABOUT = ("front", "back", "right", "left")
-"""The sides that are spoken of; through feet and head no image shows skin."""
+"""The sides that are reported; through feet and head no image shows skin."""
 
 NOT_SHOWN = "lies on what no image shows"
-"""Of the back of a patient without a CT, while the front is open."""
+"""Reason for the closed back of a patient without a CT, while the front is open."""
 
 AXES = {"front": "anterior", "back": "posterior", "right": "right", "left": "left", "feet": "feet", "head": "head"}
 FRONT, BACK, WHOLE = '"bed"', '{ z = "posterior", x = "head" }', (0.0, 180.0)
 
 
 class Side(NamedTuple):
-    """What is nearest to one axis of the body, seen from the target.
+    """The open directions nearest to one axis of the body, seen from the target.
 
     Attributes:
         name: For a person.
@@ -55,23 +56,23 @@ class Side(NamedTuple):
 
     @property
     def is_open(self) -> bool:
-        """Whether it is a side to puncture from."""
+        """Whether a needle can come from this side."""
         return self.open >= LEAST_OPEN
 
     def document(self) -> dict[str, Any]:
-        """As it stands under ``sides`` of ``--json``."""
+        """The side as one entry of ``sides`` in ``--json``."""
         return {**self._asdict(), "nearest_mm": finite(self.nearest_mm)}
 
 
 class Grid(NamedTuple):
-    """Which directions are searched: the range of theta, degrees, and the entry frame as TOML writes it."""
+    """The directions that are searched: range of theta, degrees, and the entry frame as TOML writes it."""
 
     theta_deg: tuple[float, float]
     frame: str
 
 
 def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
-    """Look around from the target, at the skin, what lies outside of it and the needle's length; organs do not count.
+    """The sides of the body by skin, what lies outside of it and the needle's length; organs do not count.
 
     Args:
         case: The validated case; none of a patient has no sides.
@@ -85,7 +86,7 @@ def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
     nearest = (outward @ np.array([ANATOMICAL_LPS[axis] for axis in AXES.values()]).T).argmax(axis=1)
     paths, within = skin_paths(anatomy.skin, case.target_ct, outward, case.needle.length_mm), _within(case, outward)
     closed = _closed(case, anatomy, paths, outward)
-    free = ~np.any([rows for _, rows in closed], axis=0)
+    free = ~np.any([rows for _, rows in closed], axis=0)  # open for every reason
     sides = []
     for number, name in enumerate(AXES):
         side = nearest == number
@@ -101,7 +102,7 @@ def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
 
 
 def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) -> list[tuple[str, Bools]]:
-    """Why no needle comes from some directions, and from which, whatever organs are there."""
+    """Why no needle comes from some directions, whatever organs are there, and from which."""
     length, needle = paths.path_length, case.needle
     unseen = np.isnan(length) | ~np.isnan(paths.unknown_depth)
     table = "lies on the table" if anatomy.couch is not None else "is near to where the image ends"
@@ -119,7 +120,7 @@ def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) 
 
 
 def _crosses(mesh: TriangleMesh, target_ct: Floats, outward_ct: Floats, length_mm: float) -> Bools:
-    """Which straight needles meet a surface, shape (n,)."""
+    """Which straight needles intersect a surface, shape (n,)."""
     return np.asarray(crossings(mesh, target_ct, outward_ct, length_mm).count > 0)
 
 
@@ -127,44 +128,44 @@ def _within(case: Case, outward_ct: Floats) -> Bools:
     """Which directions the case's grid holds, shape (n,)."""
     theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
     (low, high), (first, last), slack = case.search.theta, case.search.beta, GRID_SLACK
-    turned = (first - slack <= beta) & (beta <= last + slack)
-    return np.asarray((low - slack <= theta) & (theta <= high + slack) & (turned | (np.sin(theta) < slack)))
+    within_beta = (first - slack <= beta) & (beta <= last + slack)
+    return np.asarray((low - slack <= theta) & (theta <= high + slack) & (within_beta | (np.sin(theta) < slack)))
 
 
 def grid_of(sides: Sequence[Side]) -> Grid:
-    """The grid that covers the sides that are open: front or back with what is beside it, or all around."""
+    """The grid that covers the sides that are open: front or back with its neighbours, or all around."""
     is_open = {side.name: side.is_open for side in sides}
     if is_open["back"] and not is_open["front"]:
         return Grid((0.0, 90.0), BACK)
-    beside = not is_open["front"] and (is_open["left"] or is_open["right"])
-    return Grid(WHOLE if is_open["back"] or beside else (0.0, 90.0), FRONT)
+    sideways = not is_open["front"] and (is_open["left"] or is_open["right"])
+    return Grid(WHOLE if is_open["back"] or sideways else (0.0, 90.0), FRONT)
 
 
 def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
-    """From where a needle can come, and why not from the others.
+    """The open sides in words, and why the others are closed.
 
     Args:
         sides: As `sides_of` found them.
         searched: Whether the case's grid counts: what it does not hold is named.
     """
-    spoken = [side for side in sides if side.name in ROUND_ABOUT]
-    here = [side.name for side in spoken if side.is_open and (not searched or side.searched >= LEAST_SEARCHED)]
+    reported = [side for side in sides if side.name in ROUND_ABOUT]
+    here = [side.name for side in reported if side.is_open and (not searched or side.searched >= LEAST_SEARCHED)]
     parts = [_listed(here) or "no side"]
-    for why in dict.fromkeys(side.why for side in spoken if not side.is_open):
-        names = [side.name for side in spoken if side.why == why]
+    for why in dict.fromkeys(side.why for side in reported if not side.is_open):
+        names = [side.name for side in reported if side.why == why]
         are = why.replace("is ", "are ", 1).replace("lies ", "lie ", 1)
         parts.append(f"the {_listed(names)} {why if len(names) == 1 else are}")
-    missed = [side for side in spoken if searched and side.is_open and side.name not in here]
+    missed = [side for side in reported if searched and side.is_open and side.name not in here]
     parts += [f"not the {side.name}, where skin is {side.nearest_mm:.0f} mm away" for side in missed]
     return "; ".join(parts)
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Both sides as one.
+    """Names as a list in a sentence, right and left together as "sides".
 
     >>> _listed(["front", "right", "left"])
     'front and sides'
     """
     both = {"right", "left"} <= set(names)
-    said = [*(one for one in names if not (both and one in {"right", "left"})), *(["sides"] if both else [])]
-    return " and ".join([", ".join(said[:-1]), said[-1]] if len(said) > 1 else said)
+    names = [*(one for one in names if not (both and one in {"right", "left"})), *(["sides"] if both else [])]
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)

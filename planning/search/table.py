@@ -67,7 +67,7 @@ def _path_columns(candidates: Candidates) -> dict[str, Any]:
 
 
 def _choice_columns(candidates: Candidates) -> dict[str, Any]:
-    """What tells safe directions from one another: reach, the cone, cost and rank, and the window."""
+    """Columns that compare safe directions: reach, safe cone, cost, rank and window."""
     reachable = candidates.arm.reachable
     return {
         "reachable": truths(reachable > 0, reachable >= 0),

@@ -11,11 +11,11 @@ from puncture_twin.planning.case.entry import AngleGrid
 from puncture_twin.planning.search.candidates import Candidates
 
 SQUARE_DEGREES = float(np.degrees(1.0) ** 2)
-"""Of a steradian."""
+"""Square degrees in a steradian."""
 
 
 MOST_WINDOWS = 10
-"""So many are listed to people."""
+"""Windows that are listed to people."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class Window:
 
     @property
     def wide_deg(self) -> float:
-        """Across a cone of the same solid angle, degrees."""
+        """Width of a cone of the same solid angle, degrees."""
         return 2.0 * float(np.degrees(np.arccos(1.0 - self.square_deg / SQUARE_DEGREES / (2.0 * np.pi))))
 
     @property
     def text(self) -> str:
-        """Its size for a person."""
+        """The window's size for a person."""
         return f"{self.entry_cm2:.1f} cm2 on the skin, {self.wide_deg:.0f} deg wide"
 
 
@@ -68,7 +68,7 @@ class Windows:
 
     @property
     def headline(self) -> str:
-        """The first thing that a search says of what is safe."""
+        """One sentence on how much is safe."""
         one = self.largest
         if one is None:
             return "no window: nothing is safe"
@@ -83,7 +83,7 @@ def find_windows(candidates: Candidates) -> Windows:
     """The windows of ranked candidates; without a grid every candidate is one of its own, without area."""
     label = _connected(candidates.grid, candidates.safe)
     ranked = candidates.ranked
-    firsts = ranked[np.sort(np.unique(label[ranked], return_index=True)[1])]
+    firsts = ranked[np.sort(np.unique(label[ranked], return_index=True)[1])]  # best of each set, by rank
     number = np.zeros(len(candidates), np.int64)
     for one, row in enumerate(firsts, start=1):
         number[(label == label[row]) & candidates.safe] = one
@@ -94,15 +94,15 @@ def find_windows(candidates: Candidates) -> Windows:
 
 
 def nearest_row(candidates: Candidates, outward_ct: Floats) -> int | None:
-    """The row of a search beside which a direction, shape (3,), lies; None where it is beyond the grid by a step."""
-    row = int(np.argmax(candidates.outward_ct @ outward_ct))
+    """Row of the grid nearest to a direction, shape (3,); None where it is beyond the grid by a step."""
+    row = int(np.argmax(candidates.outward_ct @ outward_ct))  # largest cosine
     near = candidates.outward_ct[row]
     apart = float(np.arctan2(np.linalg.norm(np.cross(near, outward_ct)), near @ outward_ct))
     return None if candidates.grid is None or apart > candidates.grid.step else row
 
 
 def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
-    """A label for each row; safe neighbours share theirs, the least of their rows.
+    """Label of each row's connected set, shape (n,): the least row among neighbouring safe ones.
 
     A label is a row of the same set. Where neighbours differ, the row that one names takes the other's label if that is
     less, and all rows take the label of the row that they name (Shiloach and Vishkin, J. Algorithms 3, 1982).
@@ -116,12 +116,12 @@ def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
         least, ends = np.minimum(label[one], label[other]), (label[one], label[other])
         for end in ends:
             np.minimum.at(label, end, least)
-        label = label[label]
+        label = label[label]  # pointer jumping
     return label
 
 
 def _entry_area(candidates: Candidates, cell: Floats) -> Floats:
-    """Skin that each direction's cell covers, mm2: the sphere's patch, seen at the angle at which the path enters."""
+    """Skin area of each direction's cell, mm2: the sphere's patch over the cosine of the skin angle."""
     area = cell * candidates.path.length**2 / np.cos(candidates.path.skin_angle)
     return np.asarray(np.where(candidates.safe, area, 0.0))
 

@@ -1,1 +1,1 @@
-"""Omnidirectional pointing: the needle turned about the target from outside the body, as one motion."""
+"""Omnidirectional pointing: the needle rotated about the target from outside the body, as one motion."""

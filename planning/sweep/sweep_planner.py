@@ -1,9 +1,7 @@
-"""The planning of a sweep: as far as every direction is safe and reachable, and the arm can go on from the one before.
+"""Sweeps: the needle's axis through one fixed point while its direction changes, as far as every direction is safe.
 
-A direction is passed only if the search calls it safe: organs, skin and the arm's straight insertion. The needle stays
-outside the body; arm, holder and needle keep their distance all the way.
-
-A sweep: the needle's axis through one fixed point while its direction changes.
+A direction is passed only if the search calls it safe: organs, skin and the arm's straight insertion; and if the arm
+can go on from the one before. The needle stays outside the body; arm, holder and needle keep their distance all along.
 """
 
 from __future__ import annotations
@@ -33,6 +31,40 @@ from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
 
+
+@dataclass(frozen=True, eq=False)
+class SweepPlan:
+    """A motion about the virtual TCP (Chen 2019): the point on the needle's axis, a standoff before its tip.
+
+    Attributes:
+        model: The arm.
+        needle_length_mm: Flange to tip.
+        standoff_mm: Tip to virtual TCP.
+        point_base: Shape (3,), mm: where the virtual TCP stays, the target.
+        angles: Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less.
+        wanted: Theta and beta, rad, where it should have ended.
+        approach: From home to the first direction.
+        sweep: Through all of them.
+        stopped: Where and why it ends before; empty where it does not.
+    """
+
+    model: UrModel
+    needle_length_mm: float
+    standoff_mm: float
+    point_base: Floats
+    angles: Floats
+    wanted: tuple[float, float]
+    approach: Trajectory
+    sweep: Trajectory
+    stopped: str
+
+    def off_point_mm(self, T_base_flange: Floats) -> Floats:
+        """How far flange poses (m, 4, 4), mm, leave the virtual TCP from its point, shape (m,)."""
+        reach = self.needle_length_mm + self.standoff_mm
+        virtual = T_base_flange[:, :3, 3] + reach * T_base_flange[:, :3, 2]
+        return np.asarray(np.linalg.norm(virtual - self.point_base, axis=1))
+
+
 STEP = np.radians(1.0)
 """Between two directions that are checked, at most: half of the search's usual grid."""
 
@@ -40,16 +72,7 @@ MOST_JOINT_STEP = 0.2
 """A joint that turns more from one direction to the next jumps, rad."""
 
 SWEEP_SPEED_MM_S = 30.0
-"""Of the needle's tip, in the air."""
-
-
-class _SweepPath(NamedTuple):
-    """Directions that are passed one after the other, and why no more."""
-
-    angles: Floats
-    """Shape (k, 2), rad."""
-    standoff_mm: float
-    stopped: str
+"""Speed of the needle's tip, in the air."""
 
 
 def plan_sweep(
@@ -114,14 +137,14 @@ def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:
 
 
 def _allowed(context: CaseContext, angles: Floats, progress: Count) -> _SweepPath:
-    """As far as the search calls every direction safe, with the arm."""
+    """Directions up to the first that the search, with the arm, does not call safe."""
     standoff, passed, stopped = 0.0, 0, ""
     for row, (theta, beta) in enumerate(angles.tolist()):
-        found = context.check(theta, beta % (2 * np.pi))
-        if not found.safe[0]:
-            stopped = f"{_place(angles[row])} is rejected: {reason_text(found, 0)}"
+        candidates = context.check(theta, beta % (2 * np.pi))
+        if not candidates.safe[0]:
+            stopped = f"{_place(angles[row])} is rejected: {reason_text(candidates, 0)}"
             break
-        needed = standoffs(context.case.needle, found.path.length[0], found.path.skin_angle[0])
+        needed = standoffs(context.case.needle, candidates.path.length[0], candidates.path.skin_angle[0])
         standoff, passed = max(standoff, float(needed)), row + 1
         progress(passed, len(angles))
     return _SweepPath(angles[:passed], standoff, stopped)
@@ -132,8 +155,17 @@ def _place(angles: Floats) -> str:
     return f"theta {theta:.1f} deg, beta {beta % 360:.1f} deg"
 
 
+class _SweepPath(NamedTuple):
+    """Directions that are passed one after the other, and why it ends."""
+
+    angles: Floats
+    """Shape (k, 2), rad."""
+    standoff_mm: float
+    stopped: str
+
+
 def _farthest(context: CaseContext, point: Floats, directions: Floats, route: _SweepPath) -> tuple[Floats, str]:
-    """Of all rolls and branches at the first direction the one that goes farthest, shape (k, 6), and why not on."""
+    """The path that goes farthest among all rolls and branches at the first direction, (k, 6), and why it ends."""
     assert context.reach is not None
     if not len(directions):
         return np.empty((0, 6)), route.stopped
@@ -170,7 +202,7 @@ def _followed(
 
 
 def _least_turn(R: Floats, z: Floats) -> Floats:
-    """A rotation (3, 3) whose z axis is turned to another, shape (3,), unit, and no farther."""
+    """A rotation (3, 3) whose z axis is rotated to another, shape (3,), unit, and no farther."""
     axis = np.cross(R[:, 2], z)
     sine = float(np.linalg.norm(axis))
     angle = float(np.arctan2(sine, R[:, 2] @ z))
@@ -188,36 +220,3 @@ def _why_not(checker: CellChecker, before: Floats, q: Floats, step: float) -> st
     states = dense_states(checker, np.stack([before, q]), RESOLUTION_RAD / FINER)
     contact = checker.first_contact(states, needle_may_touch_patient=False)
     return "" if contact is None else f"{contact.contact.body} touches {contact.contact.other}"
-
-
-@dataclass(frozen=True, eq=False)
-class SweepPlan:
-    """A motion about the virtual TCP (Chen 2019): the point on the needle's axis, a standoff before its tip.
-
-    Attributes:
-        model: The arm.
-        needle_length_mm: Flange to tip.
-        standoff_mm: Tip to virtual TCP.
-        point_base: Shape (3,), mm: where the virtual TCP stays, the target.
-        angles: Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less.
-        wanted: Theta and beta, rad, where it should have ended.
-        approach: From home to the first direction.
-        sweep: Through all of them.
-        stopped: Where and why it ends before; empty where it does not.
-    """
-
-    model: UrModel
-    needle_length_mm: float
-    standoff_mm: float
-    point_base: Floats
-    angles: Floats
-    wanted: tuple[float, float]
-    approach: Trajectory
-    sweep: Trajectory
-    stopped: str
-
-    def off_point_mm(self, T_base_flange: Floats) -> Floats:
-        """How far flange poses (m, 4, 4), mm, leave the virtual TCP from its point, shape (m,)."""
-        reach = self.needle_length_mm + self.standoff_mm
-        virtual = T_base_flange[:, :3, 3] + reach * T_base_flange[:, :3, 2]
-        return np.asarray(np.linalg.norm(virtual - self.point_base, axis=1))

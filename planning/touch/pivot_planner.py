@@ -1,6 +1,6 @@
 """Poses for a pivot calibration: the tip on one place, the needle tilted to several sides, as the workcell allows.
 
-The place is a hole or a dimple beside the patient. Of the free poses those are taken that leave the tip least
+The place is a hole or a dimple next to the patient. Of the free poses those are taken that leave the tip least
 uncertain: greedily, the next one that adds most to det(A'A) of `R_i x + p_i = c` (D-optimal design).
 """
 
@@ -39,19 +39,19 @@ SPREAD = 2
 """So many free poses are wanted for each that is taken: else they lean to one side."""
 
 RADII = (0.6, 0.8, 0.45)
-"""Of where the flange is tried above a place, in the arm's reach without its wrist, from the shoulder."""
+"""Distances from the shoulder at which the flange is tried, over the arm's reach without its wrist."""
 
 HEIGHTS = (0.0, 0.3, -0.3, 0.6)
-"""The same along the direction up."""
+"""Heights above the shoulder at which it is tried, likewise."""
 
 SIDES = 12
 """Directions from the base in which they lie."""
 
 ROLLS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3)
-"""Of the flange about the needle, added to each tilt: they tell how far the tip is beside the flange's axis."""
+"""Rolls of the flange about the needle, added to each tilt: they tell how far the tip is off the flange's axis."""
 
 RIDGE = 1e-6
-"""Of A'A, so that fewer poses than unknowns can be compared."""
+"""Added to A'A, so that fewer poses than unknowns can be compared."""
 
 
 def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, seed: int, progress: Count) -> TouchTour:
@@ -60,7 +60,7 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
     Args:
         context: Of a case with an arm.
         count: How many poses, 4 to 12.
-        place_base: Shape (3,), mm, where; None for a place that is found beside the patient.
+        place_base: Shape (3,), mm, where; None for a place that is found next to the patient.
         seed: Of the motions' planner.
         progress: Called with motions done and all of them.
 
@@ -101,7 +101,7 @@ def spread_poses(R_base_flange: Floats, count: int) -> list[int]:
 
 
 def _places(context: CaseContext) -> Iterator[Floats]:
-    """Places about the base, base frame, mm: those across from the patient first."""
+    """Places about the base, base frame, mm: those opposite the patient first."""
     assert context.reach is not None
     model, up = context.case.robot.model, _up_base(context)
     reach = abs(model.a2) + abs(model.a3)
@@ -117,7 +117,7 @@ def _places(context: CaseContext) -> Iterator[Floats]:
 
 
 def _up_base(context: CaseContext) -> Floats:
-    """Against gravity, unit."""
+    """Unit direction against gravity, base frame."""
     assert context.reach is not None
     return np.asarray(context.reach.T_base_ct[:3, :3] @ bed_frame(context.case)[:3, 2])
 

@@ -40,7 +40,7 @@ PLANNED_PADDING_MM = 4.0
 """Kept between the shaft of a touching needle and the patient where the markers are believed: they lie elsewhere."""
 
 TOUCHING_PADDING_MM = 1.0
-"""The same when the line was set onto the marker."""
+"""Padding when the line was set onto the marker."""
 
 ALLOWED = "a case with [errors] and markers, which say where to touch and how sure that is"
 
@@ -48,9 +48,45 @@ MOST_MARKERS = 12
 """The order of more takes too long to be the best one."""
 
 
+def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progress: Count) -> TouchPlan:
+    """Plan to touch every marker that can be touched.
+
+    Args:
+        context: Of a case with declared errors, markers and an arm.
+        q_insertion: Shape (6,), rad, the tip on the target: what the touches shall be good for.
+        seed: Of the motions' planner.
+        progress: Called with motions done and all of them.
+
+    Raises:
+        InputError: The case declares no errors, or has no markers, or too many.
+        NoAnswerError: The markers that can be touched are fewer than three or lie on a line, or no motion home was
+            found.
+    """
+    every = _task(context, q_insertion)
+    open_markers = _open(every)
+    while True:
+        task = every.of(open_markers.rows)
+        error = _error(task, every, open_markers.left_out)
+        chosen, worst = (
+            least_error(error, open_markers.candidates, q_insertion, worst=worst) for worst in (False, True)
+        )
+        stops = Stops(task.markers.names, task.markers.points_base, chosen)
+        try:
+            tour = tour_through(context, stops, seed=seed, progress=progress)
+        except NoMotionError as none:
+            open_markers = open_markers.without(none.place, task.markers.names[none.place], str(none))
+            continue
+        return TouchPlan(
+            **vars(tour),
+            left_out=open_markers.left_out,
+            expected_mm=task.expected_mm(chosen),
+            worst_mm=task.expected_mm(worst),
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """Some markers of a case, and what they are touched for.
+    """Some markers of a case, and the insertion that they are touched for.
 
     Attributes:
         context: The case.
@@ -75,7 +111,7 @@ class _Task:
         return self.context.case.needle.length_mm
 
     def of(self, rows: Sequence[int]) -> _Task:
-        """The same of some of its markers."""
+        """The task with some of its markers."""
         at, names = list(rows), self.markers.names
         points_ct, points_base = self.markers.points_ct[at], self.markers.points_base[at]
         return replace(self, markers=MarkerPairs(tuple(names[row] for row in at), points_ct, points_base))
@@ -94,13 +130,13 @@ class _Task:
         return PoseError(self.model, self.tip_mm, target, case.errors, fitted.uncertainty)
 
     def _aimed(self, fitted: Registration) -> Registration:
-        """Corrected for the insertion, where the case's pose is corrected."""
+        """The pose error corrected for the insertion, where the case's pose is corrected."""
         if self.method != "joint":
             return fitted
         return aimed(fitted, aim_at(self.model, self.tip_mm, self.context.case.target_ct, self.q_insertion))
 
     def expected_mm(self, q_touch: Floats) -> float:
-        """Of the tip at the target (rms)."""
+        """Expected (rms) error of the tip at the target, mm."""
         return expected_error_mm(self.error(q_touch), self.q_insertion)
 
 
@@ -112,48 +148,14 @@ class _Open(NamedTuple):
     left_out: dict[str, str]
 
     def without(self, place: int, name: str, why: str) -> _Open:
-        """The same but for the marker at a place of ``rows``."""
-        rows, kept = list(self.rows), list(self.candidates)
-        del rows[place], kept[place]
-        return _Open(tuple(rows), tuple(kept), {**self.left_out, name: why})
-
-
-def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progress: Count) -> TouchPlan:
-    """Plan to touch every marker that can be touched.
-
-    Args:
-        context: Of a case with declared errors, markers and an arm.
-        q_insertion: Shape (6,), rad, the tip on the target: what the touches shall be good for.
-        seed: Of the motions' planner.
-        progress: Called with motions done and all of them.
-
-    Raises:
-        InputError: The case declares no errors, or has no markers, or too many.
-        NoAnswerError: The markers that can be touched are fewer than three or lie on a line, or no motion home was
-            found.
-    """
-    every = _task(context, q_insertion)
-    found = _open(every)
-    while True:
-        task = every.of(found.rows)
-        error = _error(task, every, found.left_out)
-        chosen, worst = (least_error(error, found.candidates, q_insertion, worst=worst) for worst in (False, True))
-        stops = Stops(task.markers.names, task.markers.points_base, chosen)
-        try:
-            tour = tour_through(context, stops, seed=seed, progress=progress)
-        except NoMotionError as none:
-            found = found.without(none.place, task.markers.names[none.place], str(none))
-            continue
-        return TouchPlan(
-            **vars(tour),
-            left_out=found.left_out,
-            expected_mm=task.expected_mm(chosen),
-            worst_mm=task.expected_mm(worst),
-        )
+        """The open markers without the one at a place of ``rows``."""
+        rows, candidates = list(self.rows), list(self.candidates)
+        del rows[place], candidates[place]
+        return _Open(tuple(rows), tuple(candidates), {**self.left_out, name: why})
 
 
 def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
-    """After touches as in the insertion.
+    """The pose error after touches in the insertion's orientation.
 
     Raises:
         NoAnswerError: The markers that are left do not suffice.
@@ -169,7 +171,7 @@ def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
 
 
 def expected_of_touches(context: CaseContext, q_insertion: Floats, read: NamedPoints) -> float:
-    """Of the tip at the target (rms), mm, when these touches are all that there are.
+    """Expected (rms) error of the tip at the target, mm, with these touches alone.
 
     Args:
         context: Of the case.
@@ -190,7 +192,7 @@ def _in_order(context: CaseContext, read: NamedPoints) -> NamedPoints:
 
 
 def registered(context: CaseContext, read: NamedPoints) -> Registration:
-    """The registration of what was touched.
+    """The registration by touched markers.
 
     Args:
         context: For which markers were touched, and what is declared of them.
@@ -221,7 +223,7 @@ def _task(context: CaseContext, q_insertion: Floats) -> _Task:
 
 
 def approach_checkers(context: CaseContext, needle_padding_mm: float) -> ApproachCheckers:
-    """The workcell with the case's needle, and with one whose tip is taken off and that is so much fuller."""
+    """Two checkers of the workcell: with the case's needle, and with one without tip and with more padding."""
     assert context.reach is not None
     tool = case_tool(context.case)
     short = replace(tool, needle_length_mm=tool.needle_length_mm - TIP_MM, shaft_mm=tool.shaft_mm - TIP_MM)
@@ -240,26 +242,26 @@ def approach_checkers(context: CaseContext, needle_padding_mm: float) -> Approac
 
 
 def _open(task: _Task) -> _Open:
-    """Of each marker the poses that reach it and that nothing is in the way of."""
+    """Poses of each marker that reach it and are clear."""
     checkers = approach_checkers(task.context, PLANNED_PADDING_MM)
-    rows, kept, left_out = [], [], {}
+    rows, candidates, left_out = [], [], {}
     for row, (name, point) in enumerate(zip(task.markers.names, task.markers.points_base, strict=True)):
         free, why = _free(checkers, task.tip_mm, touch_candidates(task.model, task.tip_mm, point, task.q_insertion))
         if len(free):
             rows.append(row)
-            kept.append(free)
+            candidates.append(free)
         else:
             left_out[name] = why
-    return _Open(tuple(rows), tuple(kept), left_out)
+    return _Open(tuple(rows), tuple(candidates), left_out)
 
 
 def _free(checkers: ApproachCheckers, tip_mm: float, candidates: Candidates) -> tuple[Floats, str]:
-    """Of the insertion's own branch those that are free, else of the others; and what most often is in the way."""
+    """Free poses of the insertion's own branch, else of the others; and what blocks most often."""
     reasons: list[str] = []
     for q in (candidates.alike, candidates.others):
-        said = [why_not(checkers, tip_mm, one) for one in q]
-        free = q[[not reason for reason in said]]
+        blocked_by = [why_not(checkers, tip_mm, one) for one in q]
+        free = q[[not reason for reason in blocked_by]]
         if len(free):
             return free, ""
-        reasons += said
+        reasons += blocked_by
     return np.empty((0, 6)), max(set(reasons), key=reasons.count) if reasons else "out of the arm's reach"

@@ -1,11 +1,9 @@
-"""Markers to be touched, and the motions of a tour: from home through all standoffs at least cost, and back.
+"""Motions of a marker tour: from home through all standoffs at least cost and back, each touch, and the puncture after.
 
-The last stretch to a marker: a straight line along the needle, and whether the arm may take it.
-
-The needle must touch nothing but the marker: with its foremost `TIP_MM` taken off, it keeps its padding from
-the patient all the way, so that no shaft passes through them. Arm and holder keep their distance as everywhere.
-
-The puncture after touches: to where their registration puts the target, in the posture they were chosen for.
+A touch is a straight line along the needle onto the marker. The needle must touch nothing but the marker: with its
+foremost `TIP_MM` taken off, it keeps its padding from the patient all the way, so that no shaft passes through them.
+Arm and holder keep their distance as everywhere. `plan_puncture` goes to where the touches' registration puts the
+target, in the posture that they were chosen for.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ from puncture_twin.planning.search.context import CaseContext
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """One marker.
+    """The touch of one marker.
 
     Attributes:
         name: The marker's.
@@ -78,7 +76,7 @@ class TouchTour:
 
 @dataclass(frozen=True, eq=False)
 class TouchPlan(TouchTour):
-    """A tour of the markers for a puncture.
+    """A planned tour of the markers for a puncture.
 
     Attributes:
         left_out: Marker to why it is not touched, in words.
@@ -92,7 +90,7 @@ class TouchPlan(TouchTour):
 
 
 RESOLUTION = 1e-9
-"""Of costs, in their unit: sums of whole multiples are exact."""
+"""Rounding of costs, in their unit: sums of whole multiples are exact."""
 
 
 class NoMotionError(NoAnswerError):
@@ -104,7 +102,7 @@ class NoMotionError(NoAnswerError):
 
 
 class Stops(NamedTuple):
-    """Where the tip is to be set: names, points (n, 3), mm, base frame, and joints (n, 6), rad."""
+    """Stops of a tour: names, points (n, 3), mm, base frame, and joints (n, 6), rad."""
 
     names: tuple[str, ...]
     points_base: Floats
@@ -112,7 +110,7 @@ class Stops(NamedTuple):
 
 
 def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Count) -> TouchTour:
-    """Plan the motions.
+    """Plan the motions of a tour through stops.
 
     Args:
         context: Of a case with an arm.
@@ -181,10 +179,10 @@ SLOW_MM = 5.0
 """From here on the tip moves at touching speed."""
 
 PAST_MM = 5.0
-"""So far beyond its believed place a marker is felt for; then the touch is given up."""
+"""So far beyond its believed place a marker is searched for by contact; then the touch is given up."""
 
 TIP_MM = 8.0
-"""Of the needle that may be nearer than its padding to the patient: the marker sits on their skin."""
+"""Length of the needle that may be nearer than its padding to the patient: the marker sits on their skin."""
 
 STEP_MM = 0.5
 """Between two configurations of the line."""
@@ -271,7 +269,7 @@ def _dense(checker: CellChecker, line: Floats) -> Floats:
 def registered_joints(
     model: UrModel, tip_mm: float, q_insertion: Floats, target_ct: Floats, T_base_ct: tuple[Floats, Floats]
 ) -> Floats:
-    """The joints that put the needle as planned in the CT, patient and all where a new registration puts them.
+    """Joints that put the needle as planned in the CT, by a new registration.
 
     Args:
         model: The arm.

@@ -1,9 +1,7 @@
-"""The chances of any needles that reach a case's target, to hit, to touch and to break margins, to first order.
+"""Chances of any needles that reach a case's target: to hit, to touch and to break margins, and the case's limits.
 
-The model is made once for a case; whoever asks has needles alone: directions, and how the arm stands with the tip on
-the target. Line sampling refines them where it is wanted (`refined_chances`).
-
-The chances of a search's candidates to hit the target, and to touch each structure or its margin; their limits.
+The model is made once for a case; a query is needles alone: directions, and the arm's joints with the tip on the
+target. Chances are of first order; line sampling refines them on request (`refined_chances`).
 """
 
 from __future__ import annotations
@@ -33,12 +31,12 @@ from puncture_twin.planning.uncertainty.lines import Needles, Surroundings, refi
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 TAKEN = frozenset({"any", "joint"})
-"""Names whose column ``p_touch_<name>`` says something else than one structure's chance."""
+"""Names that are taken: ``p_touch_<name>`` is another column than one structure's chance."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChanceModel:
-    """Answers for the chances of a case's needles.
+    """Chances of any needles of one case.
 
     Attributes:
         case: The case.
@@ -61,7 +59,7 @@ class ChanceModel:
 
     @property
     def structures(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the k structures that must not be touched."""
         return tuple(self.anatomy.checked[column].name for column in self.columns)
 
     @property
@@ -71,13 +69,13 @@ class ChanceModel:
 
     @cached_property
     def surfaces(self) -> Floats:
-        """By what each one's surface may lie off as a whole, `PoseError.surface_cov_ct`, shape (k, 3, 3), CT axes."""
+        """Covariance of each surface as a whole, `PoseError.surface_cov_ct`, shape (k, 3, 3), CT axes."""
         voxels = [self.anatomy.checked[column].voxel_ct for column in self.columns]
         return np.array([self.error.surface_cov_ct(voxel_ct) for voxel_ct in voxels]).reshape(-1, 3, 3)
 
     @cached_property
     def target_surface_mm(self) -> float:
-        """By what the target's may, the mean over its faces; nothing where a radius says what is hit."""
+        """Standard deviation of the target's surface, the mean over its faces; 0 where a radius decides a hit."""
         if self.hit.radius_mm is not None:
             return 0.0
         target = self.anatomy.structure(self.case.target_structure)
@@ -85,17 +83,17 @@ class ChanceModel:
 
     @property
     def touching(self) -> Floats:
-        """How near a needle's axis touches each of them, shape (k,), mm."""
+        """Axis distance at which a needle touches each structure, shape (k,), mm."""
         return np.full(len(self.columns), self.case.needle.radius_mm)
 
     @property
     def breaking(self) -> Floats:
-        """How near it breaks each one's margin, shape (k,), mm."""
+        """Axis distance at which a needle breaks each margin, shape (k,), mm."""
         margins = np.array([self.anatomy.checked[column].margin_mm for column in self.columns], dtype=np.float64)
         return self.case.needle.radius_mm + margins
 
     def needles(self, outward_ct: Floats, q: Floats, axes: AxisDistances | None = None) -> Needles:
-        """Some needles, the doubt about them, and how they pass the structures; arguments as of `chances`."""
+        """Needles with their covariances and proximity to the structures; arguments as of `chances`."""
         target, columns = self.case.target_ct, self.columns
         if axes is None:
             lengths = own_lengths(self.case, self.anatomy, outward_ct)
@@ -181,8 +179,8 @@ def refined_chances(
     return replace(first, touch=touch, margin=margin, touch_any=touching_any(touch), refined=whole)
 
 
-def keeps_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
-    """Whether needles keep the case's limits, shape (n,), in any configurations that reach the target.
+def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
+    """Whether needles satisfy the case's limits in any configuration that reaches the target, shape (n,).
 
     Args:
         model: Of the case.
@@ -201,7 +199,7 @@ def keeps_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
 
 @dataclass(frozen=True, eq=False)
 class Chances:
-    """Of n candidates and k structures that demand a margin; NaN where nothing was computed.
+    """Chances of n candidates and k structures that demand a margin; NaN where nothing was computed.
 
     Attributes:
         structures: The k names.
@@ -234,14 +232,14 @@ class Chances:
 
     @classmethod
     def unknown(cls, structures: tuple[str, ...], count: int) -> Chances:
-        """Of candidates for which nothing was computed."""
+        """The chances of candidates for which nothing was computed."""
         shapes = {"touch": (count, len(structures)), "margin": (count, len(structures))}
         names = {field.name for field in fields(cls)} - {"structures", "refined"}
         blank = {name: np.full(shapes.get(name, (count,)), np.nan) for name in names}
         return cls(structures, refined=np.zeros(count, bool), **blank)
 
     def put(self, rows: Ints, known: Chances) -> Chances:
-        """With those of some candidates replaced."""
+        """These chances with some candidates' replaced."""
         values = {field.name: getattr(self, field.name).copy() for field in fields(self) if field.name != "structures"}
         for name, value in values.items():
             value[rows] = getattr(known, name)

@@ -1,6 +1,7 @@
-"""The chance to hit: that a normal error of known covariance leaves the tip within a radius, or within a mesh.
+"""Chance to hit, and chance to touch to first order, from the covariance of the needle's pose.
 
-In a mesh by directional simulation (Bjerager, J. Eng. Mech. 114, 1988): along each of many fixed directions u_i the
+**To hit**: a normal error of known covariance leaves the tip within a radius, or within a mesh. In a mesh by
+directional simulation (Bjerager, J. Eng. Mech. 114, 1988): along each of many fixed directions u_i the
 surface is crossed at distances rho_ij, and with m_i^2 = u_i' Sigma^-1 u_i
 
     P = sum_i m_i^-3 sum_j s_ij F3(rho_ij m_i) / sum_i m_i^-3,   F3 the distribution of the length of three normals
@@ -11,14 +12,12 @@ normal; F3 is odd, so that this is right where it moves past the target, and P i
 gave the errors' size, that size is uncertain too: F3 becomes Fisher's F(3, nu), and within a radius the chance is
 averaged over chi-squared.
 
-The chance to touch, to first order: how an error of the needle's pose changes its distance from each structure.
-
-The axis point f + s u is nearest to structure j at distance D; n is the unit vector from the structure to it. Then
+**To touch** (`proximity`): the axis point f + s u is nearest to structure j at distance D, n the unit vector from it.
 
     dD = n . (d + s phi x u),   g = (n; s u x n),   sigma^2 = g' Sigma6 g,   P = Phi(-(D - t) / sigma)
 
 (Hasofer, Lind, J. Eng. Mech. Div. 100, 1974). Exact for a flat surface; low between two ribs or over a concave lung,
-high at convex ends: where it may decide, `line_sampling` answers (docs/concepts/uncertainty.md).
+high at convex ends: where it may decide, line sampling is used (docs/concepts/uncertainty.md).
 """
 
 from __future__ import annotations
@@ -37,11 +36,82 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
-SERIES_END = 1e-8
-"""The series stops where what is left of its weights, which add up to 1, is smaller."""
 
-MOST_TERMS = 20_000
-"""Enough for standard deviations of a ratio of 30; what is left then is not counted, so that P is never too large."""
+@dataclass(frozen=True, eq=False)
+class HitModel:
+    """When a tip hits: within a radius of the target, or within its mesh.
+
+    Attributes:
+        radius_mm: Where a case gives one.
+        rays: The target's mesh, else.
+    """
+
+    radius_mm: float | None
+    rays: TargetRays | None
+
+    def chance(self, error: PoseError, cov_ct: Floats, surface_mm: float = 0.0) -> Floats:
+        """The chance of needles with these Sigma6, shape (n, 6, 6), CT axes, in a mesh that may lie off: shape (n,)."""
+        if self.rays is None or self.radius_mm is not None:
+            assert self.radius_mm is not None
+            return hit_in_ball(cov_ct[:, :3, :3] + error.target_covariance_ct, self.radius_mm, error.freedom)
+        return hit_in_mesh(self.rays, np.ascontiguousarray(cov_ct[:, :3, :3]), error.freedom, surface_mm)
+
+
+def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:
+    """By the radius where there is one, else by the mesh of the target's structure."""
+    return HitModel(radius_mm, None if radius_mm is not None else target_rays(mesh, target_ct))
+
+
+def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Floats:
+    """The chance that the tip is within a radius of the intended point.
+
+    Args:
+        cov: Shape (n, 3, 3), mm^2, of tip against that point, any frame.
+        radius_mm: The radius.
+        freedom: Degrees of the errors' size, where the residuals gave it.
+
+    Returns:
+        Shape (n,).
+    """
+    values = np.asarray(np.linalg.eigvalsh(cov) + LEAST_VARIANCE, dtype=np.float64)
+    if freedom is None:
+        return chance_within(values, np.full((len(cov), 1), radius_mm))[:, 0]
+    parts = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    radii = radius_mm * np.sqrt(chdtri(freedom, parts) / freedom)  # a larger error is a smaller radius
+    return np.asarray(chance_within(values, np.broadcast_to(radii, (len(cov), QUANTILES))).mean(axis=1))
+
+
+def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) -> float:
+    """Radius about the intended point within which the tip ends with a chance, mm: the inverse of `hit_in_ball`.
+
+    Args:
+        cov: Shape (3, 3), mm^2, of tip against that point, any frame.
+        chance: Below 1.
+        freedom: Degrees of the errors' size, where the residuals gave it.
+    """
+    from scipy.optimize import brentq  # here: it loads 260 modules, and few commands need it
+
+    size = float(np.sqrt(np.trace(cov)))
+    if size == 0.0:
+        return 0.0
+    high = size
+    while hit_in_ball(cov[None], high, freedom)[0] < chance:
+        high *= 2.0
+    return float(
+        brentq(lambda radius: hit_in_ball(cov[None], radius, freedom)[0] - chance, 0.0, high, xtol=1e-4 * size)
+    )
+
+
+def _with_unknown_size(rays: TargetRays, inverse: Floats, freedom: int) -> Floats:
+    squares = np.einsum("ia,nab,ib->ni", rays.directions, inverse, rays.directions)  # m_i^2
+    weights = squares**-1.5
+    within = fdtr(3, freedom, rays.depth**2 * squares[:, rays.ray] / 3)
+    found = (rays.sign * np.sign(rays.depth) * within * weights[:, rays.ray]).sum(axis=1) / weights.sum(axis=1)
+    return np.asarray(np.clip(found, 0.0, 1.0))
+
+
+QUANTILES = 64
+"""Quantiles of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
 
 
 def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
@@ -61,6 +131,13 @@ def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
     chances = np.empty(radii.shape)
     _ruben(np.sort(eigenvalues, axis=1), np.ascontiguousarray(radii, dtype=np.float64) ** 2, chances)
     return chances
+
+
+SERIES_END = 1e-8
+"""The series stops where what is left of its weights, which add up to 1, is smaller."""
+
+MOST_TERMS = 20_000
+"""Enough for standard deviations of a ratio of 30; what is left then is not counted, so that P is never too large."""
 
 
 @nb.njit(cache=True)
@@ -93,31 +170,6 @@ def _series(weight, e1, e2, x):  # type: ignore[no-untyped-def]
     return min(max(total, 0.0), 1.0)
 
 
-DIRECTIONS = 512
-"""Of a mesh, spread evenly: against a million draws P errs by .001, for axis ratios of 10 by .004."""
-
-QUANTILES = 64
-"""Of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
-
-TABLE_STEPS = 256
-"""Of F3 for every standard deviation: straight lines between err by 2e-6."""
-
-ROOT_HALF = math.sqrt(0.5)
-ROOT_TWO_OVER_PI = math.sqrt(2.0 / math.pi)
-
-LEAST_VARIANCE = 1e-12
-"""mm^2, added to every axis, and to areas: what cannot happen must not divide by zero."""
-
-SURFACES = 32
-"""Of a surface that lies off, at the middles of equal chances: however sharply it decides, P errs by half of one."""
-
-GRAZING = 0.2
-"""Least cosine between ray and normal: a crossing that a surface moves farther than this says is not moved by it."""
-
-ROWS_AT_ONCE = 512
-"""Of covariances, so that a table of rows times crossings stays below some MB."""
-
-
 @dataclass(frozen=True, eq=False)
 class TargetRays:
     """A target's mesh as its point sees it.
@@ -137,11 +189,15 @@ class TargetRays:
     moved: Floats | None = None
 
 
+DIRECTIONS = 512
+"""Directions for a mesh, spread evenly: against a million draws P errs by .001, for axis ratios of 10 by .004."""
+
+
 def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     """Cast the directions once; the mesh is closed."""
     directions = _fibonacci(DIRECTIONS)
     found = crossings(mesh, target_ct, directions)
-    from_last = (found.first + found.count - 1)[found.ray] - np.arange(len(found.ray))
+    from_last = (found.first + found.count - 1)[found.ray] - np.arange(len(found.ray))  # 0 for a ray's last
     sign = np.where(from_last % 2 == 0, 1.0, -1.0)
     area = _areas(mesh)[found.face]
     facing = np.abs(np.einsum("ca,ca->c", area, directions[found.ray])) / (
@@ -150,21 +206,17 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     return TargetRays(directions, found.ray, found.depth, sign, sign / np.maximum(facing, GRAZING))
 
 
-def _areas(mesh: TriangleMesh) -> Floats:
-    """Normals of the faces as long as twice their areas, shape (m, 3)."""
-    a, b, c = np.moveaxis(mesh.triangles.reshape(-1, 3, 3), 1, 0)
-    return np.asarray(np.cross(b - a, c - a))
-
-
-def mean_over_faces(mesh: TriangleMesh, cov: Floats) -> float:
-    """Sqrt of the mean of n' S n over a surface, for S of shape (3, 3)."""
-    area = _areas(mesh)
-    size = np.linalg.norm(area, axis=1)
-    return float(np.sqrt(np.einsum("ma,ab,mb->", area / (size[:, None] + LEAST_VARIANCE), cov, area) / size.sum()))
+def _fibonacci(count: int) -> Floats:
+    """Unit vectors spread evenly over the ball, shape (n, 3)."""
+    number = np.arange(count)
+    z = 1 - (2 * number + 1) / count
+    angle = number * np.pi * (3 - np.sqrt(5))  # golden angle
+    across = np.sqrt(1 - z**2)
+    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
-    """A ball about the target, as a tip sees it that is believed elsewhere: a known mean error beside the covariance.
+    """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance.
 
     Args:
         offset: Shape (3,), mm, believed tip minus target, in the covariance's axes.
@@ -172,10 +224,10 @@ def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
     """
     directions = _fibonacci(DIRECTIONS)
     along = directions @ offset
-    inside = along**2 - offset @ offset + radius_mm**2
+    inside = along**2 - offset @ offset + radius_mm**2  # below 0 the ray misses the ball
     half = np.sqrt(np.maximum(inside, 0.0))
     depth, sign = np.concatenate([half - along, -half - along]), np.repeat([1.0, -1.0], DIRECTIONS)
-    ahead = (np.tile(inside, 2) > 0) & (depth > 0)
+    ahead = (np.tile(inside, 2) > 0) & (depth > 0)  # behind the tip there is no ray
     ray = np.tile(np.arange(DIRECTIONS), 2)
     return TargetRays(directions, ray[ahead], depth[ahead], sign[ahead])
 
@@ -206,9 +258,41 @@ def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, su
     return np.concatenate([np.empty(0), *(_with_unknown_size(rays, part, freedom) for part in parts)])
 
 
+SURFACES = 32
+"""Positions of a surface that lies off, at the middles of equal chances: however sharply it decides, P errs by half of
+one."""
+
+GRAZING = 0.2
+"""Least cosine between ray and normal: a crossing that a surface moves farther than this says is not moved by it."""
+
+ROWS_AT_ONCE = 512
+"""Covariances at once: a table of rows times crossings stays below some MB."""
+
+LEAST_VARIANCE = 1e-12
+"""mm^2, added to every axis, and to areas: what cannot happen must not divide by zero."""
+
+
+def mean_over_faces(mesh: TriangleMesh, cov: Floats) -> float:
+    """Standard deviation along the normals, as the root of the mean of n' S n over a surface, S (3, 3)."""
+    area = _areas(mesh)
+    size = np.linalg.norm(area, axis=1)
+    return float(np.sqrt(np.einsum("ma,ab,mb->", area / (size[:, None] + LEAST_VARIANCE), cov, area) / size.sum()))
+
+
+def _areas(mesh: TriangleMesh) -> Floats:
+    """Normals of the faces as long as twice their areas, shape (m, 3)."""
+    a, b, c = np.moveaxis(mesh.triangles.reshape(-1, 3, 3), 1, 0)
+    return np.asarray(np.cross(b - a, c - a))
+
+
+ROOT_HALF = math.sqrt(0.5)
+
+ROOT_TWO_OVER_PI = math.sqrt(2.0 / math.pi)
+
+
 @nb.njit(cache=True, error_model="numpy")
 def _directional(x, y, z, ray, depth, sign, table, inverse, chances):  # type: ignore[no-untyped-def]  # numba infers
-    """The sum of the module's docstring, row by row; directions' coordinates apart, so that several go at once."""
+    """The sum of the module's first equation, row by row."""
     weights, lengths, last = np.empty(len(x)), np.empty(len(x)), len(table) - 1.0
     for row in range(len(inverse)):
         S = inverse[row]
@@ -225,6 +309,10 @@ def _directional(x, y, z, ray, depth, sign, table, inverse, chances):  # type: i
         chances[row] = min(max(within / weights.sum(), 0.0), 1.0)
 
 
+TABLE_STEPS = 256
+"""Steps of the table of F3 per standard deviation: straight lines between err by 2e-6."""
+
+
 @cache
 def _length_table() -> Floats:
     """F3 at steps of 1 / `TABLE_STEPS`, up to where it is 1."""
@@ -232,95 +320,13 @@ def _length_table() -> Floats:
     return np.asarray(erf(t * ROOT_HALF) - ROOT_TWO_OVER_PI * t * np.exp(-0.5 * t * t))
 
 
-def _with_unknown_size(rays: TargetRays, inverse: Floats, freedom: int) -> Floats:
-    squares = np.einsum("ia,nab,ib->ni", rays.directions, inverse, rays.directions)
-    weights = squares**-1.5
-    within = fdtr(3, freedom, rays.depth**2 * squares[:, rays.ray] / 3)
-    found = (rays.sign * np.sign(rays.depth) * within * weights[:, rays.ray]).sum(axis=1) / weights.sum(axis=1)
-    return np.asarray(np.clip(found, 0.0, 1.0))
-
-
-def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Floats:
-    """The chance that the tip is within a radius of the point that was meant.
-
-    Args:
-        cov: Shape (n, 3, 3), mm^2, of tip against that point, any frame.
-        radius_mm: The radius.
-        freedom: Degrees of the errors' size, where the residuals gave it.
-
-    Returns:
-        Shape (n,).
-    """
-    values = np.asarray(np.linalg.eigvalsh(cov) + LEAST_VARIANCE, dtype=np.float64)
-    if freedom is None:
-        return chance_within(values, np.full((len(cov), 1), radius_mm))[:, 0]
-    parts = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    radii = radius_mm * np.sqrt(chdtri(freedom, parts) / freedom)
-    return np.asarray(chance_within(values, np.broadcast_to(radii, (len(cov), QUANTILES))).mean(axis=1))
-
-
-def radius_that_holds(cov: Floats, chance: float, freedom: int | None = None) -> float:
-    """Within which of the point that was meant the tip ends with a chance, mm: `hit_in_ball` the other way round.
-
-    Args:
-        cov: Shape (3, 3), mm^2, of tip against that point, any frame.
-        chance: Below 1.
-        freedom: Degrees of the errors' size, where the residuals gave it.
-    """
-    from scipy.optimize import brentq  # here: it loads 260 modules, and few commands need it
-
-    size = float(np.sqrt(np.trace(cov)))
-    if size == 0.0:
-        return 0.0
-    high = size
-    while hit_in_ball(cov[None], high, freedom)[0] < chance:
-        high *= 2.0
-    return float(
-        brentq(lambda radius: hit_in_ball(cov[None], radius, freedom)[0] - chance, 0.0, high, xtol=1e-4 * size)
-    )
-
-
-def _fibonacci(count: int) -> Floats:
-    """Unit vectors spread evenly over the ball, shape (n, 3)."""
-    number = np.arange(count)
-    z = 1 - (2 * number + 1) / count
-    angle = number * np.pi * (3 - np.sqrt(5))
-    across = np.sqrt(1 - z**2)
-    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
-
-
-@dataclass(frozen=True, eq=False)
-class HitModel:
-    """When a tip hits: within a radius of the target, or within its mesh.
-
-    Attributes:
-        radius_mm: Where a case gives one.
-        rays: The target's mesh, else.
-    """
-
-    radius_mm: float | None
-    rays: TargetRays | None
-
-    def chance(self, error: PoseError, cov_ct: Floats, surface_mm: float = 0.0) -> Floats:
-        """The chance of needles with these Sigma6, shape (n, 6, 6), CT axes, in a mesh that may lie off: shape (n,)."""
-        if self.rays is None or self.radius_mm is not None:
-            assert self.radius_mm is not None
-            return hit_in_ball(cov_ct[:, :3, :3] + error.target_covariance_ct, self.radius_mm, error.freedom)
-        return hit_in_mesh(self.rays, np.ascontiguousarray(cov_ct[:, :3, :3]), error.freedom, surface_mm)
-
-
-def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:
-    """By the radius where there is one, else by the mesh of the target's structure."""
-    return HitModel(radius_mm, None if radius_mm is not None else target_rays(mesh, target_ct))
-
-
 @dataclass(frozen=True, eq=False)
 class Proximity:
-    """How n needles pass k structures; CT frame.
+    """Distances, gradients and deviations of n needles and k structures; CT frame.
 
     Attributes:
         distance: Shape (n, k), of the axis from the surface, mm.
-        gradient: Shape (n, k, 6), g: what the pose's error (mm, rad) does to it; NaN where they meet.
+        gradient: Shape (n, k, 6), g: what the pose's error (mm, rad) does to it; NaN where they intersect.
         deviation: Shape (n, k), sigma, mm.
     """
 
@@ -351,7 +357,7 @@ def proximity(
 
 @nb.njit(cache=True, error_model="numpy")
 def _first_order(depth, normal, outward, cov, surface, gradient, deviation):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill g = (n; s u x n) and sigma of every pair."""
+    """Fill the gradients g = (n; s u x n) and deviations sigma of every pair."""
     for i in range(len(outward)):
         ux, uy, uz = outward[i]
         for j in range(depth.shape[1]):
@@ -382,7 +388,7 @@ def touch_chance(near: Proximity, threshold_mm: Floats | float, freedom: int | N
 
 
 def touching_any(touch: Floats) -> Floats:
-    """At most the chance to touch any of k structures, shape (n,), from the chances (n, k) to touch each."""
+    """Upper bound of the chance to touch any of k structures, shape (n,), from the chances (n, k) to touch each."""
     return np.asarray(np.minimum(1.0, touch.sum(axis=1)))
 
 
@@ -394,7 +400,7 @@ def touch_bound(
     surface_mm: Floats | float,
     freedom: int | None = None,
 ) -> Floats:
-    """What the chance would be if the nearest point were the axis' most doubtful one, to first order, shape (n, k).
+    """Bound of the first-order chance if the nearest point were the axis' least certain one, shape (n, k).
 
     A needle that leans may touch a structure far from where it is nearest, which first order does not see. No point of
     the axis is nearer than the nearest, and none is more doubtful than the worse end: the variance is convex in depth.

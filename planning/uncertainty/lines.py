@@ -1,6 +1,6 @@
-"""The chance to touch, beyond first order: the needle is moved along lines, and where it touches is found.
+"""Chance to touch beyond first order, by line sampling: a needle is displaced along lines to where it touches.
 
-With Sigma5 the covariance of the tip's shift and of the lean across the needle (turning about its own axis moves it
+With Sigma5 the covariance of the tip's shift and of the lean across the needle (a rotation about its own axis moves it
 nowhere), xi = B z, B B' = Sigma5, and z standard normal, every line is
 
     z = y + beta a,   a = -B'g / sigma,   y across a,      P = E_y[sum Phi(beta_out) - Phi(beta_in)]
@@ -9,16 +9,12 @@ over the stretches of the line on which the needle is nearer than the threshold 
 Pradlwarter, Schueller, Prob. Eng. Mech. 19, 2004). The mean over y is a rule of 25 lines, exact to the fifth degree
 (Stroud, Approximate Calculation of Multiple Integrals, 1971, E_n^r2 5-2 with n = 4). Where its lines disagree, or
 several things are about as likely, 128 lines spread by Sobol; where these disagree, 512. Where another direction
-touches sooner than first order's, which 51 rays tell, a is that one. A line is walked in steps that no approach can
-outrun, so that entry *and* exit of every stretch are found. A surface that may lie off as a whole is one more normal;
-errors whose size is uncertain give every line a size of its own.
+touches sooner than first order's (found by 51 rays), a is that one. A surface that may lie off as a whole is one more
+normal; errors whose size is uncertain give every line a size of its own.
 
-One needle, and how it may be displaced.
-
-Lines of displaced needles, walked to where they touch: the compiled inside of `line_sampling`.
-
-A step is never longer than the needle's distance over the fastest that any of its points moves, so that no approach
-is outrun; through what it touches it goes in small steps, and at every exit it is tested whether the needle is inside.
+A step along a line is never longer than the needle's distance over the fastest that any of its points moves, so that
+entry *and* exit of every stretch are found. Through what it touches the walk goes in small steps, and at every exit it
+is tested whether the needle is inside.
 """
 
 from __future__ import annotations
@@ -45,142 +41,9 @@ from puncture_twin.planning.geometry.rigid import frame_about, skew
 from puncture_twin.planning.uncertainty.hit import Proximity
 
 
-def line_chance(near: NearFaces, doubt: NeedleDoubt, length: float, threshold: float, gradient: Floats) -> float:
-    """P that the needle comes nearer to a structure than a threshold; NaN where nothing displaces it.
-
-    Args:
-        near: The structure's faces within `NeedleDoubt.reach` of the axis.
-        doubt: The needle and its doubt.
-        length: Of the axis, mm.
-        threshold: Needle radius, or that and a margin, mm.
-        gradient: Shape (6,), g: what shift and rotation do to the distance, to first order.
-    """
-    problem = (near.triangles, near.faces, near.blocks, doubt.origin, doubt.outward, float(length), float(threshold))
-    slope = doubt.root.T @ gradient
-    sigma = math.hypot(float(np.linalg.norm(slope)), doubt.surface_mm)
-    likeliest, alone = likeliest_slope(problem, doubt, slope, _slack(problem))
-    steep = math.hypot(float(np.linalg.norm(likeliest)), doubt.surface_mm)
-    if not steep > 0.0:
-        return math.nan
-    basis = line_basis(likeliest, doubt.surface_mm / steep, float(np.linalg.norm(likeliest)) / steep)
-    first = -_slack(problem) / max(sigma, 1e-12)
-    return chance_by_rules(problem, doubt, basis, first, alone)
-
-
-def _slack(problem: Problem) -> float:
-    """Of the nominal needle, mm."""
-    triangles, faces, blocks, origin, outward, length, threshold = problem
-    tip = (float(origin[0]), float(origin[1]), float(origin[2]))
-    along = (float(outward[0]), float(outward[1]), float(outward[2]))
-    return min(float(displaced_distance(triangles, faces, blocks, tip, along, length, -1.0, 0)[0]), 1e9) - threshold
-
-
-SCRAMBLED_WITH = 20191104
-"""Seed of the lines' spread."""
-
-
-def by_lines(problem: Problem, doubt: NeedleDoubt, basis: Floats, lines: Lines, first: float) -> tuple[float, float]:
-    """The mean chance of some lines, and their standard deviation; beyond first order's where sizes are uncertain."""
-    chances = walked(problem, doubt.root, doubt.surface_mm, basis, lines.offsets, lines.sizes)
-    whole = 0.0
-    if doubt.freedom is not None:
-        whole, chances = float(stdtr(doubt.freedom, first)), chances - ndtr(first / lines.sizes)
-    mean = float(lines.weights @ chances)
-    return whole + mean, math.sqrt(float(lines.weights @ (chances - mean) ** 2))
-
-
-class Lines(NamedTuple):
-    """Where n lines lie.
-
-    Attributes:
-        offsets: Shape (n, 5), standard deviations, four of the pose and one mixed with the surface.
-        sizes: Shape (n,), of each line's errors over the estimate.
-        weights: Shape (n,), their sum is 1.
-    """
-
-    offsets: Floats
-    sizes: Floats
-    weights: Floats
-
-
-@cache
-def few_lines(surface: bool) -> Lines:
-    """The small rule."""
-    signs = list(itertools.product((1.0, -1.0), repeat=2))
-    pairs = list(itertools.combinations(range(4), 2))
-    offsets, weights = np.zeros((1 + len(signs) * len(pairs), 5)), np.full(1 + len(signs) * len(pairs), 1.0 / 36.0)
-    weights[0] = 1.0 / 3.0
-    for row, (pair, sign) in enumerate(itertools.product(pairs, signs)):
-        offsets[row + 1, list(pair)] = math.sqrt(3.0) * np.array(sign)
-    if surface:
-        mixed = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
-        offsets, weights = np.concatenate([offsets + mixed, offsets - mixed]), np.tile(weights, 2) / 2
-    return Lines(offsets, np.ones(len(offsets)), weights)
-
-
-@cache
-def many_lines(surface: bool, count: int, freedom: int | None) -> Lines:
-    """Spread evenly over a normal, and over the sizes that are as likely."""
-    mixed = 1 if surface else 0
-    drawn = _sobol(4 + mixed + (freedom is not None), count)
-    normal = ndtri(np.clip(drawn[:, : 4 + mixed], 1e-12, 1 - 1e-12))
-    length = np.linalg.norm(normal, axis=1)[:, None]
-    offsets = np.zeros((count, 5))
-    offsets[:, : 4 + mixed] = normal * np.minimum(1.0, WIDEST / length)
-    sizes = np.ones(count) if freedom is None else error_sizes(freedom)[(drawn[:, -1] * SIZES).astype(np.int64)]
-    return Lines(offsets, sizes, np.full(count, 1.0 / count))
-
-
-def _sobol(dimensions: int, count: int) -> Floats:
-    """Points spread evenly over the unit cube, shape (count, dimensions), from the user's cache if they are there."""
-
-    def make() -> Arrays:
-        return {"points": scipy.stats.qmc.Sobol(dimensions, scramble=True, seed=SCRAMBLED_WITH).random(count)}
-
-    made_from = {"what": "sobol", "dimensions": dimensions, "count": count, "seed": SCRAMBLED_WITH}
-    return user_cache().arrays(made_from, make, by=__name__)["points"]
-
-
-MANY_LINES, MOST_LINES = 128, 512
-"""Where something else is touched about as soon as what is likeliest, or sizes are uncertain; where these disagree."""
-
-DISAGREE = 0.1
-"""Standard deviation of the lines' chances up to which few are trusted with .003: against 4,096 lines they err by that
-at most, and by .013 where it is .2 (three anatomies; beside a lung and between ribs)."""
-
-
-def chance_by_rules(problem: Problem, doubt: NeedleDoubt, basis: Floats, first: float, alone: bool) -> float:
-    """By the small rule; by many lines where its lines disagree, or several things are touched, or by most lines.
-
-    Where the errors' size is uncertain every line has its own, and the lines say by how much first order, of quantile
-    ``first``, errs.
-    """
-    surface = doubt.surface_mm > 0.0
-    rules = [many_lines(surface, count, doubt.freedom) for count in (MANY_LINES, MOST_LINES)]
-    if alone and doubt.freedom is None:
-        rules.insert(0, few_lines(surface))
-    for lines in rules:
-        mean, spread = by_lines(problem, doubt, basis, lines, first)
-        if spread <= DISAGREE:
-            break
-    return min(max(mean, 0.0), 1.0)
-
-
-def line_basis(slope: Floats, by_surface: float, by_pose: float) -> Floats:
-    """Orthonormal rows (6, 6) of six normals (five of the pose, the surface's): a, four across, the mixed one."""
-    size = float(np.linalg.norm(slope))
-    down = -slope / size if size > 0.0 else np.eye(5)[0]
-    frame = np.linalg.qr(np.column_stack([down, np.eye(5)]))[0]
-    basis = np.zeros((6, 6))
-    basis[0, :5], basis[0, 5] = by_pose * down, -by_surface
-    basis[1:5, :5] = frame[:, 1:5].T
-    basis[5, :5], basis[5, 5] = by_surface * down, by_pose
-    return basis
-
-
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What must not be touched about one target; CT frame, mm.
+    """The structures that must not be touched about one target; CT frame, mm.
 
     Attributes:
         blocks: The faces of each of the k structures.
@@ -195,7 +58,7 @@ class Surroundings:
 
 @dataclass(frozen=True, eq=False)
 class Needles:
-    """n needles and the doubt about them.
+    """n needles with their covariances and proximity to the structures.
 
     Attributes:
         outward_ct: Shape (n, 3), unit.
@@ -213,7 +76,7 @@ class Needles:
 
 
 def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first: Floats, wanted: Bools) -> Floats:
-    """First-order chances, those that are wanted refined.
+    """First-order chances with the wanted ones refined by line sampling.
 
     A structure of which no face is within the needle's reach keeps its first order: it is touched less than once in
     100,000 times.
@@ -222,7 +85,7 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
         around: What must not be touched.
         needles: The n needles.
         threshold_mm: Shape (k,), needle radius, or that and a margin.
-        first: Shape (n, k), to first order; NaN where a needle meets a structure already.
+        first: Shape (n, k), to first order; NaN where a needle intersects a structure already.
         wanted: Shape (n, k).
 
     Returns:
@@ -232,19 +95,166 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
     rows = np.flatnonzero((wanted & np.isfinite(first)).any(axis=1))
     for row in rows:
         outward = needles.outward_ct[row]
-        pose = needle_doubt(around.target_ct, outward, needles.cov_ct[row], 0.0, needles.freedom)
+        pose = needle_uncertainty(around.target_ct, outward, needles.cov_ct[row], 0.0, needles.freedom)
         for column in np.flatnonzero(wanted[row] & np.isfinite(first[row])):
             surface_mm = float(needles.surface_mm[row, column])
-            doubt = replace(pose, surface_mm=surface_mm) if surface_mm > 0 else pose
+            uncertainty = replace(pose, surface_mm=surface_mm) if surface_mm > 0 else pose
             length, threshold = float(around.length[row, column]), float(threshold_mm[column])
-            reach = doubt.reach(length, threshold)
-            if needles.near.distance[row, column] > max(reach):
+            reach = uncertainty.reach(length, threshold)
+            if needles.near.distance[row, column] > max(reach):  # no line leads so far
                 continue
             faces = near_faces(around.blocks[column], around.target_ct, outward, length, reach)
             if len(faces):
-                chance = line_chance(faces, doubt, length, threshold, needles.near.gradient[row, column])
+                chance = line_chance(faces, uncertainty, length, threshold, needles.near.gradient[row, column])
                 found[row, column] = first[row, column] if np.isnan(chance) else chance
     return found
+
+
+def line_chance(
+    near: NearFaces, uncertainty: NeedleUncertainty, length: float, threshold: float, gradient: Floats
+) -> float:
+    """P that the needle comes nearer to a structure than a threshold; NaN where nothing displaces it.
+
+    Args:
+        near: The structure's faces within `NeedleUncertainty.reach` of the axis.
+        uncertainty: The needle and the distribution of its displacement.
+        length: Of the axis, mm.
+        threshold: Needle radius, or that and a margin, mm.
+        gradient: Shape (6,), g: what shift and rotation do to the distance, to first order.
+    """
+    problem = (
+        near.triangles,
+        near.faces,
+        near.blocks,
+        uncertainty.origin,
+        uncertainty.outward,
+        float(length),
+        float(threshold),
+    )
+    slope = uncertainty.root.T @ gradient
+    sigma = math.hypot(float(np.linalg.norm(slope)), uncertainty.surface_mm)
+    likeliest, alone = likeliest_slope(problem, uncertainty, slope, _slack(problem))
+    steep = math.hypot(float(np.linalg.norm(likeliest)), uncertainty.surface_mm)
+    if not steep > 0.0:  # nothing moves the needle against the structure
+        return math.nan
+    basis = line_basis(likeliest, uncertainty.surface_mm / steep, float(np.linalg.norm(likeliest)) / steep)
+    first = -_slack(problem) / max(sigma, 1e-12)
+    return chance_by_rules(problem, uncertainty, basis, first, alone)
+
+
+def _slack(problem: Problem) -> float:
+    """Slack of the nominal needle: its distance beyond the threshold, mm."""
+    triangles, faces, blocks, origin, outward, length, threshold = problem
+    tip = (float(origin[0]), float(origin[1]), float(origin[2]))
+    along = (float(outward[0]), float(outward[1]), float(outward[2]))
+    return min(float(displaced_distance(triangles, faces, blocks, tip, along, length, -1.0, 0)[0]), 1e9) - threshold
+
+
+def chance_by_rules(
+    problem: Problem, uncertainty: NeedleUncertainty, basis: Floats, first: float, alone: bool
+) -> float:
+    """By the small rule; by many lines where its lines disagree, or several things are touched, or by most lines.
+
+    Where the errors' size is uncertain every line has its own, and the lines say by how much first order, of quantile
+    ``first``, errs.
+    """
+    surface = uncertainty.surface_mm > 0.0
+    rules = [many_lines(surface, count, uncertainty.freedom) for count in (MANY_LINES, MOST_LINES)]
+    if alone and uncertainty.freedom is None:
+        rules.insert(0, few_lines(surface))  # exact enough only about one smooth nearest surface
+    for lines in rules:
+        mean, spread = by_lines(problem, uncertainty, basis, lines, first)
+        if spread <= DISAGREE:
+            break
+    return min(max(mean, 0.0), 1.0)
+
+
+MANY_LINES, MOST_LINES = 128, 512
+"""Where something else is touched about as soon as what is likeliest, or sizes are uncertain; where these disagree."""
+
+DISAGREE = 0.1
+"""Standard deviation of the lines' chances up to which few are trusted with .003: against 4,096 lines they err by that
+at most, and by .013 where it is .2 (three anatomies; next to a lung and between ribs)."""
+
+
+def by_lines(
+    problem: Problem, uncertainty: NeedleUncertainty, basis: Floats, lines: Lines, first: float
+) -> tuple[float, float]:
+    """The mean chance of some lines, and their standard deviation; beyond first order's where sizes are uncertain."""
+    chances = walked(problem, uncertainty.root, uncertainty.surface_mm, basis, lines.offsets, lines.sizes)
+    whole = 0.0
+    if uncertainty.freedom is not None:
+        whole, chances = float(stdtr(uncertainty.freedom, first)), chances - ndtr(first / lines.sizes)
+    mean = float(lines.weights @ chances)
+    return whole + mean, math.sqrt(float(lines.weights @ (chances - mean) ** 2))
+
+
+class Lines(NamedTuple):
+    """Offsets and sizes of n lines.
+
+    Attributes:
+        offsets: Shape (n, 5), standard deviations, four of the pose and one mixed with the surface.
+        sizes: Shape (n,), of each line's errors over the estimate.
+        weights: Shape (n,), their sum is 1.
+    """
+
+    offsets: Floats
+    sizes: Floats
+    weights: Floats
+
+
+@cache
+def few_lines(surface: bool) -> Lines:
+    """The 25 lines of the small rule."""
+    signs = list(itertools.product((1.0, -1.0), repeat=2))
+    pairs = list(itertools.combinations(range(4), 2))
+    offsets, weights = np.zeros((1 + len(signs) * len(pairs), 5)), np.full(1 + len(signs) * len(pairs), 1.0 / 36.0)
+    weights[0] = 1.0 / 3.0
+    for row, (pair, sign) in enumerate(itertools.product(pairs, signs)):
+        offsets[row + 1, list(pair)] = math.sqrt(3.0) * np.array(sign)
+    if surface:
+        mixed = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
+        offsets, weights = np.concatenate([offsets + mixed, offsets - mixed]), np.tile(weights, 2) / 2
+    return Lines(offsets, np.ones(len(offsets)), weights)
+
+
+@cache
+def many_lines(surface: bool, count: int, freedom: int | None) -> Lines:
+    """Lines spread evenly over a normal, with sizes that are equally likely."""
+    mixed = 1 if surface else 0
+    drawn = _sobol(4 + mixed + (freedom is not None), count)
+    normal = ndtri(np.clip(drawn[:, : 4 + mixed], 1e-12, 1 - 1e-12))
+    length = np.linalg.norm(normal, axis=1)[:, None]
+    offsets = np.zeros((count, 5))
+    offsets[:, : 4 + mixed] = normal * np.minimum(1.0, WIDEST / length)  # farther ones are pulled in
+    sizes = np.ones(count) if freedom is None else error_sizes(freedom)[(drawn[:, -1] * SIZES).astype(np.int64)]
+    return Lines(offsets, sizes, np.full(count, 1.0 / count))
+
+
+def _sobol(dimensions: int, count: int) -> Floats:
+    """Points spread evenly over the unit cube, shape (count, dimensions), from the user's cache if they are there."""
+
+    def make() -> Arrays:
+        return {"points": scipy.stats.qmc.Sobol(dimensions, scramble=True, seed=SCRAMBLED_WITH).random(count)}
+
+    made_from = {"what": "sobol", "dimensions": dimensions, "count": count, "seed": SCRAMBLED_WITH}
+    return user_cache().arrays(made_from, make, by=__name__)["points"]
+
+
+SCRAMBLED_WITH = 20191104
+"""Seed of the lines' spread."""
+
+
+def line_basis(slope: Floats, by_surface: float, by_pose: float) -> Floats:
+    """Orthonormal rows (6, 6) of six normals (five of the pose, the surface's): a, four across, the mixed one."""
+    size = float(np.linalg.norm(slope))
+    down = -slope / size if size > 0.0 else np.eye(5)[0]
+    frame = np.linalg.qr(np.column_stack([down, np.eye(5)]))[0]  # its first column is down, up to its sign
+    basis = np.zeros((6, 6))
+    basis[0, :5], basis[0, 5] = by_pose * down, -by_surface
+    basis[1:5, :5] = frame[:, 1:5].T
+    basis[5, :5], basis[5, 5] = by_surface * down, by_pose
+    return basis
 
 
 Problem = tuple[Floats, Floats, Floats, Floats, Floats, float, float]
@@ -257,18 +267,18 @@ WIDEST = 4.0
 """Standard deviations across which a line may lie: what lies beyond has a chance of .003 and less to matter."""
 
 SIZES = 16
-"""Of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
+"""Quantiles of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
-class NeedleDoubt:
-    """One needle, and how it may be displaced; CT frame, mm and rad.
+class NeedleUncertainty:
+    """One needle and the distribution of its displacement; CT frame, mm and rad.
 
     Attributes:
         origin: Shape (3,), the tip's own place, where the axis starts.
         outward: Shape (3,), unit.
         root: Shape (6, 5), B: shift and lean of each of five standard normals.
-        surface_mm: Standard deviation of the surface, as a whole, of the structure that is asked about.
+        surface_mm: Standard deviation of the surface, as a whole, of the structure in question.
         freedom: Degrees of the errors' size where the residuals gave it.
     """
 
@@ -304,10 +314,10 @@ class NeedleDoubt:
         return of
 
 
-def needle_doubt(
+def needle_uncertainty(
     origin: Floats, outward: Floats, cov_ct: Floats, surface_mm: float, freedom: int | None = None
-) -> NeedleDoubt:
-    """From Sigma6.
+) -> NeedleUncertainty:
+    """The uncertainty of one needle from its Sigma6.
 
     Args:
         origin: Shape (3,), mm, the covariance's point of reference.
@@ -321,7 +331,7 @@ def needle_doubt(
     keep[:3, :3], keep[3:, 3:] = np.eye(3), across
     values, axes = np.linalg.eigh(_balanced(keep.T @ cov_ct @ keep))
     root = keep @ (_scales(keep.T @ cov_ct @ keep)[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
-    return NeedleDoubt(origin, outward, np.ascontiguousarray(root), surface_mm, freedom)
+    return NeedleUncertainty(origin, outward, np.ascontiguousarray(root), surface_mm, freedom)
 
 
 def _scales(cov: Floats) -> Floats:
@@ -330,14 +340,14 @@ def _scales(cov: Floats) -> Floats:
 
 
 def _balanced(cov: Floats) -> Floats:
-    """Correlations."""
+    """A covariance scaled to correlations."""
     scale = np.where(_scales(cov) > 0, _scales(cov), 1.0)
     return np.asarray(cov / np.outer(scale, scale))
 
 
 @cache
 def error_sizes(freedom: int) -> Floats:
-    """By how much the errors' true size may exceed the estimate: sqrt(nu / chi-squared) at equal chances."""
+    """Factors of the errors' true size over the estimate: sqrt(nu / chi-squared) at equal chances."""
     return np.asarray(np.sqrt(freedom / chdtri(freedom, (np.arange(SIZES) + 0.5) / SIZES)))
 
 
@@ -400,7 +410,7 @@ def gap_beyond(scene, start, ahead, beta, hint):  # type: ignore[no-untyped-def]
         origin[1] + start[1] + beta * ahead[1],
         origin[2] + start[2] + beta * ahead[2],
     )
-    enough = max(threshold - surface_mm * (start[6] + beta * ahead[6]), 0.0)  # a surface that is met is touched
+    enough = max(threshold - surface_mm * (start[6] + beta * ahead[6]), 0.0)  # a surface that is reached is touched
     distance, nearest = displaced_distance(triangles, faces, blocks, tip, along, length, enough, hint)
     return (-1.0 if distance == 0.0 else distance - enough), nearest
 
@@ -415,7 +425,7 @@ LITTLE = 0.01
 """A walk ends where what is left of its normal is this part of what it has: all that is left counts as touched."""
 
 NUDGE_MM = 1e-6
-"""By which a tip's path is moved aside, so that it does not run through an edge of a face."""
+"""mm by which a tip's path is moved aside, so that it does not run through an edge of a face."""
 
 ROOT_HALF = math.sqrt(0.5)
 
@@ -470,7 +480,7 @@ def _walk(scene, start, ahead, hint):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, error_model="numpy")
 def _swallowed(scene, start, ahead, beta):  # type: ignore[no-untyped-def]
-    """Whether a needle that is near no face is inside: its tip came through an odd number of them.
+    """Whether a needle that is near no face lies inside a structure: its tip crossed an odd number of faces.
 
     Faces that the tip can come through are near the nominal needle, all of them.
     """
@@ -542,21 +552,23 @@ PREFERRED, SOONER, NO_MATTER = 0.1, 0.8, 3.8
 something else is touched; and how far out it does not matter."""
 
 
-def likeliest_slope(problem: Problem, doubt: NeedleDoubt, slope: Floats, slack: float) -> tuple[Floats, bool]:
+def likeliest_slope(
+    problem: Problem, uncertainty: NeedleUncertainty, slope: Floats, slack: float
+) -> tuple[Floats, bool]:
     """The slope (5,) along which the needle touches soonest, and whether nothing else touches about as soon.
 
-    The nearest face need not be the likeliest, where a farther one lies in the direction of greater doubt: rays are
-    sent in 51 directions. What touches sooner than a plane across the likeliest direction would is something else.
+    The nearest face need not be the likeliest, where a farther one lies in the direction of greater uncertainty: rays
+    are sent in 51 directions. What touches sooner than a plane across the likeliest direction would is something else.
     """
     size = float(np.linalg.norm(slope))
     directions = np.vstack([-slope / size if size > 0.0 else np.eye(5)[0], _rays()])
     radii = np.empty(len(directions))
-    first_touches(problem, doubt.root, directions, radii)
+    first_touches(problem, uncertainty.root, directions, radii)
     best = int(np.argmin(radii))
     if not np.isfinite(radii[best]) or radii[best] <= 0.0 or radii[0] < radii[best] + PREFERRED:
         best = 0
     flat = np.full(len(radii), np.inf)
-    towards = directions @ directions[best]
+    towards = directions @ directions[best]  # cosine: a plane across the best is hit at radius / cosine
     np.divide(radii[best], towards, out=flat, where=towards > 0.05)
     alone = not bool(((radii < SOONER * flat) & (radii < NO_MATTER)).any())
     return (slope, alone) if best == 0 else (-directions[best] * (slack / radii[best]), alone)

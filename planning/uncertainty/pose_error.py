@@ -1,4 +1,4 @@
-"""The covariance of the needle's pose against the anatomy at the end of an insertion, and where it comes from.
+"""Covariance of the needle's pose against the anatomy at the end of an insertion, its sources, and its bound.
 
 With J_i the arm's error Jacobian at marker i's touch and J_f at the insertion, L the registration's map, X its
 transport to the target, Omega what errs anew at each marker:
@@ -6,25 +6,7 @@ transport to the target, Omega what errs anew at each marker:
     Sigma6 = G Sigma_eta G' + X L Omega L' X' + (rep^2 + drift^2) Jq_f Jq_f',   G = J_f - X L J
 
 The minus sign is the cancellation: what the arm does wrong at the markers it does again at the target.
-
-The most that a needle's pose may err in any configuration that puts its tip on the target.
-
-No configuration is asked: every column of the arm's error Jacobian is bounded by its lever, and a lever's length by the
-chain between the tip and the joint. For matrices |A + B| <= |A| + |B| and |[A B]|^2 <= |A|^2 + |B|^2 (largest singular
-values), so that for every q
-
-    sqrt(lmax Sigma_dd) <= deviation_mm,   sqrt(lmax Sigma_phiphi) <= deviation_rad.
-
-A distance whose gradient is g = (n; s u x n), |n| = |u| = 1, then deviates by deviation_mm + s deviation_rad at most.
-
-A point of the axis at depth s is displaced by no more than |d| + s |phi|, phi across the axis, and a surface by e. With
-(d, phi, e) whitened to w of 6 dimensions, Cauchy and Schwarz give for all s at once
-
-    |d| + s |phi| + |e| <= |w| hypot(deviation_mm + s deviation_rad, surface_mm),
-
-and |w|^2 is chi-squared (6 times Fisher's F where the residuals gave the noise's size). So a distance that is larger
-than the needle's radius by z times this, z^2 the quantile of 1 - P, is used up with a chance of P at most, whatever the
-surface's shape.
+`AnyPose` bounds the error in all configurations that put the tip on the target.
 """
 
 from __future__ import annotations
@@ -48,9 +30,9 @@ from puncture_twin.planning.uncertainty.sources import reading_parts
 
 
 def not_cancelled(fit: FitUncertainty, J: Floats, target_base: Floats) -> Floats:
-    """G = J_f - X L J: the arm's error Jacobian, the part that the registration takes off taken off.
+    """G = J_f - X L J: the arm's error Jacobian without the part that the registration cancels.
 
-    Where nobody says how the arm touched the markers, sqrt(2) J_f stands for it: errors of equal size at the markers
+    Where it is not stated how the arm touched the markers, sqrt(2) J_f replaces it: errors of equal size at the markers
     and at the target, independent.
 
     Args:
@@ -62,7 +44,7 @@ def not_cancelled(fit: FitUncertainty, J: Floats, target_base: Floats) -> Floats
         Shape (n, 6, 28).
     """
     if not fit.noise.touches_known:
-        return np.asarray(np.sqrt(2.0) * J)
+        return np.asarray(np.sqrt(2.0) * J)  # as if the markers' errors were new ones of the same size
     return np.asarray(J - fit.map_at(target_base) @ fit.noise.arm_jacobian)
 
 
@@ -75,7 +57,7 @@ class Bend(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """Answers how far the needle may be off, for any configuration that puts its tip on the target.
+    """The needle's pose error in any configuration that puts its tip on the target.
 
     Attributes:
         model: The arm.
@@ -83,7 +65,7 @@ class PoseError:
         target_base: Shape (3,), mm.
         errors: As declared.
         fit: What the registration makes of them; its test's scale multiplies every covariance but that of the bend.
-        bend: Of one direction's needle; None where it is straight, or what is asked is not of one direction.
+        bend: Of one direction's needle; None where it is straight, or where it is not of one direction.
     """
 
     model: UrModel
@@ -104,17 +86,17 @@ class PoseError:
         J, arm = error_jacobian(self.model, q, self.tip_mm), self.errors.arm
         lasting = not_cancelled(self.fit, J, self.target_base) * np.sqrt(self.fit.noise.eta_variances)
         anew = J[..., PARAMETERS["joint"]] * np.hypot(arm.drift, arm.repeatability)
-        root = self.fit.test.scale * np.concatenate([lasting, anew], axis=-1)
+        root = self.fit.test.scale * np.concatenate([lasting, anew], axis=-1)  # root @ root' is the arm's part
         straight = readings + root @ np.swapaxes(root, -1, -2)
         return straight if self.bend is None else straight + _bend_covariance(self.model, q, self.bend)
 
     def tip_covariance(self, q: Floats) -> Floats:
-        """Of the tip against the point that was meant, its reading included: shape (n, 3, 3), mm^2, base axes."""
+        """Covariance of the tip about the intended point, its reading included: (n, 3, 3), mm^2, base axes."""
         return self.covariance(q)[:, :3, :3] + self.target_covariance
 
     def covariance_ct(self, q: Floats) -> Floats:
         """Sigma6 in CT axes, shape (n, 6, 6)."""
-        turn = np.kron(np.eye(2), self.fit.R_base_ct)
+        turn = np.kron(np.eye(2), self.fit.R_base_ct)  # rotates shift and rotation alike
         return np.asarray(turn.T @ self.covariance(q) @ turn)
 
     def tip_covariance_ct(self, q: Floats) -> Floats:
@@ -123,12 +105,12 @@ class PoseError:
         return np.asarray(R.T @ self.tip_covariance(q) @ R)
 
     def surface_cov_ct(self, voxel_ct: Floats | None) -> Floats:
-        """`ErrorModel.surface_cov_ct`, scaled as all that is declared."""
+        """`ErrorModel.surface_cov_ct`, scaled like everything that is declared."""
         return np.asarray(self.fit.test.scale**2 * self.errors.surface_cov_ct(voxel_ct))
 
     @property
     def target_covariance_ct(self) -> Floats:
-        """Of the target's reading, shape (3, 3), mm^2, CT axes, scaled."""
+        """Covariance of the target's reading, shape (3, 3), mm^2, CT axes, scaled."""
         return np.asarray(self.fit.test.scale**2 * self.errors.target_cov_ct)
 
     @property
@@ -145,7 +127,7 @@ class PoseError:
         return parts if self.bend is None else {**parts, "bend": _bend_covariance(self.model, q, self.bend)}
 
     def _reading_parts(self, count: int) -> dict[str, Floats]:
-        """Of the markers: in the CT, at the touch, and by the arm's repeatability there; the same for all rows."""
+        """Parts of the markers: CT reading, touch, and the arm's repeatability there; the same for all rows."""
         at, noise = self.fit.map_at(self.target_base), self.fit.noise
         marks = at.reshape(6, -1, 3)
         R, touch = self.fit.R_base_ct, self.errors.touch_mm**2 * np.eye(3)
@@ -161,7 +143,7 @@ class PoseError:
         return {source: np.broadcast_to(cov, (count, 6, 6)) for source, cov in covs.items()}
 
     def _arm_parts(self, J: Floats) -> dict[str, Floats]:
-        """Of the arm's parameters, of its drift since the touches, and of one arrival at the target."""
+        """Parts of the arm's parameters, of its drift since the touches, and of one arrival at the target."""
         G, eta = not_cancelled(self.fit, J, self.target_base), self.fit.noise.eta_variances
         found = {source: _outer(G[..., part], eta[part]) for source, part in PARAMETERS.items()}
         Jq, arm = J[..., PARAMETERS["joint"]], self.errors.arm
@@ -171,12 +153,12 @@ class PoseError:
 
 
 def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
-    """Of a tip off by d to a side drawn evenly, the shaft rotated about its clamp, shape (n, 6, 6), base axes.
+    """Covariance of a tip off by d to a uniform side, the shaft rotated about its clamp, (n, 6, 6), base axes.
 
     For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h, and
     by d y with the shaft about -x; each with half the variance.
     """
-    R = flange_pose(model, q)[..., :3, :3]
+    R = flange_pose(model, q)[..., :3, :3]  # the needle lies along the flange's z
     x, y, turn = R[..., 0], R[..., 1], 1 / bend.clamped_mm
     sides = np.stack([np.concatenate([x, turn * y], axis=-1), np.concatenate([y, -turn * x], axis=-1)], axis=-1)
     return np.asarray(bend.tip_mm**2 / 2 * sides @ np.swapaxes(sides, -1, -2))
@@ -202,7 +184,7 @@ def pose_error(case: Case, registration: Registration | None) -> PoseError | Non
 
 @dataclass(frozen=True, eq=False)
 class ErrorBudget:
-    """Where the tip's expected error comes from.
+    """The tip's expected error and the fraction of each source.
 
     Attributes:
         rms_mm: Tip to the point that was meant, rms.
@@ -220,7 +202,7 @@ class ErrorBudget:
 
 
 def expected_error_mm(error: PoseError, q: Floats) -> float:
-    """The tip's expected (rms) error against the point that was meant, of one configuration (6,), rad."""
+    """The tip's expected (rms) error about the intended point at one configuration (6,), rad; mm."""
     return float(np.sqrt(np.trace(error.tip_covariance(q[None])[0])))
 
 
@@ -233,13 +215,13 @@ def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudg
         outward_base: Shape (3,), unit, from the target along the needle.
     """
     parts = {source: float(np.trace(cov[0, :3, :3])) for source, cov in error.parts(q[None]).items()}
-    parts["repeatability"] += parts.pop("arrival")
+    parts["repeatability"] += parts.pop("arrival")  # one key states both
     parts["target"] = float(np.trace(error.target_covariance))
     whole = error.tip_covariance(q[None])[0]
     variance, along = float(np.trace(whole)), float(outward_base @ whole @ outward_base)
     return ErrorBudget(
         rms_mm=float(np.sqrt(variance)),
-        lateral_mm=float(np.sqrt(max(variance - along, 0.0))),
+        lateral_mm=float(np.sqrt(max(variance - along, 0.0))),  # rounding may leave less than 0
         depth_mm=float(np.sqrt(along)),
         half_axes_mm=error.fit.test.region_factor * np.sqrt(np.linalg.eigvalsh(whole)[::-1]),
         fraction={source: part / variance if variance > 0 else 0.0 for source, part in parts.items()},
@@ -247,13 +229,29 @@ def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudg
 
 
 class AnyPose(NamedTuple):
-    """Bounds of a pose's error, whatever the configuration; see above."""
+    """Bounds of the needle's pose error over all configurations that put its tip on the target.
+
+    Every column of the arm's error Jacobian is bounded by its lever, and a lever's length by the chain between tip and
+    joint. For matrices |A + B| <= |A| + |B| and |[A B]|^2 <= |A|^2 + |B|^2 (largest singular values), so that for all q
+
+        sqrt(lmax Sigma_dd) <= deviation_mm,   sqrt(lmax Sigma_phiphi) <= deviation_rad.
+
+    A distance whose gradient is g = (n; s u x n), |n| = |u| = 1, deviates by deviation_mm + s deviation_rad at most.
+    A point of the axis at depth s is displaced by no more than |d| + s |phi|, phi across the axis, a surface by e. With
+    (d, phi, e) whitened to w of 6 dimensions, Cauchy and Schwarz give for all s at once
+
+        |d| + s |phi| + |e| <= |w| hypot(deviation_mm + s deviation_rad, surface_mm),
+
+    and |w|^2 is chi-squared (6 times Fisher's F where the residuals gave the noise's size). So a distance larger than
+    the needle's radius by z times this, z^2 the quantile of 1 - P, is used up with a chance of P at most, whatever the
+    surface's shape.
+    """
 
     deviation_mm: float
     deviation_rad: float
 
     def of_distance(self, depth_mm: Floats, surface_mm: Floats) -> Floats:
-        """Bound of the standard deviation of distances whose nearest axis points lie no deeper than this, (k,), mm."""
+        """Bound of the deviation of distances with nearest axis points no deeper than this, (k,), mm."""
         return np.hypot(self.deviation_mm + depth_mm * self.deviation_rad, surface_mm)
 
     def margin(
@@ -278,7 +276,7 @@ class AnyPose(NamedTuple):
             radius_mm: The needle's.
             surface_mm: Shape (k,), by which each structure's surface may lie off as a whole, at most.
         """
-        count = 5 + int((surface_mm > 0).any())
+        count = 5 + int((surface_mm > 0).any())  # normals: shift, lean across the axis, the surface's
         square = chdtri(count, chance) if freedom is None else count * fdtri(count, freedom, 1.0 - chance)
         z = np.sqrt(square)
         kept, deepest = 1.0 - z * self.deviation_rad, np.asarray(lengths_mm, dtype=np.float64)
@@ -308,16 +306,16 @@ def any_pose(error: PoseError) -> AnyPose:
             lasting = own + np.linalg.norm(at_touches * np.sqrt(variance), 2)
         else:
             lasting = np.sqrt(2.0) * own
-        largest = np.linalg.eigvalsh(readings[rows, rows])[-1]
+        largest = np.linalg.eigvalsh(readings[rows, rows])[-1]  # ascending: the last is the largest
         bounds.append(float(np.sqrt(largest + scale**2 * (lasting**2 + arrival**2))))
     return AnyPose(bounds[0], bounds[1])
 
 
 def _levers_mm(error: PoseError) -> Floats:
-    """Of each frame's origin, 0 to 6, from a tip on the target: the chain between them from either end, shape (7,)."""
+    """Bounds of distances of frame origins 0 to 6 from a tip on the target, shape (7,): the chain from either end."""
     model, target = error.model, error.target_base
-    links = np.hypot(model.a, model.d)
+    links = np.hypot(model.a, model.d)  # straight from one frame's origin to the next
     from_tip = error.tip_mm + np.append(np.cumsum(links[::-1])[::-1], 0.0)
     to_base, to_shoulder = np.linalg.norm(target), np.linalg.norm(target - model.shoulder_base)
     from_base = np.concatenate([[to_base], to_shoulder + np.concatenate([[0.0], np.cumsum(links[1:])])])
-    return np.asarray(np.minimum(from_tip, from_base))
+    return np.asarray(np.minimum(from_tip, from_base))  # each is a bound: the triangle inequality

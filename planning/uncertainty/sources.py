@@ -24,11 +24,11 @@ NOT_MODELLED: Mapping[str, tuple[str, str]] = MappingProxyType(
 """What no source stands for, which is something else than 0; and where the case declares it, what is done instead."""
 
 NAMED = 3
-"""Meshes that are named; of more their number is told."""
+"""Meshes that are named; of more their number is stated."""
 
 
 def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
-    """What the chances of a case leave out: what it does not declare, and what is declared but counted elsewhere.
+    """What the chances of a case leave out, in words: undeclared errors, and those counted elsewhere.
 
     Args:
         case: The case.
@@ -40,7 +40,7 @@ def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
 
 
 def _unknown_contours(case: Case) -> list[str]:
-    """Of meshes, of which nobody says how far they may lie off: those to avoid, and the one that is to be hit."""
+    """Text on the meshes without a declared surface error: those to avoid, and the target's."""
     if case.errors is None or case.errors.surface_mm is not None:
         return []
     hit = case.target_structure if case.hit_radius_mm is None else None
@@ -55,7 +55,7 @@ ISOTROPIC = 1e-9
 
 
 class Source(NamedTuple):
-    """What a source is called, the key of ``[errors]`` that states it, and that key's unit."""
+    """Name of a source, the key of ``[errors]`` that states it, and that key's unit."""
 
     text: str
     key: str
@@ -95,7 +95,7 @@ def reading_parts(cov_ct: Floats) -> dict[str, Floats]:
 
 
 def deviation(errors: ErrorModel, source: str) -> float:
-    """What is declared for a source, in the unit of its key."""
+    """Declared deviation of a source, in the unit of its key."""
     if source in ("ct_slice", "ct_in_plane", "markers_ct"):
         return float(np.sqrt(np.linalg.eigvalsh(reading_parts(errors.marker_cov_ct)[source])[2]))
     if source == "target":
@@ -106,5 +106,5 @@ def deviation(errors: ErrorModel, source: str) -> float:
 
 
 def _attribute(source: str) -> str:
-    """Where `ErrorModel` or its arm keeps a source."""
+    """Attribute of `ErrorModel` or its arm that stores a source."""
     return f"{source}_mm" if SOURCES[source].unit == "mm" else source

@@ -32,7 +32,7 @@ SWEEPS = 4
 
 
 class Candidates(NamedTuple):
-    """Joints that keep the tip on a point, each shape (n, 6), rad; the nearest to the insertion's first."""
+    """Joints (n, 6), rad, that keep the tip on a point; the nearest to the insertion's first."""
 
     alike: Floats
     """On the insertion's own branch."""
@@ -61,7 +61,7 @@ def choose_touches(error: PoseError, points_base: Floats, q_insertion: Floats) -
 
 
 def least_error(error: PoseError, candidates: Sequence[Floats], q_insertion: Floats, *, worst: bool = False) -> Floats:
-    """Of each marker's candidates one, shape (N, 6), rad, such that together they leave the least error at the target.
+    """One candidate of each marker, shape (N, 6), rad, that together leave the least error at the target.
 
     Marker by marker the candidate of the least trace(Sigma_dd) is taken, given the others, until nothing changes.
 

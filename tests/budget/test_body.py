@@ -24,7 +24,7 @@ from puncture_twin.planning.registration.marker_noise import reading_noise
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.run_twin import app
-from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
+from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
 ABDOMEN = ROOT / "meshes" / "abdomen"
 ROOMS = 8_000
@@ -79,7 +79,7 @@ def test_rooms_with_bevel_and_breath_err_as_predicted(chain, gate):
         chain.target_ct, outward_ct, chain.q_insertion, Path.bend,
     )  # fmt: skip
     rng = np.random.default_rng(11)
-    rooms = draw_rooms(puncture, chain.errors, ROOMS, rng).reached_alone()
+    rooms = draw_trials(puncture, chain.errors, ROOMS, rng).reached_alone()
     one = both.breath.breathing
     s = drawn_positions(one, len(rooms.tip_ct), rng)
     target = rooms.target_ct[: len(s)] + (s - one.scanned_at)[:, None] * one.amplitude_mm * one.direction_ct

@@ -21,7 +21,7 @@ from puncture_twin.planning.registration.marker_noise import reading_noise
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.uncertainty.sources import reading_parts
 from puncture_twin.run_twin import app
-from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
+from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
 BEDS = {"abdomen/case.toml": (0.0, 0.0, 1.0), "carton/case_m_setup2.toml": (1.0, 0.0, 0.0)}
 """Of each case, the direction across its slices."""
@@ -87,7 +87,7 @@ def test_rooms_drawn_with_one_source_err_as_it_costs(name, source):
         one.model, one.tip_mm, one.method, noise, one.points_ct, one.q_touch, one.T_base_ct, one.target_ct, outward_ct,
         one.q_insertion,
     )  # fmt: skip
-    rooms = draw_rooms(puncture, _alone(one.errors, source), 4000, np.random.default_rng(6)).reached_alone()
+    rooms = draw_trials(puncture, _alone(one.errors, source), 4000, np.random.default_rng(6)).reached_alone()
     realised = np.sqrt(np.mean(np.sum((rooms.tip_ct - rooms.target_ct) ** 2, axis=1)))
     predicted = {cost.source: cost.alone_mm for cost in source_costs(one)}[source]
     assert realised == pytest.approx(predicted, rel=0.03)

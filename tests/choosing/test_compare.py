@@ -122,8 +122,8 @@ def test_two_plans_by_what_they_state_and_with_their_case_by_what_holds(tmp_path
     assert main(["compare", *paths, "--case", str(case), "--json"]) == OK
     told = json.loads(capsys.readouterr().out)
     for side, plan in zip("ab", plans, strict=True):
-        doubt = context.doubt_at(plan.outward_ct, plan.insertion.q[-1])
-        assert told[side]["check"]["chances"]["p_hit"] == pytest.approx(doubt.p_hit, abs=1e-9)
+        breakdown = context.breakdown_at(plan.outward_ct, plan.insertion.q[-1])
+        assert told[side]["check"]["chances"]["p_hit"] == pytest.approx(breakdown.p_hit, abs=1e-9)
     case.write_text(case.read_text() + "\n# other\n")
     assert main(["compare", *paths, "--case", str(case)]) == BAD_INPUT
     capsys.readouterr()

@@ -20,7 +20,7 @@ from slicer_files import vtk_model
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
-from puncture_twin.planning.formats.meshes.mesh_files import kept_mesh_warnings, mesh_warnings, read_mesh
+from puncture_twin.planning.formats.meshes.mesh_files import cached_mesh_warnings, mesh_warnings, read_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
@@ -748,10 +748,10 @@ def test_what_is_kept_of_meshes_is_what_they_warn_of(tmp_path: Path, monkeypatch
         found.append(name)
         return mesh_warnings(mesh, name)
 
-    monkeypatch.setattr(sys.modules[kept_mesh_warnings.__module__], "mesh_warnings", counted)
-    assert kept_mesh_warnings(meshes, cache) == kept_mesh_warnings(meshes, cache) == expected
-    assert kept_mesh_warnings({"a": whole}, cache) == kept_mesh_warnings({"a": whole}, cache) == ()
-    assert kept_mesh_warnings({**meshes, "spleen": cut}, cache) != expected
+    monkeypatch.setattr(sys.modules[cached_mesh_warnings.__module__], "mesh_warnings", counted)
+    assert cached_mesh_warnings(meshes, cache) == cached_mesh_warnings(meshes, cache) == expected
+    assert cached_mesh_warnings({"a": whole}, cache) == cached_mesh_warnings({"a": whole}, cache) == ()
+    assert cached_mesh_warnings({**meshes, "spleen": cut}, cache) != expected
     assert found == ["liver", "spleen", "aorta", "a", "liver", "spleen", "aorta"]
 
 

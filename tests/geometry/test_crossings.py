@@ -8,9 +8,9 @@ from oracles import ray_crossings
 from puncture_twin.planning.case.entry import grid
 from puncture_twin.planning.geometry.containment import (
     Side,
+    contains,
     crossings,
     first_crossing,
-    holds,
     inside_each,
     settled_crossings,
     side_of,
@@ -141,8 +141,8 @@ def test_a_surface_holds_what_lies_inside_of_it(rng, ball):
     """The points whose side is inside, in the box of a closed surface and beyond; an open one holds none."""
     mesh, points = ball(50), rng.uniform(-70, 70, (200, 3))
     inside = [side_of(mesh, point) is Side.INSIDE for point in points]
-    assert [holds(mesh, point) for point in points] == inside and 20 < sum(inside) < 180
-    assert not any(holds(TriangleMesh(mesh.vertices, mesh.faces[1:]), point) for point in points)
+    assert [contains(mesh, point) for point in points] == inside and 20 < sum(inside) < 180
+    assert not any(contains(TriangleMesh(mesh.vertices, mesh.faces[1:]), point) for point in points)
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.5, 0.9])

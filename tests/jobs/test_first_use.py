@@ -6,7 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from puncture_twin.planning.reach.reach import ask_arm, small_workcell
+from puncture_twin.planning.reach.reach import check_small_workcell, small_workcell
 from puncture_twin.twin.jobs import first_use
 
 
@@ -51,7 +51,7 @@ def test_none_begins_where_all_is_compiled(begun, monkeypatch):
 
 def test_the_small_workcell_has_directions_of_both_kinds():
     """What is reached goes through every kernel of the arm; what is not, says why."""
-    answers = ask_arm(small_workcell())
+    answers = check_small_workcell(small_workcell())
     assert [answer.reachable for answer in answers] == [True, True, False, False]
     assert all(answer.detail for answer in answers if not answer.reachable)
     assert all(np.isfinite(answer.insertion_q).all() for answer in answers)
@@ -67,6 +67,6 @@ def test_what_tells_that_all_is_compiled_is_compiled_by_each_search(begun, monke
     queried = []
     monkeypatch.setattr("puncture_twin.planning.base.numba_kernels.is_compiled", lambda kernel: queried.append(kernel))
     with first_use.compiling_beside():
-        ask_arm(small_workcell())
+        check_small_workcell(small_workcell())
     (kernel,) = queried
     assert kernel.signatures

@@ -15,7 +15,7 @@ from benchmarks.beside.scene import Asked, judged
 from puncture_twin.meshes import folder
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.run_twin import main
-from puncture_twin.twin.plant.outside_objects import Beside
+from puncture_twin.twin.plant.outside_objects import OutsideObjects
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from tools.phantoms import __main__ as phantoms
 
@@ -29,12 +29,12 @@ def settings(seed, spacing, pixel, noise, fov=None):
 
 
 SCENES = {
-    "arms beside, flat table": Asked(301, Beside("beside", "flat"), settings(1, 4.0, 3.0, 20.0)),
-    "arms pressed, curved table": Asked(302, Beside("pressed", "curved"), settings(2, 5.0, 4.0, 30.0)),
-    "arms across, pad": Asked(14, Beside("across", "pad", 1), settings(3, 4.0, 3.0, 20.0)),
-    "arms across, no bed": Asked(17, Beside("across", "none"), settings(4, 5.0, 4.0, 15.0)),
-    "arms pressed, cut": Asked(303, Beside("pressed", "pad"), settings(5, 4.0, 4.0, 20.0, 420.0)),
-    "arms beside, cut": Asked(304, Beside("beside", "curved", 2), settings(6, 5.0, 3.0, 20.0, 360.0)),
+    "arms beside, flat table": Asked(301, OutsideObjects("beside", "flat"), settings(1, 4.0, 3.0, 20.0)),
+    "arms pressed, curved table": Asked(302, OutsideObjects("pressed", "curved"), settings(2, 5.0, 4.0, 30.0)),
+    "arms across, pad": Asked(14, OutsideObjects("across", "pad", 1), settings(3, 4.0, 3.0, 20.0)),
+    "arms across, no bed": Asked(17, OutsideObjects("across", "none"), settings(4, 5.0, 4.0, 15.0)),
+    "arms pressed, cut": Asked(303, OutsideObjects("pressed", "pad"), settings(5, 4.0, 4.0, 20.0, 420.0)),
+    "arms beside, cut": Asked(304, OutsideObjects("beside", "curved", 2), settings(6, 5.0, 3.0, 20.0, 360.0)),
 }
 
 

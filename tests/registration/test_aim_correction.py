@@ -22,7 +22,7 @@ from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import pose_error
-from puncture_twin.twin.rehearsal.rooms import draw_rooms
+from puncture_twin.twin.rehearsal.trials import draw_trials
 
 NOMINAL = {"arm": "nominal", "tip_offset_mm": 1.0, "needle_direction_deg": 0.5, "joint_drift_deg": 0.0}
 ABDOMEN = "abdomen/case.toml"
@@ -127,7 +127,7 @@ def test_other_insertions_are_told_what_the_correction_leaves_there():
         (aim, True),
         (None, False),
     ):  # rooms that are not corrected are told from those that are
-        rooms = draw_rooms(replace(w.puncture, aim=aim_of_rooms), w.errors, 8_000, np.random.default_rng(1))
+        rooms = draw_trials(replace(w.puncture, aim=aim_of_rooms), w.errors, 8_000, np.random.default_rng(1))
         off, cov = rooms.tip_ct - rooms.target_ct, error.tip_covariance_ct(w.puncture.q_insertion[None])[0]
         ratio = np.sqrt(np.mean(np.sum(off**2, axis=1)) / np.trace(cov))
         inside = np.mean(np.einsum("na,ab,nb->n", off, np.linalg.inv(cov), off) <= chdtri(3, 0.05))

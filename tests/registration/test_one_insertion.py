@@ -8,7 +8,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.conditioning import leverage
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.uncertainty.hit import hit_in_ball, radius_that_holds
+from puncture_twin.planning.uncertainty.hit import hit_in_ball, radius_for_chance
 
 
 @pytest.mark.parametrize("markers", [3, 4, 6, 8])
@@ -25,10 +25,10 @@ def test_the_radius_is_the_chance_the_other_way_round(freedom):
     """Whatever the shape of the error; none where nothing errs."""
     cov = np.diag([4.0, 0.3, 0.01])
     for chance in (0.5, 0.95):
-        assert hit_in_ball(cov[None], radius_that_holds(cov, chance, freedom), freedom)[0] == pytest.approx(
+        assert hit_in_ball(cov[None], radius_for_chance(cov, chance, freedom), freedom)[0] == pytest.approx(
             chance, abs=1e-3
         )
-    assert radius_that_holds(np.zeros((3, 3)), 0.95, freedom) == 0.0
+    assert radius_for_chance(np.zeros((3, 3)), 0.95, freedom) == 0.0
 
 
 def test_without_declared_errors_it_is_fitzpatricks_formula():

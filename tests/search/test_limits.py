@@ -14,7 +14,7 @@ from puncture_twin.planning.search import candidate_chances
 from puncture_twin.planning.search.candidate_chances import limited
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.windows import find_windows
-from puncture_twin.planning.uncertainty.chance_model import Chances, keeps_limits, refined_chances
+from puncture_twin.planning.uncertainty.chance_model import Chances, refined_chances, satisfies_limits
 from puncture_twin.planning.uncertainty.hit import proximity, touch_bound, touch_chance
 
 LIMITS = "min_hit = 0.999\nmax_touch = 0.0001"
@@ -80,7 +80,7 @@ def test_limits_are_kept_in_a_configuration_or_not_as_the_search_says(tmp_path, 
     case = replace(context.case, search=replace(context.case.search, **{limit: value}))
     said = limited(case, found).safe[rows]
     q = found.arm.q_insertion[rows]
-    kept = keeps_limits(replace(context.chance, case=case), found.outward_ct[rows], q)
+    kept = satisfies_limits(replace(context.chance, case=case), found.outward_ct[rows], q)
     assert said.any() and not said.all()
     np.testing.assert_array_equal(kept, said)
 
@@ -181,7 +181,7 @@ def test_what_is_shown_or_may_decide_is_line_sampled_and_the_rest_is_marked(tmp_
         np.testing.assert_array_equal(table[rows][done], of_lines[done])
         np.testing.assert_array_equal(table[rows][~done], of_first[~done])
     for row in shown:
-        said = context.explain(found.theta[row], found.beta[row]).doubt
+        said = context.explain(found.theta[row], found.beta[row]).breakdown
         assert said.p_touch["rib"] == pytest.approx(found.chances.touch[row, 0], abs=1e-9)
 
 

@@ -6,7 +6,7 @@ import pytest
 from puncture_twin.planning.arm.kinematics import FREE_D, N_PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation
-from puncture_twin.twin.plant.true_needle import driven_onto, true_needle
+from puncture_twin.twin.plant.true_needle import joints_at_points, true_needle
 
 STEP = 1e-5
 
@@ -55,5 +55,5 @@ def test_a_true_tip_is_driven_onto_its_point(rng):
     model, eta = ur_model("ur3"), rng.normal(0, 1, (50, 28)) * np.sqrt(np.r_[np.full(11, 0.25), np.full(17, 1e-6)])
     q = np.tile([0.3, -1.2, 1.4, -1.0, -1.5, 0.2], (50, 1)) + rng.normal(0, 0.1, (50, 6))
     points = true_needle(model, q, np.zeros((50, 28)), 210.0).tip_base
-    reached = true_needle(model, driven_onto(model, points, q, eta, 210.0), eta, 210.0).tip_base
+    reached = true_needle(model, joints_at_points(model, points, q, eta, 210.0), eta, 210.0).tip_base
     np.testing.assert_allclose(reached, points, atol=1e-3)

@@ -12,7 +12,7 @@ from puncture_twin.planning.registration.conditioning import leverage
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import error_budget
-from puncture_twin.twin.rehearsal.rooms import draw_rooms
+from puncture_twin.twin.rehearsal.trials import draw_trials
 
 ROOMS = 20_000
 
@@ -33,7 +33,7 @@ CASES = [
 def test_rooms_err_as_predicted(case, method, keys):
     """Realised over predicted .97 to 1.03, in the tip and in the direction; the 95 % ellipsoid holds 94 to 96 %."""
     w = world(case, method, declared(**keys))
-    rooms = draw_rooms(w.puncture, w.errors, ROOMS, np.random.default_rng(0))
+    rooms = draw_trials(w.puncture, w.errors, ROOMS, np.random.default_rng(0))
     assert rooms.reached.all()
     error, q = rooms.tip_ct - rooms.target_ct, w.puncture.q_insertion[None]
     cov = w.error.tip_covariance_ct(q)[0]
@@ -49,7 +49,7 @@ def test_rooms_err_as_predicted(case, method, keys):
 def test_a_declaration_that_is_wrong_by_two_is_seen():
     """The same comparison fails where the rooms err twice as much."""
     w = world("abdomen/case.toml", "rigid", declared())
-    rooms = draw_rooms(w.puncture, w.errors.scaled(2.0), ROOMS, np.random.default_rng(0))
+    rooms = draw_trials(w.puncture, w.errors.scaled(2.0), ROOMS, np.random.default_rng(0))
     error = rooms.tip_ct - rooms.target_ct
     cov = w.error.tip_covariance_ct(w.puncture.q_insertion[None])[0]
     assert np.mean(np.einsum("na,ab,nb->n", error, np.linalg.inv(cov), error) <= chdtri(3, 0.05)) < 0.6

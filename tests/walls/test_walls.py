@@ -17,7 +17,7 @@ from walls.house import NAME, ROOT, arrows, cycle, imported, is_package, modules
 from puncture_twin.planning.base.extras import MODULES
 
 PLANT_IN_GUIDANCE = {
-    "puncture_twin.twin.guidance.stereo.stereo_room",
+    "puncture_twin.twin.guidance.stereo.stereo_workcell",
 }
 """Modules of guidance that know the ground truth: stereo still draws its own room. It only shrinks."""
 
@@ -70,8 +70,8 @@ def test_guidance_never_sees_the_plant():
 def test_the_cameras_estimate_believes_what_is_declared_and_nothing_else():
     """It sees neither plant nor drawn room, and nobody takes a number from the module that draws it."""
     stereo = f"{NAME}.twin.guidance.stereo"
-    assert broken(f"{stereo}.joint", [f"{NAME}.twin.plant", f"{stereo}.stereo_room"]) == []
-    taken = {line.rpartition(".")[2] for line in broken(stereo, [f"{stereo}.stereo_room"])}
+    assert broken(f"{stereo}.joint", [f"{NAME}.twin.plant", f"{stereo}.stereo_workcell"]) == []
+    taken = {line.rpartition(".")[2] for line in broken(stereo, [f"{stereo}.stereo_workcell"])}
     assert {name for name in taken if name.isupper()} == set()
 
 

@@ -1,25 +1,12 @@
-"""What a rigid motion leaves of all points: per axis of the CT, against a declaration, and by one strain.
-
-With z the stacked residuals in CT axes, A the motion's design and C the declaration's covariance:
-
-    chi^2 = z' P z,   P = C^-1 - C^-1 A (A' C^-1 A)^-1 A' C^-1,   3 p - 6 degrees of freedom for p points,
-
-and a strain that moves the points by k b takes (b' M z)^2 / (b' M b) off the sum of squares, M = I - A (A' A)^-1 A'.
-
-Many experiments drawn from a declaration, and where the paper's own one stands among them.
-
-One number that the paper's own points show: a skew of the CT's y against z, found from markers, tried on lesions.
-
-What somebody declares of the experiment's errors, and carton and touches drawn from it; mm and rad.
-
-The pose of the carton does not matter: touches err alike in all directions, so that they are drawn in the CT's axes.
-
-Every error that Chen et al. 2019 print (Tables 3, 5, 6, 7), from touches of either setup; many at once.
-
-What Chen et al. 2019 measured: Tables 1, 2 and 4, mm.
+"""Chen et al. 2019 in numbers: the paper's measurements, its printed errors, and whether a declaration explains them.
 
 Chen G. et al., "Robot-Assisted Puncture Positioning Methods under CT Navigation", J. Xi'an Jiaotong Univ. 53(4),
-2019, DOI 10.7652/xjtuxb201904013.
+2019, DOI 10.7652/xjtuxb201904013: Tables 1, 2 and 4 as measured (mm), errors of Tables 3, 5, 6, 7 computed from touches
+of either setup, many at once.
+
+`run_draws` draws many experiments from a declaration and ranks the paper's own one among them. Touches err alike in all
+directions, so that the carton's pose does not matter and they are drawn in the CT's axes. `find_skew` tests the one
+number that the paper's own points show: a skew of the CT's y against z, found from markers, tried on lesions.
 """
 
 from __future__ import annotations
@@ -79,20 +66,20 @@ TABLE_4: Mapping[str, Point] = MappingProxyType(
 
 
 NAMES = tuple(TABLE_1)
-"""Of all points, in the order of the rows below."""
+"""Names of all points, in the order of the rows below."""
 
 READ: Floats = np.array(list(TABLE_1.values()), dtype=np.float64)
 """Table 1, shape (8, 3): what was read in the CT."""
 READ.setflags(write=False)
 
 SETUPS: tuple[Mapping[str, Point], ...] = (TABLE_2, TABLE_4)
-"""What was touched in either setup."""
+"""Points that were touched in either setup."""
 
 TRIADS = ((0, "ABC", "L"), (0, "ABC", "M"), (0, "ABC", "H"), (1, "ABC", "M"), (1, "ABE", "M"), (1, "ACD", "M"))
 """Setup, markers and lesion of Tables 3 and 5."""
 
 AFFINE = ((1, "ABCE", "M"), (1, "ABCDE", "M"))
-"""Of Table 6, where least squares of twelve parameters are meant."""
+"""Numbers of Table 6, where least squares of twelve parameters are meant."""
 
 
 def rows_of(names: str) -> list[int]:
@@ -101,7 +88,7 @@ def rows_of(names: str) -> list[int]:
 
 
 def measured() -> tuple[Floats, ...]:
-    """What the paper touched in each setup, shape (1, 8, 3), mm, base frame; NaN where a point was not touched."""
+    """Touches of the paper in each setup, shape (1, 8, 3), mm, base frame; NaN where a point was not touched."""
     return tuple(
         np.array([[touched.get(name, (np.nan, np.nan, np.nan)) for name in NAMES]], dtype=np.float64)
         for touched in SETUPS
@@ -153,13 +140,13 @@ STRAINS: Mapping[str, tuple[int, int]] = MappingProxyType(
 
 
 def rigid_residuals(touched: tuple[Floats, ...]) -> tuple[Floats, ...]:
-    """Of each setup: touched minus fitted by all its points, CT axes, shape (n, p, 3), from touches (n, 8, 3), mm."""
+    """Residuals of each setup: touched minus fitted by its points, CT axes, (n, p, 3), from touches (n, 8, 3), mm."""
     found = []
     for names, points in zip(POINTS, touched, strict=True):
         rows = rows_of(names)
         T = fit_rigid(np.broadcast_to(READ[rows], (len(points), len(rows), 3)), points[:, rows])
         fitted = READ[rows] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-        found.append((points[:, rows] - fitted) @ T[:, :3, :3])
+        found.append((points[:, rows] - fitted) @ T[:, :3, :3])  # R^T r: into CT axes
     return tuple(found)
 
 
@@ -169,7 +156,12 @@ def axis_squares(residuals: tuple[Floats, ...]) -> Floats:
 
 
 def chi_squared(residuals: tuple[Floats, ...], declaration: Declaration) -> Floats:
-    """Of both setups against a declaration, shape (n,); `FREEDOM` degrees. Both touch one carton: C is not diagonal."""
+    """Chi-squared of both setups against a declaration, (n,); `FREEDOM` degrees. One carton: C is not diagonal.
+
+    With z the stacked residuals in CT axes, A the motion's design and C the declaration's covariance:
+
+        chi^2 = z' P z,   P = C^-1 - C^-1 A (A' C^-1 A)^-1 A' C^-1,   3 p - 6 degrees of freedom for p points.
+    """
     rows = np.array([row for names in POINTS for row in rows_of(names)])
     axes = (3 * rows[:, None] + np.arange(3)).ravel()
     cov = declaration.carton_covariance(READ)[np.ix_(axes, axes)] + declaration.touch_mm**2 * np.eye(len(axes))
@@ -185,7 +177,10 @@ def _design(names: str) -> Floats:
 
 
 def strain_gains(residuals: tuple[Floats, ...]) -> dict[str, Floats]:
-    """Fraction of both setups' sum of squares that each strain alone takes away, shape (n,) each."""
+    """Fraction of both setups' sum of squares that each strain alone takes away, shape (n,) each.
+
+    A strain that moves the points by k b takes (b' M z)^2 / (b' M b) off the sum of squares, M = I - A (A' A)^-1 A'.
+    """
     whole = axis_squares(residuals).sum(axis=1)
     gains = {}
     for name, (moved, along) in STRAINS.items():
@@ -196,7 +191,7 @@ def strain_gains(residuals: tuple[Floats, ...]) -> dict[str, Floats]:
             b = np.zeros(points.shape)
             b[:, moved] = points[:, along]
             A = design(points, np.zeros(3))
-            left = b.ravel() - A @ np.linalg.lstsq(A, b.ravel(), rcond=None)[0]
+            left = b.ravel() - A @ np.linalg.lstsq(A, b.ravel(), rcond=None)[0]  # M b
             dot, norm = dot + one.reshape(len(one), -1) @ left, norm + float(left @ left)
         gains[name] = dot**2 / norm / whole
     return gains
@@ -211,8 +206,8 @@ JOINT = (2.5, 97.5)
 
 
 @dataclass(frozen=True)
-class Standing:
-    """A number of the paper among as many draws of it.
+class DrawnRank:
+    """Percentile of a number of the paper among draws of it.
 
     Attributes:
         name: Of the number.
@@ -231,7 +226,7 @@ class Standing:
     high: float
 
     def within(self, bounds: tuple[float, float]) -> bool:
-        """Whether it is as usual as that."""
+        """Whether the percentile lies within bounds."""
         return bool(bounds[0] <= self.percentile <= bounds[1])
 
 
@@ -250,8 +245,8 @@ class Experiment:
 
     declaration: Declaration
     draws: int
-    printed: tuple[Standing, ...]
-    joint: tuple[Standing, ...]
+    printed: tuple[DrawnRank, ...]
+    joint: tuple[DrawnRank, ...]
     probability: float
     best_strain: float
 
@@ -275,8 +270,8 @@ def run_draws(declaration: Declaration, draws: int, rng: np.random.Generator) ->
     return Experiment(
         declaration,
         draws,
-        _standings(printed_errors(measured()), printed_errors(touched)),
-        _standings(_joint(paper, declaration), _joint(drawn, declaration)),
+        _ranks(printed_errors(measured()), printed_errors(touched)),
+        _ranks(_joint(paper, declaration), _joint(drawn, declaration)),
         float(chdtrc(FREEDOM, chi)),
         float(np.mean(_best(drawn) >= _best(paper)[0])),
     )
@@ -297,12 +292,12 @@ def _best(residuals: tuple[Floats, ...]) -> Floats:
     return np.asarray(np.max(list(strain_gains(residuals).values()), axis=0))
 
 
-def _standings(paper: Mapping[str, Floats], drawn: Mapping[str, Floats]) -> tuple[Standing, ...]:
+def _ranks(paper: Mapping[str, Floats], drawn: Mapping[str, Floats]) -> tuple[DrawnRank, ...]:
     rows = []
     for name, values in drawn.items():
         low, median, high = np.percentile(values, (5, 50, 95))
         at = float(paper[name][0])
-        rows.append(Standing(name, at, 100.0 * float(np.mean(values < at)), float(low), float(median), float(high)))
+        rows.append(DrawnRank(name, at, 100.0 * float(np.mean(values < at)), float(low), float(median), float(high)))
     return tuple(rows)
 
 
@@ -315,7 +310,7 @@ WIDEST = 0.3
 
 @dataclass(frozen=True)
 class LesionErrors:
-    """What the paper's triads miss a lesion by, mm.
+    """Errors of the paper's triads at a lesion, mm.
 
     Attributes:
         name: Lesion, markers and setup.
@@ -330,7 +325,7 @@ class LesionErrors:
 
 @dataclass(frozen=True)
 class SkewFinding:
-    """The skew, and what it does.
+    """The skew, and its effect on lesions.
 
     Attributes:
         angle: rad, of y against z.
@@ -391,7 +386,7 @@ PLANES = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True)
 class Declaration:
-    """Errors of one experiment.
+    """Declared errors of one experiment.
 
     Attributes:
         name: What it is called in a table.
@@ -410,7 +405,7 @@ class Declaration:
     touch_mm: float = 0.0
 
     def draw_carton(self, read: Floats, count: int, rng: np.random.Generator) -> Floats:
-        """Where points (p, 3) that were read truly are, shape (count, p, 3)."""
+        """Draw true points (count, p, 3) of points (p, 3) that were read."""
         cells = rng.uniform(-0.5, 0.5, (count, *read.shape)) * self._cell()
         found = read + cells + rng.normal(0.0, 1.0, (count, *read.shape)) * self.reading_mm
         for first, second in PLANES:
@@ -423,7 +418,7 @@ class Declaration:
         return np.asarray(true + rng.normal(0.0, 1.0, true.shape) * self.touch_mm)
 
     def carton_covariance(self, read: Floats) -> Floats:
-        """Of true points against their readings (p, 3), shape (3 p, 3 p), mm^2; skews to first order."""
+        """Covariance of true points about their readings (p, 3), shape (3 p, 3 p), mm^2; skews to first order."""
         cov = np.diag(np.tile(self._cell() ** 2 / 12 + self.reading_mm**2, len(read)))
         for first, second in PLANES:
             moved = np.zeros(read.shape)

@@ -51,11 +51,11 @@ def use_once() -> None:
     import numpy as np
 
     from puncture_twin.planning.motion.approach import plan_approach
-    from puncture_twin.planning.reach.reach import ask_arm, small_workcell
+    from puncture_twin.planning.reach.reach import check_small_workcell, small_workcell
 
     gc.set_threshold(LATER_EVERY)
     checker = small_workcell()
-    reached = [answer for answer in ask_arm(checker) if answer.reachable]
+    reached = [answer for answer in check_small_workcell(checker) if answer.reachable]
     _err_once()
     plan_approach(checker, np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0]), reached[0].insertion_q[0], seed=0)
     draw_once()
@@ -70,14 +70,14 @@ def _err_once() -> None:
     from puncture_twin.planning.clearance.kernels.blocks import pack
     from puncture_twin.planning.reach.reach import TARGET, octahedron
     from puncture_twin.planning.uncertainty.hit import hit_in_mesh, target_rays
-    from puncture_twin.planning.uncertainty.lines import line_chance, needle_doubt
+    from puncture_twin.planning.uncertainty.lines import line_chance, needle_uncertainty
 
     target, up, cov = read_only(TARGET), np.array([0.0, 0.0, 1.0]), np.diag([1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4])
     hit_in_mesh(target_rays(octahedron(target, 5.0), target), cov[None, :3, :3])
-    doubt, length, threshold = needle_doubt(target, up, cov, 0.5), 100.0, 1.0
+    uncertainty, length, threshold = needle_uncertainty(target, up, cov, 0.5), 100.0, 1.0
     beside = pack(octahedron(target + [23.0, 0.0, 40.0], 20.0))
-    near = near_faces(beside, target, up, length, doubt.reach(length, threshold))
-    line_chance(near, doubt, length, threshold, np.array([-1.0, 0.0, 0.0, 0.0, -40.0, 0.0]))
+    near = near_faces(beside, target, up, length, uncertainty.reach(length, threshold))
+    line_chance(near, uncertainty, length, threshold, np.array([-1.0, 0.0, 0.0, 0.0, -40.0, 0.0]))
 
 
 def draw_once() -> None:

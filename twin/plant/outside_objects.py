@@ -1,12 +1,8 @@
-"""What lies beside a patient in a scanner, as asked for; lines and cables on and before the skin.
+"""Objects outside of a patient in a scanner: arms along or upon the trunk, what they lie on, and lines and cables.
 
-Arms beside or upon a trunk, with hands and bones: drawn anew by every generator, sizes of adults.
-
-What a patient lies on: a flat table with a mattress, a curved table, or a pad as dense as the body.
-
-Closed surfaces along a line: limbs, bones and lines with round ends, and what has one section along the bed.
-
-Where a skin is, seen from beside it: sections across the bed, and how far the body reaches in them.
+Arms have hands and bones, drawn anew by every generator, sizes of adults. A patient lies on a flat table with a
+mattress, a curved table, or a pad as dense as the body. Limbs, bones and lines are closed surfaces along a line
+(`tube`), tables have one section along the bed (`loft`). `Outline` gives the skin's sections across the bed.
 """
 
 from __future__ import annotations
@@ -21,11 +17,11 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 SHEATH_HU, WATER_HU, CORE_HU = 100.0, 0.0, 3000.0
-"""Of plastic, of what flows in it, and of thin wires of copper with the plastic between; ours."""
+"""Hounsfield units of plastic, of what flows in it, and of thin wires of copper with the plastic between; ours."""
 
 
-class Beside(NamedTuple):
-    """What shall lie beside the patient.
+class OutsideObjects(NamedTuple):
+    """Choice of objects outside of the patient.
 
     Attributes:
         arms: Where both arms lie; ``none``: over the head, outside of the image.
@@ -38,8 +34,10 @@ class Beside(NamedTuple):
     lines: int = 0
 
 
-def lay_beside(skin: TriangleMesh, at_mm: float, wanted: Beside, rng: np.random.Generator) -> tuple[Part, ...]:
-    """Draw it about a skin: the bed first, then arms, then lines.
+def place_outside_objects(
+    skin: TriangleMesh, at_mm: float, wanted: OutsideObjects, rng: np.random.Generator
+) -> tuple[Part, ...]:
+    """Objects about a skin: the bed first, then arms, then lines.
 
     Args:
         skin: In the scanner's frame, LPS mm: y to the back, z to the head.
@@ -88,7 +86,7 @@ SIDES = (("left", 1.0), ("right", -1.0))
 
 
 def arms(outline: Outline, kind: Arms, at_mm: float, rng: np.random.Generator) -> Iterator[Part]:
-    """Both arms: flesh with skin, and bones.
+    """Both arms of a patient: flesh with skin, and bones.
 
     Args:
         outline: Of the trunk.
@@ -110,7 +108,7 @@ def arms(outline: Outline, kind: Arms, at_mm: float, rng: np.random.Generator) -
 
 
 class _Line(NamedTuple):
-    """Of an arm: joints (4, 3), a finer line (n, 3) through them with how far along each is, and the hand's back."""
+    """Line of an arm: joints (4, 3), a finer line (n, 3) with how far along each point is, and the hand's back."""
 
     joints: Floats
     points: Floats
@@ -121,7 +119,7 @@ class _Line(NamedTuple):
 def _beside(
     outline: Outline, side: float, at_mm: float, radii: Floats, pressed: bool, rng: np.random.Generator
 ) -> _Line:
-    """Along the bed; straight with a gap, or following the flank where it is pressed against it."""
+    """An arm along the bed: straight with a gap, or following the flank where it is pressed against it."""
     elbow = at_mm + rng.uniform(-150.0, 200.0)
     z = np.arange(elbow + UPPER_MM, elbow - FORE_MM - HAND_MM - 1e-9, -STEP_MM)
     along = elbow + UPPER_MM - z
@@ -140,7 +138,7 @@ def _beside(
 
 
 def _across(outline: Outline, side: float, at_mm: float, radii: Floats, rng: np.random.Generator) -> _Line:
-    """The upper arm beside the trunk, the forearm straight over flank and belly, the hand upon it."""
+    """An arm across the body: upper arm along the trunk, forearm over flank and belly, the hand upon it."""
     sink = rng.uniform(0.05, 0.6)
     turn = np.radians([rng.uniform(-10.0, 30.0), rng.uniform(60.0, 110.0)])
     height = at_mm + rng.uniform([-40.0, -60.0], [110.0, 60.0])
@@ -173,7 +171,7 @@ def _on(outline: Outline, z: float, spoke: Floats, off_mm: float) -> Floats:
 
 
 def _lack(outline: Outline, point: Floats, off_mm: float) -> float:
-    """By how much a point is nearer to the skin, along its own spoke, than wanted."""
+    """How much nearer to the skin than wanted a point is, along its own spoke, mm."""
     away = point[:2] - outline.middle(point[2])
     radius = float(np.linalg.norm(away))
     return outline.reach(float(point[2]), away / radius) + off_mm - radius
@@ -237,7 +235,7 @@ Ends = tuple[float, float]
 BEYOND_MM = 400.0
 """So far a bed goes on beyond the skin at head and feet."""
 SHELL_HU, FOAM_HU, COVER_HU, MATTRESS_HU, PAD_HU = 60.0, -930.0, -120.0, -960.0, 20.0
-"""Of a table's shell and core, a mattress's cover and foam, and a pad of gel; ours."""
+"""Hounsfield units of a table's shell and core, a mattress's cover and foam, and a pad of gel; ours."""
 COVER_MM, CURVED_MM = 2.0, 30.0
 """How thick a mattress's cover and a curved table are; ours."""
 
@@ -290,11 +288,11 @@ def _curved(at: tuple[float, float], radius: float, half: float, shell: float, e
 TUBE_SIDES = 24
 """Corners of a round section: at a radius of 50 mm the sides lie within 0.5 mm of the circle."""
 END_RINGS = 4
-"""Of a round end."""
+"""Rings of a round end."""
 
 
 class Part(NamedTuple):
-    """One body beside a patient; a later one fills the place of an earlier one.
+    """One body outside of a patient; a later one fills the place of an earlier one.
 
     Attributes:
         name: What it is.
@@ -336,7 +334,7 @@ def tube(points: Floats, radii: Floats, wide: Floats | None = None) -> TriangleM
 
 
 def drawn(section: Floats, low_mm: float, high_mm: float) -> TriangleMesh:
-    """A section along the bed.
+    """A section extruded along the bed.
 
     Args:
         section: Shape (n, 2), the corners in x and y around it, mm: two rows that face each other, so that
@@ -378,7 +376,7 @@ def _sides(count: int, around: int) -> np.ndarray:
 
 def _outward(vertices: Floats, faces: np.ndarray) -> TriangleMesh:
     a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
-    inward = float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0
+    inward = float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0  # six times the signed volume
     return TriangleMesh(vertices, np.asarray(faces[:, ::-1] if inward else faces, dtype=np.int32))
 
 
@@ -394,7 +392,7 @@ def _across_tube(along: Floats, wide: Floats | None) -> tuple[Floats, Floats]:
     first = np.array([0.3, 0.7, 0.65]) if wide is None else np.asarray(wide, dtype=float)
     one = np.empty_like(along)
     for k, tangent in enumerate(along):
-        first = first - (first @ tangent) * tangent
+        first = first - (first @ tangent) * tangent  # carried on without a twist
         first /= np.linalg.norm(first)
         one[k] = first
     return one, np.cross(along, one)
@@ -416,29 +414,29 @@ class Outline:
     skin: TriangleMesh
 
     def section(self, z: float) -> Floats:
-        """Where a plane across the bed cuts it: segments, shape (m, 2, 2), x and y, mm."""
+        """Section of the skin by a plane across the bed: segments (m, 2, 2), x and y, mm."""
         low, high = self.skin.bounds[:, 2]
         at = float(np.clip(z, min(low + END_MM, (low + high) / 2), max(high - END_MM, (low + high) / 2)))
         corners = self.skin.triangles
         above = corners[:, :, 2] > at
         cut = corners[above.any(axis=1) & ~above.all(axis=1)]
         above = cut[:, :, 2] > at
-        alone = np.argmax(above == (above.sum(axis=1) == 1)[:, None], axis=1)
+        alone = np.argmax(above == (above.sum(axis=1) == 1)[:, None], axis=1)  # the corner alone on its side
         rows = np.arange(len(cut))
         tip, first, second = (cut[rows, (alone + step) % 3] for step in range(3))
         return np.stack([_crossing(tip, first, at), _crossing(tip, second, at)], axis=1)
 
     def middle(self, z: float) -> Floats:
-        """Of the section's box, shape (2,), mm."""
+        """Middle of the section's box, shape (2,), mm."""
         points = self.section(z).reshape(-1, 2)
         return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
     def reach(self, z: float, direction: Floats) -> float:
-        """From the section's middle to its farthest point along a unit direction (2,), mm."""
+        """Distance from the section's middle to its farthest point along a unit direction (2,), mm."""
         segments = self.section(z) - self.middle(z)
         across = np.array([-direction[1], direction[0]])
         off, along = segments @ across, segments @ direction
-        crossed = (off[:, 0] > 0) != (off[:, 1] > 0)
+        crossed = (off[:, 0] > 0) != (off[:, 1] > 0)  # segments that the line through the middle crosses
         off, along = off[crossed], along[crossed]
         ahead = along[:, 0] - off[:, 0] * (along[:, 1] - along[:, 0]) / (off[:, 1] - off[:, 0])
         return float(ahead.max(initial=0.0))

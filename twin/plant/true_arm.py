@@ -1,6 +1,6 @@
-"""An arm as it really is: links and joints off their nominal values, play in the gears, a hand that trembles.
+"""The ground truth of an arm: links and joints off their nominal values, play in the gears, joints that miss.
 
-What planning believes is a :class:`planning.arm.ur.UrModel`; this is the truth beside it. A commanded configuration
+What planning believes is a :class:`planning.arm.ur.UrModel`. A commanded configuration
 becomes a true one in three steps: the gears stop at the edge of their play (:func:`settle`), the joints miss by their
 repeatability, and the true Denavit-Hartenberg numbers carry the flange somewhere near where the nominal ones say.
 """
@@ -17,18 +17,18 @@ from puncture_twin.planning.base.arrays import Floats
 
 
 class ArmErrors(NamedTuple):
-    """How far an arm of a kind is from its nominal model: standard deviations, normal, and the width of the play."""
+    """Deviations of an arm from its nominal model: standard deviations, normal, and the width of the play."""
 
     link_mm: float = 0.0
-    """Of every Denavit-Hartenberg length a_i and d_i."""
+    """Deviation of every Denavit-Hartenberg length a_i and d_i."""
     twist_rad: float = 0.0
-    """Of every twist alpha_i: axes that should be parallel or square and are not quite."""
+    """Deviation of every twist alpha_i: axes that should be parallel or square and are not quite."""
     joint_rad: float = 0.0
-    """Of every joint's zero."""
+    """Deviation of every joint's zero."""
     backlash_rad: float = 0.0
     """Full width of the play of every joint, not random."""
     repeatability_rad: float = 0.0
-    """Of every joint, drawn anew at each arrival."""
+    """Deviation of every joint, drawn anew at each arrival."""
 
 
 class TrueArm(NamedTuple):
@@ -52,7 +52,7 @@ class TrueArm(NamedTuple):
         return np.ascontiguousarray(self.link_poses(q_true)[..., 6, :, :])
 
     def settle(self, q_command: Floats, q_before: Floats, rng: np.random.Generator) -> Floats:
-        """Where the joints come to rest, shape (6,), rad.
+        """Joints at rest, shape (6,), rad.
 
         The play operator: a joint moves only when the motor has crossed the play, q = clip(q_before, q_command - b/2,
         q_command + b/2); then its repeatability adds a normal error, which the next arrival draws anew.
@@ -63,14 +63,14 @@ class TrueArm(NamedTuple):
             rng: For the repeatability.
         """
         half = 0.5 * self.backlash_rad
-        settled = np.clip(q_before, q_command - half, q_command + half)
+        settled = np.clip(q_before, q_command - half, q_command + half)  # the play operator
         return np.asarray(settled + rng.normal(0.0, self.repeatability_rad, 6))
 
 
 def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator) -> TrueArm:
     """An arm whose errors are drawn from their standard deviations.
 
-    The offset d2 along axis 2 is not drawn beside d3: the axes are parallel, and both move the arm alike.
+    The offset d2 along axis 2 is not drawn with d3: the axes are parallel, and both move the arm alike.
     """
     d_errors = rng.normal(0.0, errors.link_mm, 6)
     d_errors[1] = 0.0

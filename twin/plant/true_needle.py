@@ -1,18 +1,4 @@
-"""Where the needle truly is, for many arms at once, each with errors of its own.
-
-The tissue on a needle's way, as the arm feels it: it presses along the shaft, and to the side of the bevel.
-
-Along the shaft: capsules, cutting and friction over depth (`planning.needle.insertion_force`). A capsule pushes out
-whatever the tip does; friction and cutting work against the motion. At rest friction holds what it is pulled with:
-Dahl's solid friction, elastic up to a shift (Dahl 1968, "A solid friction model"), in place of a sign of the speed.
-
-Across it: the beam in its foundation says what its holder bears, a force and a moment (`planning.needle.beam`). The
-simulated needle is rigid, so both act on it as two forces, at the tip and where the shaft is held.
-
-How hard tissue pressed on a needle, as a person is told.
-
-What is true when markers are touched: where patient and markers are, and what is wrong with the arm.
-"""
+"""The ground truth of needles and touches: the place of each, for many erring arms at once, and the tissue's force."""
 
 from __future__ import annotations
 
@@ -33,7 +19,8 @@ from puncture_twin.twin.world.client import to_m, to_mm
 from puncture_twin.twin.world.control import Push, Tip
 
 NEWTON_STEPS = 4
-"""Of a tip moved onto a point: errors of an arm are millimetres, and each step squares what is left of them."""
+"""Newton steps of a tip moved onto a point: errors of an arm are millimetres, and each step squares what is left of
+them."""
 
 
 class TrueNeedle(NamedTuple):
@@ -48,7 +35,7 @@ def true_needle(model: UrModel, q_true: Floats, eta: Floats, tip_mm: float) -> T
 
     Args:
         model: The nominal arm.
-        q_true: Shape (..., 6), rad: what the joints truly are, but for the error of their zeros.
+        q_true: Shape (..., 6), rad: true joints, but for the error of their zeros.
         eta: Shape (..., 28), the errors in the order of `error_jacobian`'s columns, mm and rad.
         tip_mm: Flange to tip by the controller's number.
     """
@@ -67,7 +54,7 @@ def true_needle(model: UrModel, q_true: Floats, eta: Floats, tip_mm: float) -> T
     return TrueNeedle(T[..., :3, 3] + (R @ offset[..., None])[..., 0], R @ exp_rotation(lean))
 
 
-def driven_onto(model: UrModel, points_base: Floats, q_start: Floats, eta: Floats, tip_mm: float) -> Floats:
+def joints_at_points(model: UrModel, points_base: Floats, q_start: Floats, eta: Floats, tip_mm: float) -> Floats:
     """True joints that put each true tip on its point, shape (..., 6), rad, nearest to where they start.
 
     Args:
@@ -79,7 +66,7 @@ def driven_onto(model: UrModel, points_base: Floats, q_start: Floats, eta: Float
     """
     q = np.array(np.broadcast_to(q_start, (*points_base.shape[:-1], 6)))
     Jq = error_jacobian(model, q_start, tip_mm)[..., :3, PARAMETERS["joint"]]  # Newton's with the nominal arm's slope
-    back = np.linalg.pinv(Jq)
+    back = np.linalg.pinv(Jq)  # of the 6 joints the smallest change
     for _ in range(NEWTON_STEPS):
         missing = points_base - true_needle(model, q, eta, tip_mm).tip_base
         q += (back @ missing[..., None])[..., 0]
@@ -87,18 +74,26 @@ def driven_onto(model: UrModel, points_base: Floats, q_start: Floats, eta: Float
 
 
 SHIFT_MM = 0.1
-"""By which friction gives way elastically before it slides: the samples of the force are as far apart."""
+"""mm by which friction gives way elastically before it slides: the samples of the force are as far apart."""
 
 
 class StraightPath(NamedTuple):
-    """Along which a needle is pushed in: its entry (3,), mm, and its unit direction inward (3,), base frame."""
+    """The line of an insertion: its entry (3,), mm, and its unit direction inward (3,), base frame."""
 
     entry_base: Floats
     into_base: Floats
 
 
 class TrueTissue:
-    """Presses on a needle while it goes in; it keeps how deep the tip has been, and where friction holds it.
+    """Tissue that presses on a needle: keeps how deep the tip has been, and where friction holds it.
+
+    Along the shaft: capsules, cutting and friction over depth (`planning.needle.insertion_force`). A capsule pushes out
+    whatever the tip does; friction and cutting work against the motion. At rest friction resists the
+    pull on the needle: Dahl's solid friction, elastic up to a shift (Dahl 1968, "A solid friction model"), in place of
+    a sign of the speed.
+
+    Across it: the beam in its foundation (`planning.needle.deflection`) loads its holder with a force and a moment.
+    The simulated needle is rigid, so both act on it as two forces, at the tip and where the shaft is clamped.
 
     Args:
         insertion: What the needle passes, from the skin on.
@@ -110,26 +105,28 @@ class TrueTissue:
     def __init__(self, insertion: Insertion, path: StraightPath, side: float, shaft_mm: float) -> None:
         self._force, self._bent = insertion.force, insertion.path
         self._path, self._side, self._shaft_mm = path, np.array([np.cos(side), np.sin(side), 0.0]), shaft_mm
-        self._deepest, self._held, self._felt = 0.0, 0.0, Felt(0.0, 0.0)
+        self._deepest, self._held, self._greatest = 0.0, 0.0, TissueForce(0.0, 0.0)
 
     @property
-    def felt(self) -> Felt:
-        """The greatest so far."""
-        return self._felt
+    def greatest(self) -> TissueForce:
+        """The greatest force so far."""
+        return self._greatest
 
     def __call__(self, tip: Tip) -> tuple[Push, ...]:
-        """What presses on the needle now."""
+        """Forces of the tissue on the needle now."""
         R, at_m = tip.R_base_tip[0], tip.position_m[0]
         depth = float((to_mm(at_m) - self._path.entry_base) @ self._path.into_base)
         along = self._along(depth)
         at_tip, at_holder = self._across(depth)
-        self._felt = Felt(max(self._felt.along_n, along), max(self._felt.across_n, abs(at_tip + at_holder)))
+        self._greatest = TissueForce(
+            max(self._greatest.along_n, along), max(self._greatest.across_n, abs(at_tip + at_holder))
+        )
         holder_m = at_m - to_m(self._shaft_mm) * R[:, 2]
         side = R @ self._side
         return Push(at_tip * side - along * self._path.into_base, at_m), Push(at_holder * side, holder_m)
 
     def _along(self, depth: float) -> float:
-        """N, against the way in."""
+        """Force along the shaft, N, against the insertion."""
         if depth <= 0.0:
             self._held = 0.0
             return 0.0
@@ -143,7 +140,7 @@ class TrueTissue:
         return capsule + friction * stretch / SHIFT_MM + cutting * max(stretch, 0.0) / SHIFT_MM
 
     def _across(self, depth: float) -> tuple[float, float]:
-        """N, to the bevel's side, at the tip and at the holder: together the force and the moment of the beam."""
+        """Forces to the bevel's side at tip and holder, N: together the force and the moment of the beam."""
         force, moment = (
             float(np.interp(max(depth, 0.0), self._bent.depth_mm, term))
             for term in (self._bent.holder_n, self._bent.holder_n_mm)
@@ -152,7 +149,7 @@ class TrueTissue:
         return at_tip, force - at_tip
 
 
-class Felt(NamedTuple):
+class TissueForce(NamedTuple):
     """The greatest forces of one insertion, N: along the needle, and across it as its holder bears them."""
 
     along_n: float
@@ -166,17 +163,17 @@ class Felt(NamedTuple):
         return f"the tissue pushed with up to {self.along_n:.2f} N along the needle, {self.across_n:.2f} N across it"
 
 
-NOT_FELT = "no force of tissue: the case declares none ([tissue])"
-"""Of an insertion through tissue that nobody described."""
+NO_TISSUE_FORCE = "no force of tissue: the case declares none ([tissue])"
+"""Text for an insertion without declared tissue."""
 
 
 @dataclass(frozen=True, eq=False)
 class TouchTruth:
-    """One draw of the declared errors.
+    """Ground truth of touches, one draw of the declared errors: patient, markers, and the arm's errors.
 
     Attributes:
         seed: Of it.
-        T_base_ct: Shape (4, 4), mm: where the patient truly lies.
+        T_base_ct: Shape (4, 4), mm: true pose of the patient.
         eta: Shape (28,): what is wrong with the arm's parameters, mm and rad.
         aim_ct: Marker to shape (3,), mm: where the tip comes to on the marker, its touch noise included.
         arrival: Marker to shape (6,), rad: true joints minus what the encoders say there.
@@ -189,16 +186,16 @@ class TouchTruth:
     arrival: dict[str, Floats]
 
     def q_contact(self, model: UrModel, tip_mm: float, touch: Touch) -> Floats:
-        """What the encoders say, shape (6,), rad, when the true tip is on the marker, the needle as planned."""
+        """Encoder angles, shape (6,), rad, when the true tip is on the marker, the needle as planned."""
         there = apply(self.T_base_ct, self.aim_ct[touch.name])
-        q_true = driven_onto(model, there[None], touch.q_touch[None], self.eta[None], tip_mm)[0]
+        q_true = joints_at_points(model, there[None], touch.q_touch[None], self.eta[None], tip_mm)[0]
         return np.asarray(q_true - self.arrival[touch.name])
 
 
 def draw_touch_truth(
     T_base_ct: Floats, names: tuple[str, ...], points_ct: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw where everything truly is.
+    """Draw the true patient, markers and arm of touches.
 
     Args:
         T_base_ct: Shape (4, 4), mm: where the patient lies.
@@ -219,7 +216,7 @@ def draw_touch_truth(
 def draw_pivot_truth(
     T_base_ct: Floats, names: tuple[str, ...], place_base: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw what is wrong with an arm that sets its tip onto one place n times; the patient lies as believed.
+    """Draw the errors of an arm that sets its tip onto one place n times; the patient lies as believed.
 
     Args:
         T_base_ct: Shape (4, 4), mm.
@@ -237,14 +234,14 @@ def draw_pivot_truth(
 
 
 class AtTarget(NamedTuple):
-    """What is true when the needle arrives: joints minus encoders, (6,), rad; and where the target is, (3,), mm."""
+    """Truth at the needle's arrival: joints minus encoders, (6,), rad; and the target, (3,), mm."""
 
     arrival: Floats
     target_ct: Floats
 
 
 def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget:
-    """The joints drifted since the touches and arrive with their own error; the target was read with one.
+    """Draw the arrival: joints drifted since the touches with an error of their own; the target's reading error.
 
     Args:
         target_ct: Shape (3,), mm, as read.
@@ -258,6 +255,6 @@ def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget
 
 
 def nominal_tip(model: UrModel, tip_mm: float, q: Floats) -> Floats:
-    """Where the controller says that the tip is, shape (3,), mm, at encoders (6,), rad."""
+    """The tip by the controller, shape (3,), mm, at encoders (6,), rad."""
     T = flange_pose(model, q)
     return np.asarray(T[:3, 3] + tip_mm * T[:3, 2])

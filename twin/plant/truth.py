@@ -1,4 +1,4 @@
-"""What is really so, beside what the planner believes: where the patient lies and what the joints truly do."""
+"""The ground truth of a rehearsal: where the patient lies and what the joints do, drawn or from a file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Fit = Callable[[Floats, Floats], Floats]
 
 
 class MarkerNoise(NamedTuple):
-    """Standard deviations per axis, normal errors."""
+    """Standard deviations per axis of markers in CT and by touch, normal errors."""
 
     ct_mm: float
     """Where a marker is found in the CT."""
@@ -36,7 +36,7 @@ class MarkerNoise(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The twin's truth.
+    """Ground truth of a rehearsal.
 
     Attributes:
         T_base_ct_true: Shape (4, 4), mm: the patient in the true base frame.
@@ -44,7 +44,7 @@ class Truth:
             or was not seen since the markers were touched.
         seed: What the random part was drawn from.
         source: How it was found, in words for the report.
-        target_ct: Shape (3,), mm: where the target truly is in the CT; None where it was read without error.
+        target_ct: Shape (3,), mm: true target in the CT; None where it was read without error.
         bevel_side: Whereto the bevel points about the needle's z, rad; of a needle that bends.
     """
 
@@ -124,7 +124,7 @@ def _drawn(case: Case, registration: MarkerSection, T_base_ct: Floats, rng: np.r
 
 
 def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "rehearsal.truth_base") -> Floats:
-    """Where the patient lies when these points of the CT truly are there.
+    """Pose of the patient whose true points these are, from the points of the CT.
 
     The rotation is the rigid least-squares fit of all points. Where the target is among them, the translation puts
     it exactly on its true place: what the twin measures is the distance from there.

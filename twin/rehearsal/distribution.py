@@ -1,4 +1,4 @@
-"""A puncture rehearsed in many rooms: what was realised, beside what was predicted."""
+"""The distribution of a puncture over many Monte Carlo trials: what was realised, next to what was predicted."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled
-from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, draw_rooms
+from puncture_twin.twin.rehearsal.trials import Puncture, Trials, draw_trials
 
-MET_MM = 1e-6
-"""Of an axis from a surface that it meets."""
+CONTACT_MM = 1e-6
+"""Distance of an axis from a surface that counts as contact."""
 
 ALLOWED = "a case with [errors] and markers, which say what a room may differ by"
 
 
 @dataclass(frozen=True, eq=False)
-class PhysicsRooms:
-    """What the simulator said of some rooms.
+class PhysicsTrials:
+    """Results of some trials in the simulator.
 
     Attributes:
         apart_mm: Shape (n,), its tip from that of the kinematics, in the patient.
-        contacts: So many of the rooms had a contact of the arm.
+        contacts: So many of the trials had a contact of the arm.
     """
 
     apart_mm: Floats
@@ -58,13 +58,13 @@ class PhysicsRooms:
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """n rooms of one puncture in which the arm reached the pose; mm.
+    """n trials of one puncture in which the arm reached the pose; mm.
 
     Attributes:
         seed: Of all draws.
-        unreached: Rooms beside these whose registration put the pose out of the arm's reach.
-        puncture: What every room repeats.
-        rooms: The n rooms.
+        unreached: Further trials, whose registration put the pose out of the arm's reach.
+        puncture: Common part of all trials.
+        trials: The n trials.
         cov_ct: Shape (3, 3), predicted of it, mm^2.
         in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid.
         hit: Shape (n,).
@@ -74,15 +74,15 @@ class Distribution:
         p_touch: Shape (k,), predicted.
         wrong_belief: Whether the truth was drawn from other errors than the belief declares, on purpose.
         budget: Where the predicted error comes from.
-        guessed_touches: Whether nobody says how the arm touched the markers, so that a posture was assumed.
-        not_modelled: What neither the rooms nor the chances hold.
-        physics: Some of the rooms in the simulator, where that was wanted.
+        guessed_touches: Whether it is not stated how the arm touched the markers, so that a posture was assumed.
+        not_modelled: What neither the trials nor the chances contain.
+        physics: Some of the trials in the simulator, if any.
     """
 
     seed: int
     unreached: int
     puncture: Puncture
-    rooms: Rooms
+    trials: Trials
     cov_ct: Floats
     in_region: Bools
     hit: Bools
@@ -94,29 +94,29 @@ class Distribution:
     budget: ErrorBudget
     guessed_touches: bool
     not_modelled: str
-    physics: PhysicsRooms | None = None
+    physics: PhysicsTrials | None = None
 
     def __len__(self) -> int:
-        return len(self.rooms.tip_ct)
+        return len(self.trials.tip_ct)
 
     @property
     def error_ct(self) -> Floats:
         """Shape (n, 3), true tip minus true target."""
-        return np.asarray(self.rooms.tip_ct - self.rooms.target_ct)
+        return np.asarray(self.trials.tip_ct - self.trials.target_ct)
 
     @property
     def tip_error_mm(self) -> Floats:
-        """Shape (n,)."""
+        """Distance of true tip and true target, shape (n,), mm."""
         return np.asarray(np.linalg.norm(self.error_ct, axis=1))
 
     @property
     def realised_rms_mm(self) -> float:
-        """Of the tip's error."""
+        """Realised rms of the tip's error, mm."""
         return float(np.sqrt(np.mean(self.tip_error_mm**2))) if len(self) else float("nan")
 
     @property
     def predicted_rms_mm(self) -> float:
-        """Of the tip's error."""
+        """Predicted rms of the tip's error, mm."""
         return float(np.sqrt(np.trace(self.cov_ct)))
 
     def summary(self) -> dict[str, Any]:
@@ -146,20 +146,20 @@ class Distribution:
         }
 
 
-def _fraction(rooms: Bools) -> float | None:
-    return float(rooms.mean()) if len(rooms) else None
+def _fraction(trials: Bools) -> float | None:
+    return float(trials.mean()) if len(trials) else None
 
 
-def rehearse_rooms(
+def rehearse_trials(
     context: CaseContext, outward_ct: Floats, q_insertion: Floats, count: int, seed: int
 ) -> Distribution:
-    """Rehearse one direction in many rooms, each with a truth of its own.
+    """Rehearse one direction in many trials, each with a truth of its own.
 
     Args:
         context: Of a case with declared errors and markers.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target.
-        count: Rooms, at least 1.
+        count: Trials, at least 1.
         seed: Of all draws.
 
     Raises:
@@ -167,23 +167,23 @@ def rehearse_rooms(
     """
     query = _query(context, outward_ct, q_insertion)
     rng = np.random.default_rng(seed)
-    rooms = draw_rooms(query.puncture, query.truth, count, rng)
-    off = rng.normal(size=(count, len(context.anatomy.checked)))[rooms.reached]
-    return _measured(context, query, rooms, off, seed)
+    trials = draw_trials(query.puncture, query.truth, count, rng)
+    off = rng.normal(size=(count, len(context.anatomy.checked)))[trials.reached]
+    return _measured(context, query, trials, off, seed)
 
 
 def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: int) -> Floats:
     """E with T_believed = T_true E, shape (4, 4), mm: one registration of a case that its declared errors allow.
 
-    Arguments and errors as of `rehearse_rooms`.
+    Arguments and errors as of `rehearse_trials`.
     """
     query = _query(context, outward_ct, q_insertion)
-    room = draw_rooms(query.puncture, query.truth, 1, np.random.default_rng(seed))
-    return np.asarray(np.linalg.inv(query.puncture.T_base_ct) @ room.T_base_ct[0])
+    truth_trial = draw_trials(query.puncture, query.truth, 1, np.random.default_rng(seed))
+    return np.asarray(np.linalg.inv(query.puncture.T_base_ct) @ truth_trial.T_base_ct[0])
 
 
 class _Query(NamedTuple):
-    """What rooms are drawn of."""
+    """Belief and truth that trials are drawn of."""
 
     believed: PoseError
     puncture: Puncture
@@ -210,7 +210,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
 
 
 def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
-    """How far the bevel takes the needle off along one direction, if it never turns; None for a straight one.
+    """Deflection along one direction, if the bevel never rotates; None for a straight needle.
 
     Args:
         context: Of a case.
@@ -221,37 +221,37 @@ def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
 
 
 def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
-    """The pose error of rooms: touches as there, and errors of the size that the markers say, taken for declared."""
+    """The pose error of trials: touches as there, and errors of the estimated size taken as declared."""
     errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
     noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
     test = NoiseTest(fit.test.count, float(fit.test.freedom))
     return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
 
 
-def _measured(context: CaseContext, query: _Query, rooms: Rooms, off: Floats, seed: int) -> Distribution:
-    """What happened; ``off`` has a normal number for the surface of each structure in each room that is reached."""
+def _measured(context: CaseContext, query: _Query, trials: Trials, off: Floats, seed: int) -> Distribution:
+    """The distribution of trials; ``off`` has a normal number for each structure's surface in each trial."""
     case, believed, puncture = context.case, query.believed, query.puncture
     q = puncture.q_insertion[None]
-    unreached = int((~rooms.reached).sum())
-    rooms = rooms.reached_alone()
-    cov_ct, error_ct = believed.tip_covariance_ct(q)[0], rooms.tip_ct - rooms.target_ct
+    unreached = int((~trials.reached).sum())
+    trials = trials.reached_alone()
+    cov_ct, error_ct = believed.tip_covariance_ct(q)[0], trials.tip_ct - trials.target_ct
     model = chance_model(case, context.anatomy, context.engine, believed)
     assert model is not None
     chances = refined_chances(model, puncture.outward_ct[None], q, model.chances(puncture.outward_ct[None], q))
-    off_mm = off * _surfaces(model, puncture, query.truth)
+    off_mm = off * _surfaces(model, puncture, query.truth)  # drawn in deviations
     inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
     return Distribution(
         seed=seed,
         unreached=unreached,
         puncture=puncture,
-        rooms=rooms,
+        trials=trials,
         cov_ct=cov_ct,
         in_region=square <= chdtri(3, 1 - INTERVAL),
-        hit=_hits(context, rooms, off_mm),
+        hit=_hits(context, trials, off_mm),
         p_hit=float(chances.hit[0]),
         structures=chances.structures,
-        touched=_touches(context, puncture, rooms, off_mm),
+        touched=_touches(context, puncture, trials, off_mm),
         p_touch=chances.touch[0],
         wrong_belief=case.truth_errors is not None,
         budget=error_budget(believed, q[0], puncture.T_base_ct[:3, :3] @ puncture.outward_ct),
@@ -261,7 +261,7 @@ def _measured(context: CaseContext, query: _Query, rooms: Rooms, off: Floats, se
 
 
 def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:
-    """By what each structure's surface may lie off as a whole where the needle passes it; the target's anywhere; mm."""
+    """Deviation of each structure's surface as a whole where the needle passes it; of the target's anywhere; mm."""
     checked, outward_ct = model.anatomy.checked, puncture.outward_ct[None]
     axes = model.engine.measure(puncture.target_ct, outward_ct, own_lengths(model.case, model.anatomy, outward_ct))
     normals = normals_of(model.engine.triangles, puncture.target_ct, outward_ct, axes)[0]
@@ -272,17 +272,17 @@ def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floa
     return np.asarray(passed)
 
 
-def _hits(context: CaseContext, rooms: Rooms, off_mm: Floats) -> Bools:
-    """Within the radius of the true target, or in the mesh, which comes from the target's own scan and may lie off."""
+def _hits(context: CaseContext, trials: Trials, off_mm: Floats) -> Bools:
+    """Which trials hit: within the radius of the true target, or in the mesh of the target's own scan."""
     case = context.case
     if case.hit_radius_mm is not None:
-        return np.asarray(np.linalg.norm(rooms.tip_ct - rooms.target_ct, axis=1) < case.hit_radius_mm)
+        return np.asarray(np.linalg.norm(trials.tip_ct - trials.target_ct, axis=1) < case.hit_radius_mm)
     mesh, off = context.anatomy.structure(case.target_structure).mesh, off_mm[:, _target_column(context.anatomy, case)]
-    hit = inside_each(mesh, rooms.tip_ct)
-    shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1)
+    hit = inside_each(mesh, trials.tip_ct)
+    shift = np.linalg.norm(trials.tip_ct - case.target_ct, axis=1)
     for row in np.flatnonzero((off != 0) & (surface_distance(mesh, case.target_ct) - shift <= abs(off))):
-        if surface_distance(mesh, rooms.tip_ct[row]) <= abs(off[row]):
-            hit[row] = off[row] > 0
+        if surface_distance(mesh, trials.tip_ct[row]) <= abs(off[row]):
+            hit[row] = off[row] > 0  # within the shell that moved: inside if the surface moved out
     return hit
 
 
@@ -290,23 +290,23 @@ def _target_column(anatomy: Anatomy, case: Case) -> int:
     return [one.name for one in anatomy.checked].index(case.target_structure)
 
 
-def _touches(context: CaseContext, puncture: Puncture, rooms: Rooms, off_mm: Floats) -> Bools:
-    """Which structures each room's needle touches, shape (n, k), by FCL's capsule where a bound does not exclude it.
+def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: Floats) -> Bools:
+    """Structures that each trial's needle touches, shape (n, k), by FCL's capsule where no bound excludes it.
 
     A surface that lies farther out is touched from farther; one that lies deeper than the needle is thick is touched
-    where the axis meets it as it was drawn, as in `line_chance`.
+    where the axis hits it as it was drawn, as in `line_chance`.
     """
     case, checked = context.case, context.anatomy.checked
     columns, outward_ct = demanding(checked), puncture.outward_ct[None]
     lengths = own_lengths(case, context.anatomy, outward_ct)[0]
     distance = context.engine.measure(case.target_ct, outward_ct, lengths).distance[0]
-    shift = np.linalg.norm(rooms.tip_ct - case.target_ct, axis=1)
-    turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1)
-    touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)
+    shift = np.linalg.norm(trials.tip_ct - case.target_ct, axis=1)
+    turn = np.linalg.norm(trials.outward_ct - puncture.outward_ct, axis=1)
+    touched = np.zeros((len(trials.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):
-        length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], MET_MM)
-        for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):
+        length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], CONTACT_MM)
+        for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):  # others are surely clear
             touched[row, place] = context.engine.collides(
-                int(column), rooms.tip_ct[row], rooms.outward_ct[row], length, float(radius[row])
+                int(column), trials.tip_ct[row], trials.outward_ct[row], length, float(radius[row])
             )
     return touched

@@ -1,17 +1,13 @@
-"""The truth that a plan meets: as a file says, or as the declared errors draw it, one room or the median of many.
+"""The ground truth that a plan is rehearsed with: from a file, or drawn from the declared errors (the median trial).
 
-A room without physics says where the needle ended in the patient. For the simulator its errors, those of the markers
-and of the arm alike, become one: where the patient truly lies. Executed by an arm without errors, the same plan then
-ends at the room's own place, and turned as there:
+A trial without physics says where the needle ended in the patient. For the simulator its errors, those of the markers
+and of the arm alike, become one: where the patient lies. Executed by an arm without errors, the same plan then
+ends at the trial's own place, and rotated as there:
 
-    T_base_ct_true = T_base_tip T_ct_tip^-1,   T_base_tip as planned, T_ct_tip as the room found it
+    T_base_ct_true = T_base_tip T_ct_tip^-1,   T_base_tip as planned, T_ct_tip as the trial found it
 
-That holds at the target; on the way the arm's own errors would differ a little from those at its end.
-
-Punctures in the simulator whose truth something else has drawn: touches of the same erring arm, or rooms.
-
-The simulated arm is the nominal one. What its lengths and the needle err by at the target becomes a part of where the
-patient lies, as in `plan_truth`; the error of the joints on arrival stays one of joints.
+That is exact at the target; before it the arm's own errors would differ a little from those at its end. The error of
+the joints on arrival stays one of joints. `rehearse_touched` does the same for touches of an erring arm.
 """
 
 from __future__ import annotations
@@ -30,21 +26,21 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 from puncture_twin.twin.plant.true_needle import AtTarget, TouchTruth, TrueNeedle, true_needle
 from puncture_twin.twin.plant.truth import Truth, draw_truth
-from puncture_twin.twin.rehearsal.distribution import Distribution, PhysicsRooms, bend_along, rehearse_rooms
+from puncture_twin.twin.rehearsal.distribution import Distribution, PhysicsTrials, bend_along, rehearse_trials
 from puncture_twin.twin.rehearsal.rehearsal import rehearse
-from puncture_twin.twin.rehearsal.result import PredictedScale, Rehearsal, RoomScale, Scale
-from puncture_twin.twin.rehearsal.rooms import Puncture, Rooms, bent
+from puncture_twin.twin.rehearsal.result import PredictedScale, Rehearsal, Scale, TrialScale
+from puncture_twin.twin.rehearsal.trials import Puncture, Trials, bent
 
 TRIED = 16
-"""Rooms that are drawn for one: the arm may not reach the pose that a room's registration asks for."""
+"""Trials that are drawn for one: the arm may not reach the pose that a trial's registration demands."""
 
 
-def drawn_truth(puncture: Puncture, rooms: Rooms, row: int, seed: int, source: str) -> Truth:
-    """The truth whose execution ends as one of the rooms did.
+def drawn_truth(puncture: Puncture, trials: Trials, row: int, seed: int, source: str) -> Truth:
+    """The truth whose execution ends as one of the trials did.
 
     Args:
-        puncture: What the rooms repeat.
-        rooms: As drawn.
+        puncture: Common part of the trials.
+        trials: As drawn.
         row: Which.
         seed: Of their draws.
         source: In words for the report.
@@ -52,13 +48,13 @@ def drawn_truth(puncture: Puncture, rooms: Rooms, row: int, seed: int, source: s
     T_base_tip = np.array(flange_pose(puncture.model, puncture.q_insertion))
     T_base_tip[:3, 3] += puncture.tip_mm * T_base_tip[:3, 2]
     T_ct_tip = np.eye(4)
-    T_ct_tip[:3, :3], T_ct_tip[:3, 3] = rooms.R_ct_needle[row], rooms.tip_ct[row]
-    T_base_ct, side = T_base_tip @ np.linalg.inv(T_ct_tip), float(rooms.bevel_side[row])
-    return Truth(T_base_ct, np.zeros(6), seed, source, rooms.target_ct[row], side)
+    T_ct_tip[:3, :3], T_ct_tip[:3, 3] = trials.R_ct_needle[row], trials.tip_ct[row]
+    T_base_ct, side = T_base_tip @ np.linalg.inv(T_ct_tip), float(trials.bevel_side[row])
+    return Truth(T_base_ct, np.zeros(6), seed, source, trials.target_ct[row], side)
 
 
 def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Truth:
-    """What one rehearsal meets: a room of the declared errors, unless the case names true positions or declares none.
+    """The truth of one rehearsal: a trial of the declared errors, unless the case states true positions or none.
 
     Args:
         context: The plan's case.
@@ -67,19 +63,19 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
 
     Raises:
         InputError: A file of true positions that cannot be used.
-        NoAnswerError: In none of the rooms the arm reaches the pose that its registration asks for.
+        NoAnswerError: In no trial the arm reaches the pose that its registration demands.
     """
     case = context.case
     drawn = case.errors is not None and case.registration is not None and case.rehearsal.truth_base is None
     if not drawn:
         return bent_truth(context, plan, draw_truth(case, plan.T_base_ct, seed=seed))
     seed = case.rehearsal.seed if seed is None else seed
-    found = rehearse_rooms(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
+    found = rehearse_trials(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
     return _of_drawn(found, 0, f"drawn with seed {seed} from {_declared(found)}")
 
 
 def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
-    """The same truth with a needle that bends to a drawn side: the patient moved by what a straight one misses.
+    """A truth with a needle that bends to a drawn side: the patient moved by what a straight one misses.
 
     Args:
         context: The plan's case; where it declares no tissue, nothing bends.
@@ -99,7 +95,7 @@ def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
 
 
 def median_truth(found: Distribution) -> Truth:
-    """The truth of the median room by tip error.
+    """The truth of the median trial by tip error.
 
     Raises:
         NoAnswerError: As `plan_truth`.
@@ -110,7 +106,7 @@ def median_truth(found: Distribution) -> Truth:
 
 
 def spread_rows(found: Distribution, count: int) -> Ints:
-    """Rooms spread evenly over the order of their tip errors, shape (count,) at most; the median where it is one."""
+    """Trials spread evenly over the order of their tip errors, shape (count,) at most; the median where it is one."""
     order = np.argsort(found.tip_error_mm, kind="stable")
     places = ((np.arange(count) + 0.5) / count * len(order) - 0.5).round(9)
     return np.asarray(np.unique(order[np.floor(places).clip(0).astype(np.int64)]))
@@ -121,17 +117,17 @@ def _of_drawn(found: Distribution, row: int, source: str) -> Truth:
         raise NoAnswerError(
             f"in none of {found.unreached} rooms did the arm reach the pose that its registration asked for"
         )
-    return drawn_truth(found.puncture, found.rooms, row, found.seed, source)
+    return drawn_truth(found.puncture, found.trials, row, found.seed, source)
 
 
 def _declared(found: Distribution) -> str:
     return "[rehearsal.errors], not from what is believed" if found.wrong_belief else "[errors]"
 
 
-def standing_scale(context: CaseContext, q_insertion: Floats, found: Distribution | None) -> Scale | None:
-    """What a tip error is held against: the rooms, or without rooms the prediction; None without declared errors."""
+def error_scale(context: CaseContext, q_insertion: Floats, found: Distribution | None) -> Scale | None:
+    """Scale of a tip error: the trials', or without trials the prediction's; None without declared errors."""
     if found is not None:
-        return RoomScale(found.tip_error_mm, len(found) + found.unreached)
+        return TrialScale(found.tip_error_mm, len(found) + found.unreached)
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(context.case, registration)
     if error is None:
@@ -142,16 +138,16 @@ def standing_scale(context: CaseContext, q_insertion: Floats, found: Distributio
 
 
 def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Rehearsal:
-    """Execute the puncture of touches where everything truly is. The same arguments give the same numbers.
+    """Execute the puncture of touches in their ground truth. The same arguments give the same numbers.
 
     Args:
         context: The case.
         plan: By the registration of the touches.
-        truth: That the touches met.
+        truth: Of the touches.
         at_target: What is true on arrival.
     """
-    met = bent_truth(context, plan, puncture_truth(plan, truth, at_target))
-    return rehearse(plan, context.case, context.anatomy, met)
+    hit = bent_truth(context, plan, puncture_truth(plan, truth, at_target))
+    return rehearse(plan, context.case, context.anatomy, hit)
 
 
 def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
@@ -165,22 +161,22 @@ def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
     return Truth(T_base_ct, at_target.arrival, truth.seed, source, at_target.target_ct)
 
 
-def physics_rooms(context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count) -> PhysicsRooms:
-    """Run some of the rooms, spread evenly over the order of their tip errors, in the simulator.
+def physics_trials(context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count) -> PhysicsTrials:
+    """Run some of the trials, spread evenly over the order of their tip errors, in the simulator.
 
     Args:
         context: The plan's case.
         plan: What is executed.
-        found: The rooms; the arm reached the pose in one at least.
+        found: The trials; the arm reached the pose in one at least.
         count: How many.
-        progress: Called with rooms done and all of them.
+        progress: Called with trials done and all of them.
     """
     rows = spread_rows(found, count)
     apart, contacts = np.empty(len(rows)), 0
     for number, row in enumerate(rows.tolist()):
-        truth = drawn_truth(found.puncture, found.rooms, row, found.seed, "a room")
+        truth = drawn_truth(found.puncture, found.trials, row, found.seed, "a room")
         done = rehearse(plan, context.case, context.anatomy, truth)
-        apart[number] = np.linalg.norm(done.tip_true_ct[-1] - found.rooms.tip_ct[row])
+        apart[number] = np.linalg.norm(done.tip_true_ct[-1] - found.trials.tip_ct[row])
         contacts += bool(done.contacts)
         progress(number + 1, len(rows))
-    return PhysicsRooms(apart, contacts)
+    return PhysicsTrials(apart, contacts)

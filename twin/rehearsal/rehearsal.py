@@ -1,12 +1,9 @@
-"""A plan, executed in the twin: the arm moves under its motors, the patient lies at their true place.
+"""A plan executed in the twin: the approach by motors, a pause, and the insertion, the patient at their true place.
 
 What is modelled: rigid bodies, gravity, motor lag and torque limits, joint offsets, a registration that errs; the
 insertion by a spring at the tip, or by the motors (``[rehearsal] control``); where ``[tissue]`` is declared, its force
-on the needle, and how far the needle bends, in where the patient lies. What is not: tissue that moves, breathing.
-
-A plan's motions in the simulator: the approach by position motors, a pause, and the insertion as the case wants it.
-
-Where the case declares tissue, it presses on the needle from the skin on, whoever controls the insertion.
+on the needle from the skin on, and how far the needle bends, in where the patient lies. What is not: tissue that moves,
+breathing.
 """
 
 from __future__ import annotations
@@ -31,7 +28,7 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.bending import insertion_along
 from puncture_twin.planning.sweep.sweep_planner import SweepPlan
-from puncture_twin.twin.plant.true_needle import Felt, StraightPath, TrueTissue
+from puncture_twin.twin.plant.true_needle import StraightPath, TissueForce, TrueTissue
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.result import Rehearsal, RehearsalContact
 from puncture_twin.twin.world.client import TIME_STEP_S
@@ -45,7 +42,7 @@ CLEARANCE_SAMPLES = 48
 
 @dataclass(frozen=True)
 class TipError:
-    """Where a needle ended, seen from the target; mm. total^2 = lateral^2 + depth^2."""
+    """Error of a needle's tip from the target; mm. total^2 = lateral^2 + depth^2."""
 
     total_mm: float
     lateral_mm: float
@@ -99,7 +96,7 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth, engine: Fcl
         truth_is_belief=bool(np.array_equal(T_base_ct, plan.T_base_ct)),
         control=case.rehearsal.control,
         off_path_mm=seen.off_path_mm,
-        felt=seen.felt,
+        tissue_force=seen.tissue_force,
     )
 
 
@@ -117,7 +114,7 @@ def split_error(tip: Floats, forward: Floats, target: Floats) -> TipError:
 
 
 def _clearance_samples(phase: NDArray[np.str_]) -> NDArray[np.int64]:
-    """Records spread over the insertion, and the last of all."""
+    """Rows of records spread over the insertion, and the last of all."""
     candidates = np.append(np.flatnonzero(phase == "insertion"), len(phase) - 1)
     spread = np.round(np.linspace(0, len(candidates) - 1, CLEARANCE_SAMPLES)).astype(np.int64)
     return np.unique(candidates[spread])
@@ -146,7 +143,7 @@ def _clearances(
 def _contacts(
     case: Case, anatomy: Anatomy, truth: Truth, done: Execution, times_s: Floats, phase: NDArray[np.str_]
 ) -> tuple[RehearsalContact, ...]:
-    """What the physics felt at every step, and what FCL finds at every record, arm and patient where they truly were.
+    """Contacts by the physics at every step, and by FCL at every record, arm and patient at their true places.
 
     The physics lets the needle pass the skin and the arm pass itself, and rounds large skins; FCL says the first
     contact of a record only.
@@ -179,45 +176,45 @@ DWELL_S = 1.0
 """Pause at the end, before the tip is measured."""
 
 ROUNDING = 1e-6
-"""Of a time over the physics step: a whole number of steps must not fall short of itself."""
+"""Tolerance of a time over the physics step: a whole number of steps must not fall short of itself."""
 
 
 @dataclass(frozen=True, eq=False)
 class Executed:
-    """What the simulator measured.
+    """Measurements of the simulator.
 
     Attributes:
         execution: Its records.
         phase: Shape (m,), of each record: "approach", "settle", "insertion" or "hold".
         off_path_mm: Of the tip from its commanded path, by the encoders, at most from the insertion on.
-        felt: The greatest forces of the tissue; None where none was declared.
+        tissue_force: The greatest forces of the tissue; None where none was declared.
     """
 
     execution: Execution
     phase: NDArray[np.str_]
     off_path_mm: float
-    felt: Felt | None
+    tissue_force: TissueForce | None
 
 
 def executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executed:
-    """Execute a plan; arguments and errors as of `rehearse`."""
+    """Execute a plan in the simulator; arguments and errors as of `rehearse`."""
     T_base_ct, tissue = truth.T_base_ct_true, true_tissue(plan, case, anatomy, truth)
     model, tool, boxes = plan.model, case_tool(case), case_boxes(case, T_base_ct)
     down_ct = -bed_frame(case)[:3, 2]
     approach = steps(plan.approach)
     before = np.concatenate([approach, np.repeat(approach[-1:], round(SETTLE_S / TIME_STEP_S), axis=0)])
     start_s = TIME_STEP_S * len(before)
-    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as room:
-        approached = execute(room, before, truth.joint_offsets)
+    with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as workcell:
+        approached = execute(workcell, before, truth.joint_offsets)
         insertion = Insertion(model, tool, T_base_ct[:3, :3] @ down_ct, plan.insertion, DWELL_S)
         how = case.rehearsal.control
-        inserted = insert(room, insertion, how, truth.joint_offsets, start_s=start_s, resistance=tissue)
+        inserted = insert(workcell, insertion, how, truth.joint_offsets, start_s=start_s, resistance=tissue)
     done = joined(approached, inserted.execution)
     ends = np.cumsum([len(approach), len(before) - len(approach), len(steps(plan.insertion))])
     row = np.floor(done.times_s / TIME_STEP_S + ROUNDING).astype(np.int64)
     phase = np.array(["approach", "settle", "insertion", "hold"])[np.searchsorted(ends, row, side="right")]
-    felt = None if case.bending is None else Felt(0.0, 0.0) if tissue is None else tissue.felt
-    return Executed(done, phase, inserted.off_path_mm, felt)
+    tissue_force = None if case.bending is None else TissueForce(0.0, 0.0) if tissue is None else tissue.greatest
+    return Executed(done, phase, inserted.off_path_mm, tissue_force)
 
 
 def steps(trajectory: Trajectory) -> Floats:
@@ -227,7 +224,7 @@ def steps(trajectory: Trajectory) -> Floats:
 
 
 def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueTissue | None:
-    """The declared tissue on the axis that the plan's needle truly takes; None without tissue, or where it meets none.
+    """The declared tissue on the true axis of the plan's needle; None without tissue, or where it passes none.
 
     Args:
         plan: What is executed.
@@ -253,7 +250,7 @@ def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueT
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """What was measured of the sweep, its approach left out; m records.
+    """Measurements of a sweep without its approach; m records.
 
     Attributes:
         times_s: Shape (m,).
@@ -267,7 +264,7 @@ class Swept:
 
 
 def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floats) -> Swept:
-    """Sweep in the workcell as it is believed: what is measured is control, by `[rehearsal] control` of the case.
+    """Execute a sweep in the believed workcell: what is measured is control, by `[rehearsal] control` of the case.
 
     Args:
         plan: The motion.
@@ -281,9 +278,9 @@ def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floa
     before = np.concatenate([approach, pause])
     with open_workcell(
         plan.model, tool, anatomy.skin.mesh, T_base_ct, case_boxes(case, T_base_ct), down_ct=down_ct
-    ) as room:
-        first = execute(room, before, still)
+    ) as workcell:
+        first = execute(workcell, before, still)
         motion = Insertion(plan.model, tool, T_base_ct[:3, :3] @ down_ct, plan.sweep, SETTLE_S)
-        done = insert(room, motion, case.rehearsal.control, still, start_s=len(before) * TIME_STEP_S).execution
+        done = insert(workcell, motion, case.rehearsal.control, still, start_s=len(before) * TIME_STEP_S).execution
     contacts = tuple(dict.fromkeys((one.link, one.body) for one in (*first.touches, *done.touches)))
     return Swept(done.times_s, plan.off_point_mm(done.T_base_flange), contacts)

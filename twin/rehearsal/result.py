@@ -1,4 +1,4 @@
-"""What a rehearsal measured: values alone, which pictures and pages read without the simulator."""
+"""The result of a rehearsal: values alone, which images and pages read without the simulator."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
-from puncture_twin.twin.plant.true_needle import NOT_FELT, Felt
+from puncture_twin.twin.plant.true_needle import NO_TISSUE_FORCE, TissueForce
 
 
 @dataclass(frozen=True)
-class Standing:
-    """The place of a rehearsal's tip error among those of rooms, or in the predicted distribution.
+class ErrorRank:
+    """Percentile of a rehearsal's tip error among trials, or in the predicted distribution.
 
     Attributes:
-        percentile: 0 to 100; so many of 100 rooms end nearer to the target.
-        rooms: So many rooms were drawn, and this is the median one; 0 where the percentile is the prediction's.
+        percentile: 0 to 100; so many of 100 trials end nearer to the target.
+        trials: So many trials were drawn, and this is the median one; 0 where the percentile is the prediction's.
     """
 
     percentile: float
-    rooms: int = 0
+    trials: int = 0
 
     @property
     def place(self) -> str:
@@ -34,41 +34,43 @@ class Standing:
 
     @property
     def text(self) -> str:
-        """For headlines and text."""
-        if self.rooms == 0:
+        """The rank for headlines and text."""
+        if self.trials == 0:
             return f"{self.place} of the tip errors that are predicted"
         return (
-            f"median of {self.rooms:,} rooms ({self.place} of their tip errors)" if self.rooms > 1 else "the only room"
+            f"median of {self.trials:,} rooms ({self.place} of their tip errors)"
+            if self.trials > 1
+            else "the only room"
         )
 
     @property
     def short(self) -> str:
-        """For a frame of the film."""
-        if self.rooms == 0:
+        """The rank for a frame of the film."""
+        if self.trials == 0:
             return f"{self.place} by prediction"
-        return f"median of {self.rooms:,} rooms" if self.rooms > 1 else "the only room"
+        return f"median of {self.trials:,} rooms" if self.trials > 1 else "the only room"
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
-        return {"percentile": self.percentile, "percentile_of": "rooms" if self.rooms else "prediction"}
+        return {"percentile": self.percentile, "percentile_of": "rooms" if self.trials else "prediction"}
 
 
 @dataclass(frozen=True, eq=False)
-class RoomScale:
-    """The tip errors of rooms, of which one is rehearsed.
+class TrialScale:
+    """Tip errors of trials, of which one is rehearsed.
 
     Attributes:
         errors_mm: Shape (n,), of those in which the arm reached the pose.
-        rooms: All.
+        trials: All.
     """
 
     errors_mm: Floats
-    rooms: int
+    trials: int
 
-    def of(self, tip_error_mm: float) -> Standing:
-        """Where an error stands among them."""
+    def of(self, tip_error_mm: float) -> ErrorRank:
+        """Rank of an error among them."""
         below = np.mean(self.errors_mm < tip_error_mm) + np.mean(self.errors_mm <= tip_error_mm)
-        return Standing(float(50 * below), self.rooms)
+        return ErrorRank(float(50 * below), self.trials)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,17 +85,17 @@ class PredictedScale:
     cov: Floats
     freedom: int | None
 
-    def of(self, tip_error_mm: float) -> Standing:
-        """Where an error stands in it."""
-        return Standing(100 * float(hit_in_ball(self.cov, tip_error_mm, self.freedom)[0]))
+    def of(self, tip_error_mm: float) -> ErrorRank:
+        """Rank of an error in it."""
+        return ErrorRank(100 * float(hit_in_ball(self.cov, tip_error_mm, self.freedom)[0]))
 
 
-Scale = RoomScale | PredictedScale
-"""What a tip error is held against."""
+Scale = TrialScale | PredictedScale
+"""The distribution that a tip error is ranked in."""
 
 
 def ordinal(number: int) -> str:
-    """1st, 2nd, 3rd, 4th ... 11th ... 21st."""
+    """A number as 1st, 2nd, 3rd, 4th ... 11th ... 21st."""
     last = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
     return f"{number}{last}"
 
@@ -127,17 +129,17 @@ class RehearsalContact:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal:
-    """What was measured; m records in time, k samples of clearance. Angles in rad, lengths in mm.
+    """Measurements of a rehearsal; m records in time, k samples of clearance. Angles in rad, lengths in mm.
 
     Attributes:
         seed: What the truth was drawn from.
         truth_source: How the truth was found.
-        T_base_ct_true: Shape (4, 4), where the patient truly lay.
+        T_base_ct_true: Shape (4, 4), true pose of the patient.
         times_s: Shape (m,), from the start of the approach.
-        q: Shape (m, 6), what the encoders said.
-        q_command: Shape (m, 6), what was asked.
+        q: Shape (m, 6), encoder angles.
+        q_command: Shape (m, 6), commanded joints.
         phase: Shape (m,), "approach", "settle", "insertion" or "hold".
-        T_base_flange_true: Shape (m, 4, 4), where the flange truly was.
+        T_base_flange_true: Shape (m, 4, 4), true pose of the flange.
         tip_true_ct: Shape (m, 3), the needle's true tip in the patient.
         clearance_times_s: Shape (k,), moments of the insertion and its end.
         clearance_mm: Structure to shape (k,): true needle's axis to true structure, minus the needle's radius.
@@ -148,11 +150,11 @@ class Rehearsal:
         lateral_mm: Its part across the needle.
         depth_mm: Its part along the needle, positive when too deep.
         predicted_error_mm: What the plan expected (rms), NaN without markers.
-        target_true_ct: Shape (3,), where the target truly was in the CT.
+        target_true_ct: Shape (3,), true target in the CT.
         truth_is_belief: Whether the patient lay exactly where it was believed, so that the error says little.
         control: How the insertion was followed: "impedance", "admittance" or "position".
         off_path_mm: The tip from its commanded path, by the encoders, at most from the insertion on.
-        felt: The greatest forces of the tissue on the needle; None where the case declares none.
+        tissue_force: The greatest forces of the tissue on the needle; None where the case declares none.
         standing: Where the error stands among others; None where the case declares no errors.
     """
 
@@ -178,8 +180,8 @@ class Rehearsal:
     truth_is_belief: bool
     control: str
     off_path_mm: float
-    felt: Felt | None
-    standing: Standing | None = None
+    tissue_force: TissueForce | None
+    standing: ErrorRank | None = None
 
     @brief
     def __repr__(self) -> str:
@@ -193,8 +195,8 @@ class Rehearsal:
 
     @property
     def force_text(self) -> str:
-        """What the tissue did, for a person."""
-        return NOT_FELT if self.felt is None else self.felt.text
+        """Forces of the tissue, for a person."""
+        return NO_TISSUE_FORCE if self.tissue_force is None else self.tissue_force.text
 
     def __post_init__(self) -> None:
         for value in (*vars(self).values(), *self.clearance_mm.values()):

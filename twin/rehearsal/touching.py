@@ -1,8 +1,9 @@
 """Planned touches executed in the simulator: marker after marker, and home; one that fails does not end the tour.
 
-The declared errors of arm and markers are in where each marker is met: the simulated arm is the nominal one, so a pad
-stands on its line where the erring arm's tip would be on the true marker. At the standoff somebody sets the needle's
-line onto the marker by eye; how deep it is, the arm feels. The tip is a point: the pad is square to the needle.
+The declared errors of arm and markers are in where each marker is touched: the simulated arm is the nominal one, so a
+pad stands on its line where the erring arm's tip would be on the true marker. At the standoff somebody sets the
+needle's line onto the marker by eye; how deep it is, the arm feels. The tip is a point: the pad is square to the
+needle.
 """
 
 from __future__ import annotations
@@ -54,30 +55,31 @@ from puncture_twin.twin.world.execution import touches
 from puncture_twin.twin.world.workcell import SimulatedWorkcell, load_box, open_workcell, remove, soften
 
 TOUCH_SPEED_MM_S = 2.0
-"""Of the last millimetres."""
+"""Tip speed over the last millimetres."""
 
 NEAR_SPEED_MM_S = 25.0
-"""Of the straight line before them, and back."""
+"""Tip speed on the straight line before them, and back."""
 
-FELT_N = 0.5
-"""A force along the needle above which the marker is felt."""
+CONTACT_N = 0.5
+"""Force along the needle, N, that counts as contact."""
 
-FELT_STEPS = 3
+CONTACT_STEPS = 3
 """In a row: a sensor's noise alone does not reach it so often."""
 
 FORCE_NOISE_N = 0.1
 """Standard deviation of the force sensor, per reading."""
 
 SPRING = Stiffness(translation_n_m=1e3, rotation_nm_rad=100.0, integral_per_s=5.0)
-"""Of the tip while it feels for a marker. The integral, which stands still in contact, takes away what the arm's masses
-err by: with a tenth of them wrong the tip would come down .6 mm aside."""
+"""Spring at the tip while it approaches a marker. The integral, which stands still in contact, takes away what the
+arm's masses err by: with a tenth of them wrong the tip would come down .6 mm aside."""
 
 PAD_N_M = 1e5
 """Stiffness of a marker on skin; a rigid one's first peak would be momentum over the time step."""
 
 PAD_MM = (12.0, 12.0, 4.0)
+
 MOST_ASIDE_MM = 10.0
-"""A marker that lies farther beside its believed place is not the one that was planned to be touched."""
+"""A marker that lies farther from its believed place is not the one that was planned to be touched."""
 
 LOOK_EVERY = 8
 """Steps of the motors between two looks at where the needle is: 30 a second."""
@@ -86,8 +88,95 @@ PAUSE_S = 0.25
 """Before motors and torques take over from one another."""
 
 
+@dataclass(frozen=True, eq=False)
+class Touched:
+    """Readings of all touches, in their order.
+
+    Attributes:
+        readings: One a marker that was touched.
+        failed: Marker to why it was not read, in words.
+        seconds: Home to home; where the arm stopped, of the touches before that.
+    """
+
+    readings: tuple[TouchReading, ...]
+    failed: Mapping[str, str]
+    seconds: float
+
+
+def execute_touches(
+    tour: TouchTour, case: Case, anatomy: Anatomy, checkers: ApproachCheckers, truth: TouchTruth, progress: Count
+) -> Touched:
+    """Touch the markers at their true places. The same tour and truth give the same numbers.
+
+    A marker that is not touched where it should be is given up with its reason, and the arm goes on from its standoff.
+    Where the arm or needle touched something else it stops, and what was not read by then stays unread.
+
+    Args:
+        tour: Where, in which order, by which motions.
+        case: For tool, boxes and gravity.
+        anatomy: For the skin.
+        checkers: Of the workcell as it is believed: a line moved at the standoff is checked again.
+        truth: All randomness but the force sensor's is in it, and that comes from its seed.
+        progress: Called with touches done and all of them.
+    """
+    tool, T = case_tool(case), truth.T_base_ct
+    down_ct = -bed_frame(case)[:3, 2]
+    with (
+        open_workcell(tour.model, tool, anatomy.skin.mesh, T, case_boxes(case, T), down_ct=down_ct) as workcell,
+        rigid_model(tour.model, tool, T[:3, :3] @ down_ct) as rigid,
+    ):
+        true = CellChecker(tour.model, tool, patient=patient_surface(anatomy).transformed(T))
+        cell = TouchingCell(workcell, rigid, tour, truth, checkers, true, np.random.default_rng([truth.seed, 1]))
+        workcell.arm.place(tour.touches[0].come.q[0])
+        return _tour(cell, progress)
+
+
+def _tour(cell: TouchingCell, progress: Count) -> Touched:
+    """Touch every marker, and go home."""
+    readings: list[TouchReading] = []
+    failed: dict[str, str] = {}
+    touches, seconds = cell.tour.touches, 0.0
+    try:
+        for number, touch in enumerate(touches):
+            found = touch_marker(cell, touch)
+            if isinstance(found, FailedTouch):
+                failed[touch.name] = found.why
+            else:
+                readings.append(found)
+            seconds += found.seconds
+            progress(number + 1, len(touches))
+        seconds += seconds_of(moved_outside(cell, cell.tour.leave, np.zeros(6)))
+    except StoppedError as stop:
+        done = {one.name for one in readings} | set(failed)
+        failed |= {touch.name: f"the tour was stopped: {stop}" for touch in touches if touch.name not in done}
+    return Touched(tuple(readings), failed, seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class TouchingCell:
+    """Workcell, tool and generators of every touch.
+
+    Attributes:
+        workcell: The simulated workcell.
+        rigid: The arm's masses as its controller knows them.
+        tour: The touches.
+        truth: The ground truth.
+        checkers: Of the workcell as it is believed.
+        true: Of the needle against the patient at their true pose.
+        rng: Of the force sensor's noise.
+    """
+
+    workcell: SimulatedWorkcell
+    rigid: RigidModel
+    tour: TouchTour
+    truth: TouchTruth
+    checkers: ApproachCheckers
+    true: CellChecker
+    rng: np.random.Generator
+
+
 class TouchReading(NamedTuple):
-    """One executed touch."""
+    """Reading of one executed touch."""
 
     name: str
     point_base: Floats
@@ -101,54 +190,51 @@ class TouchReading(NamedTuple):
     bias_mm: float
     """How deep in the marker the tip was when the joints were read."""
     speed_mm_s: float
-    """Of the tip when it was felt."""
+    """Tip speed at contact."""
     aside_mm: float
     """By how much the line was moved at the standoff."""
 
 
 class FailedTouch(NamedTuple):
-    """A marker that was not read, the arm back at its standoff: why, and what it took."""
+    """A marker that was not read, the arm back at its standoff: the reason, and the time."""
 
     why: str
     seconds: float
 
 
 class StoppedError(Exception):
-    """The arm stopped where no plan led it on: something is not where it is believed to be."""
+    """The arm stopped where it had no planned path: something is not where it is believed to be."""
 
 
-@dataclass(frozen=True, eq=False)
-class TouchingCell:
-    """What every touch uses.
+def touch_marker(cell: TouchingCell, touch: Touch) -> TouchReading | FailedTouch:
+    """One marker: come, set the line, feel, read, go back to the standoff.
 
-    Attributes:
-        room: The simulated workcell.
-        rigid: The arm's masses as its controller knows them.
-        tour: The touches.
-        truth: Where everything truly is.
-        checkers: Of the workcell as it is believed.
-        true: Of the needle against the patient where they truly lie.
-        rng: Of the force sensor's noise.
+    Args:
+        cell: The workcell, the arm at the last standoff or at home.
+        touch: As planned.
+
+    Raises:
+        StoppedError: The arm touched what it should not.
     """
-
-    room: SimulatedWorkcell
-    rigid: RigidModel
-    tour: TouchTour
-    truth: TouchTruth
-    checkers: ApproachCheckers
-    true: CellChecker
-    rng: np.random.Generator
+    line = _line(cell, touch)
+    if isinstance(line, str):
+        return FailedTouch(line, seconds_of(moved_outside(cell, touch.come, cell.truth.arrival[touch.name])))
+    pad = _pad(cell, line)
+    try:
+        return _touched_and_read(cell, touch, line)
+    finally:
+        remove(cell.workcell.client, pad)
 
 
 class _Line(NamedTuple):
-    """The straight line to a marker as it was set at the standoff."""
+    """The straight line to a marker, set at the standoff."""
 
     far: Floats
     """Shape (m, 6), rad: from the standoff to where the slow part begins."""
     near: Floats
     """Shape (k, 6): from there past the believed marker."""
     face_base: Floats
-    """Shape (3,), mm: where the simulated tip meets the marker."""
+    """Shape (3,), mm: where the simulated tip touches the marker."""
     axis_base: Floats
     """Shape (3,), unit, toward the tip."""
     aside_mm: float
@@ -176,27 +262,7 @@ def _line(cell: TouchingCell, touch: Touch) -> _Line | str:
     return _Line(far, near, face, flange_pose(model, q + cell.truth.arrival[touch.name])[:3, 2], aside)
 
 
-def touch_marker(cell: TouchingCell, touch: Touch) -> TouchReading | FailedTouch:
-    """One marker: come, set the line, feel, read, go back to the standoff.
-
-    Args:
-        cell: The workcell, the arm at the last standoff or at home.
-        touch: As planned.
-
-    Raises:
-        StoppedError: The arm touched what it should not.
-    """
-    line = _line(cell, touch)
-    if isinstance(line, str):
-        return FailedTouch(line, seconds_of(moved_outside(cell, touch.come, cell.truth.arrival[touch.name])))
-    pad = _pad(cell, line)
-    try:
-        return _felt_and_read(cell, touch, line)
-    finally:
-        remove(cell.room.client, pad)
-
-
-def _felt_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchReading | FailedTouch:
+def _touched_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchReading | FailedTouch:
     arrival = cell.truth.arrival[touch.name]
     come = moved_outside(cell, touch.come, arrival)
     to_near = _slow(cell, np.vstack([touch.come.q[-1:], line.far]))
@@ -205,40 +271,40 @@ def _felt_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchReadin
         back = _moved(cell, _back(cell, touch, line, there.q[-1]), arrival)
         why = f"it was felt more than {SLOW_MM:g} mm before where it was believed, and given up"
         return FailedTouch(why, sum(map(seconds_of, (come, there, back))))
-    felt = _felt(cell, line, arrival)
-    q = felt.q[-1]
+    contact = _approached_contact(cell, line, arrival)
+    q = contact.q[-1]
     back = _moved(cell, _back(cell, touch, line, q), arrival)
-    seconds = sum(map(seconds_of, (come, there, felt, back)))
-    if not felt.stopped:
+    seconds = sum(map(seconds_of, (come, there, contact, back)))
+    if not contact.stopped:
         return FailedTouch(f"no contact: the tip went {PAST_MM:g} mm past where it was believed and came back", seconds)
-    depth = float((1e3 * felt.tip_m[-1] - line.face_base) @ line.axis_base)
-    moved = 1e3 * np.linalg.norm(felt.tip_m[-1] - felt.tip_m[-2]) / felt.dt if len(felt.tip_m) > 1 else 0.0
-    force = max(float(np.linalg.norm(one.force_n, axis=1).max()) for one in (there, felt, back))
+    depth = float((1e3 * contact.tip_m[-1] - line.face_base) @ line.axis_base)
+    moved = 1e3 * np.linalg.norm(contact.tip_m[-1] - contact.tip_m[-2]) / contact.dt if len(contact.tip_m) > 1 else 0.0
+    force = max(float(np.linalg.norm(one.force_n, axis=1).max()) for one in (there, contact, back))
     point = nominal_tip(cell.tour.model, cell.tour.tip_mm, q)
     return TouchReading(touch.name, point, q, seconds, force, depth, float(moved), line.aside_mm)
 
 
 def _back(cell: TouchingCell, touch: Touch, line: _Line, q: Floats) -> Trajectory:
-    """From a configuration (6,), rad, on the line, along it, to the standoff."""
+    """Move from a configuration (6,), rad, on the line, along it, to the standoff."""
     rows = np.vstack([line.far, line.near])
     passed = _tip_mm(cell, rows) @ line.axis_base < _tip_mm(cell, q[None])[0] @ line.axis_base - PASSED_MM
     return _slow(cell, np.vstack([q[None], rows[passed][::-1], touch.come.q[-1:]]))
 
 
 PASSED_MM = 0.1
-"""Rows of the line nearer to the tip than this are not gone back to: where it stands, it stands."""
+"""Rows of the line nearer to the tip than this are not returned to."""
 
 
 def _pad(cell: TouchingCell, line: _Line) -> int:
     """The marker's body, its face square to the needle."""
     centre = line.face_base + PAD_MM[2] / 2 * line.axis_base
-    pad = load_box(cell.room.client, np.array(PAD_MM), pose(frame_about(line.axis_base), centre))
-    soften(cell.room.client, pad, PAD_N_M)
+    pad = load_box(cell.workcell.client, np.array(PAD_MM), pose(frame_about(line.axis_base), centre))
+    soften(cell.workcell.client, pad, PAD_N_M)
     return pad
 
 
-def _felt(cell: TouchingCell, line: _Line, arrival: Floats) -> Run:
-    """The last millimetres under a spring at the tip, until contact is felt or the line ends."""
+def _approached_contact(cell: TouchingCell, line: _Line, arrival: Floats) -> Run:
+    """Move the last millimetres under a spring at the tip, until contact is measured or the line ends."""
     J = tips(cell.tour.model, cell.rigid.tip_m, line.near[:1]).J[0]
     dt = allowed_step(SPRING, J, cell.rigid.mass_matrix(line.near[0]))
     controller = Impedance(cell.rigid, SPRING, dt)
@@ -247,15 +313,15 @@ def _felt(cell: TouchingCell, line: _Line, arrival: Floats) -> Run:
 
 
 class _Contact:
-    """Says when the marker is felt: a force along the needle, some readings in a row."""
+    """Detects contact with the marker: a force along the needle, some readings in a row."""
 
     def __init__(self, cell: TouchingCell, line: _Line) -> None:
         self._rng, self._axis, self._in_a_row = cell.rng, line.axis_base, 0
 
     def __call__(self, measured: Measured) -> bool:
         pressed = -float(measured.force_n @ self._axis) + self._rng.normal(0.0, FORCE_NOISE_N)
-        self._in_a_row = self._in_a_row + 1 if pressed > FELT_N else 0
-        return self._in_a_row >= FELT_STEPS
+        self._in_a_row = self._in_a_row + 1 if pressed > CONTACT_N else 0
+        return self._in_a_row >= CONTACT_STEPS
 
 
 def _slow(cell: TouchingCell, q: Floats, speed_mm_s: float = NEAR_SPEED_MM_S) -> Trajectory:
@@ -275,7 +341,7 @@ def _tip_mm(cell: TouchingCell, q: Floats) -> Floats:
 
 
 def _moved(cell: TouchingCell, trajectory: Trajectory, arrival: Floats) -> Run:
-    """A motion by the position motors."""
+    """Execute a motion by the position motors."""
     return _run(cell, Motors(), trajectory, arrival, None)
 
 
@@ -308,7 +374,9 @@ def _run(
 ) -> Run:
     reference = reference_of(cell.tour.model, cell.rigid.tip_m, trajectory, controller.dt, pause_s)
     around = Surroundings(arrival, stop=stop, watch=lambda row: _refuse_contacts(cell))
-    return run(cell.room.arm, controller, reference, lambda q: tips(cell.tour.model, cell.rigid.tip_m, q[None]), around)
+    return run(
+        cell.workcell.arm, controller, reference, lambda q: tips(cell.tour.model, cell.rigid.tip_m, q[None]), around
+    )
 
 
 def _refuse_contacts(cell: TouchingCell) -> None:
@@ -317,75 +385,11 @@ def _refuse_contacts(cell: TouchingCell) -> None:
     Raises:
         StoppedError: It does.
     """
-    for one in touches(cell.room.arm):
-        if one.body in cell.room.bodies:
-            raise StoppedError(f"{one.link} touches {cell.room.bodies[one.body]}")
+    for one in touches(cell.workcell.arm):
+        if one.body in cell.workcell.bodies:
+            raise StoppedError(f"{one.link} touches {cell.workcell.bodies[one.body]}")
 
 
 def seconds_of(done: Run) -> float:
-    """How long a motion took."""
+    """Duration of a motion, s."""
     return done.dt * len(done.q)
-
-
-@dataclass(frozen=True, eq=False)
-class Touched:
-    """All of them, in their order.
-
-    Attributes:
-        readings: One a marker that was felt.
-        failed: Marker to why it was not read, in words.
-        seconds: Home to home; where the arm stopped, of the touches before that.
-    """
-
-    readings: tuple[TouchReading, ...]
-    failed: Mapping[str, str]
-    seconds: float
-
-
-def execute_touches(
-    tour: TouchTour, case: Case, anatomy: Anatomy, checkers: ApproachCheckers, truth: TouchTruth, progress: Count
-) -> Touched:
-    """Touch the markers where they truly are. The same tour and truth give the same numbers.
-
-    A marker that is not felt where it should be is given up with its reason, and the arm goes on from its standoff.
-    Where the arm or needle touched something else it stops, and what was not read by then stays unread.
-
-    Args:
-        tour: Where, in which order, by which motions.
-        case: For tool, boxes and gravity.
-        anatomy: For the skin.
-        checkers: Of the workcell as it is believed: a line moved at the standoff is checked again.
-        truth: All randomness but the force sensor's is in it, and that comes from its seed.
-        progress: Called with touches done and all of them.
-    """
-    tool, T = case_tool(case), truth.T_base_ct
-    down_ct = -bed_frame(case)[:3, 2]
-    with (
-        open_workcell(tour.model, tool, anatomy.skin.mesh, T, case_boxes(case, T), down_ct=down_ct) as room,
-        rigid_model(tour.model, tool, T[:3, :3] @ down_ct) as rigid,
-    ):
-        true = CellChecker(tour.model, tool, patient=patient_surface(anatomy).transformed(T))
-        cell = TouchingCell(room, rigid, tour, truth, checkers, true, np.random.default_rng([truth.seed, 1]))
-        room.arm.place(tour.touches[0].come.q[0])
-        return _tour(cell, progress)
-
-
-def _tour(cell: TouchingCell, progress: Count) -> Touched:
-    """Every marker, and home."""
-    readings: list[TouchReading] = []
-    failed: dict[str, str] = {}
-    touches, seconds = cell.tour.touches, 0.0
-    try:
-        for number, touch in enumerate(touches):
-            found = touch_marker(cell, touch)
-            if isinstance(found, FailedTouch):
-                failed[touch.name] = found.why
-            else:
-                readings.append(found)
-            seconds += found.seconds
-            progress(number + 1, len(touches))
-        seconds += seconds_of(moved_outside(cell, cell.tour.leave, np.zeros(6)))
-    except StoppedError as stop:
-        done = {one.name for one in readings} | set(failed)
-        failed |= {touch.name: f"the tour was stopped: {stop}" for touch in touches if touch.name not in done}
-    return Touched(tuple(readings), failed, seconds)

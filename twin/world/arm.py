@@ -27,7 +27,7 @@ VELOCITY_GAIN = 1.0
 
 
 class JointState(NamedTuple):
-    """What the joints do now."""
+    """Angles and speeds of the joints."""
 
     q: Floats
     """Shape (6,), rad."""
@@ -156,7 +156,7 @@ def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | Non
 
 
 def _names(urdf: ArmUrdf) -> dict[str, str]:
-    """What the URDF's moving links, and those that are added to them, are called here."""
+    """Names of the URDF's moving links, and of those that are added to them."""
     first = [body[0].link.name for body in urdf.chain.bodies]
     return {
         **{name: name for name in ("tool", "holder", "needle")},

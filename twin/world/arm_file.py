@@ -26,17 +26,17 @@ NEEDLE_DENSITY_KG_M3 = 7900.0
 """Stainless steel, taken as solid."""
 
 
-KEPT = ("visual", "collision", "inertial")
-"""Of a link; other programs' additions would be taken for friction and the like."""
+KEPT_TAGS = ("visual", "collision", "inertial")
+"""Elements of a link that are kept; other programs' additions would be taken for friction and the like."""
 
 NO_WEIGHT = ET.fromstring(
     '<inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
 )
-"""Of a link that states nothing: PyBullet would take 1 kg, and 1 kg m^2 about each axis."""
+"""Inertia of a link that states none: PyBullet would take 1 kg, and 1 kg m^2 about each axis."""
 
 
 def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
-    """Write the arm with holder and needle as a URDF that PyBullet can load, and its collision pieces beside it.
+    """Write the arm with holder and needle as a URDF that PyBullet can load, and its collision pieces next to it.
 
     The collision bodies are the planner's own: convex pieces that contain each link.
 
@@ -84,7 +84,7 @@ def _simplify(robot: ET.Element) -> None:
             robot.remove(element)
     for link in robot.findall("link"):
         for element in list(link):
-            if element.tag not in KEPT:
+            if element.tag not in KEPT_TAGS:
                 link.remove(element)
         if link.find("inertial") is None:
             link.append(deepcopy(NO_WEIGHT))

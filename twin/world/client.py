@@ -1,8 +1,6 @@
-"""A headless physics client: opened, set up to repeat itself exactly, and closed again.
+"""The PyBullet client, headless and repeatable; and the one place where millimetres become PyBullet's metres, and back.
 
-PyBullet itself, imported without the line that it writes to standard error each time.
-
-The one place where the project's millimetres become PyBullet's metres, and back; surfaces as OBJ files in metres.
+PyBullet is imported without the line that it writes to standard error each time.
 """
 
 from __future__ import annotations

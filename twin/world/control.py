@@ -1,34 +1,21 @@
-"""A motion of the tip under one of the controllers, taken over from the position motors while the arm is at rest.
+"""Control of the tip along a motion: impedance, admittance or position motors, taken over while the arm is at rest.
 
-A spring and a damper at the needle's tip, by joint torques (Hogan 1985).
+**Impedance** (`Impedance`): a spring and a damper at the needle's tip, by joint torques (Hogan 1985).
 
     tau = ID(q, qd, qdd_ref) + J' (K e + D de/dt + K_i K int e dt)
 
 e is the reference's tip minus the measured one: position, then the rotation between them, in base axes. Without
 contact the model's torque alone follows the reference and the spring corrects what the masses err by; in contact the
-tip yields by F / K. The integral takes the rest away, and with it, in 1/K_i seconds, the compliance: it stands still
-while contact is felt, where the compliance is to be kept.
+tip yields by F / K. The integral takes the rest away, and with it, in 1/K_i seconds, the compliance: it stops
+while contact is measured, where the compliance is to be kept.
 
-Stiffness and damping at the tip, and the rule by which a stiffness is refused before it diverges.
-
-Along one mode of effective mass m the loop of stiffness K = m w^2 and damping 2 zeta w m, integrated with the step dt,
-is stable while (w dt)^2 + 4 zeta w dt < 4; for zeta = .8 that is w dt < .96. What is allowed is `MOST_RATIO`.
+**Stability** (`damping`, `refuse_unstable`): along one mode of effective mass m the loop of stiffness K = m w^2 and
+damping 2 zeta w m, integrated with the step dt, is stable while (w dt)^2 + 4 zeta w dt < 4; for zeta = .8 that is
+w dt < .96. What is allowed is `MOST_RATIO`.
 
 Source: Hogan 1985, "Impedance control"; Albu-Schaeffer, Ott, Frese, Hirzinger 2003, "Cartesian impedance control of
 redundant robots": damping by factors of mass and stiffness at once ("double diagonalisation"). Their other design, from
 the roots of both, is not positive where position and rotation are coupled, and an arm with a long needle oscillates.
-
-What the tip shall do: a joint motion at every step of the controller, with its speeds and accelerations.
-
-The arm under a controller or its own motors, step by step: what it felt and where its tip went.
-
-The controller's own model of the arm: its inverse dynamics and mass matrix, right for any mount.
-
-PyBullet evaluates inverse dynamics as if the body's base were not turned in the world: gravity enters in world axes and
-leaves in base axes. The model therefore stands in a world of its own, its URDF base unturned, under a gravity that was
-turned instead: g_urdf = R_urdf_base g_base.
-
-The needle's tip as the controller computes it: pose and Jacobian, in metres.
 """
 
 from __future__ import annotations
@@ -60,7 +47,7 @@ from puncture_twin.twin.world.client import (
     to_m,
     to_mm,
 )
-from puncture_twin.twin.world.execution import RECORD_S, Execution, Recorder, felt_force
+from puncture_twin.twin.world.execution import RECORD_S, Execution, Recorder, contact_force
 from puncture_twin.twin.world.workcell import SimulatedWorkcell
 
 TipControl = Literal["impedance", "admittance", "position"]
@@ -76,7 +63,7 @@ class Insertion:
         tool: What its flange carries.
         down_base: Shape (3,), unit vector of gravity, base frame.
         trajectory: From rest to rest.
-        hold_s: How long its end is held.
+        hold_s: How long its end is kept.
     """
 
     model: UrModel
@@ -87,7 +74,7 @@ class Insertion:
 
 
 class Inserted(NamedTuple):
-    """What happened, and how far the tip was from where it should be, as the encoders say, at most, mm."""
+    """Records of an insertion, and the tip's largest deviation from the reference by the encoders, mm."""
 
     execution: Execution
     off_path_mm: float
@@ -105,8 +92,8 @@ def insert(
     """Run an insertion from where the arm is.
 
     Args:
-        workcell: An open room, its arm at rest at the trajectory's start.
-        insertion: What is wanted.
+        workcell: An open workcell, its arm at rest at the trajectory's start.
+        insertion: The insertion to run.
         control: How the tip follows it.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
         start_s: Time of its first step.
@@ -127,7 +114,7 @@ def insert(
 
 
 def _controller(rigid: RigidModel, control: TipControl, q_path: Floats) -> Controller:
-    """The controller with the longest step that the whole path allows."""
+    """The controller with the longest step that is stable on the whole path."""
     if control == "position":
         return Motors()
     if control == "admittance":
@@ -139,12 +126,12 @@ def _controller(rigid: RigidModel, control: TipControl, q_path: Floats) -> Contr
 
 
 MOST_DECAY = 2.0
-"""Of D dt / M: from there on the explicit step of the virtual mass overshoots more than it takes away."""
+"""Limit of D dt / M: from there on the explicit step of the virtual mass overshoots more than it takes away."""
 
 
 @dataclass(frozen=True)
 class VirtualMass:
-    """What the tip pretends to be: M x'' + D x' + K x = F."""
+    """Virtual mass of the tip: M x'' + D x' + K x = F."""
 
     mass_kg: float = 1.0
     damping_ns_m: float = 63.0
@@ -178,7 +165,7 @@ class Admittance:
         """Goals of the position motors for the next step."""
         self._yield(measured.force_n)
         J = tips(self._model, self._tip_m, measured.q[None]).J[0]
-        moved = np.linalg.solve(J, np.concatenate([self._place, np.zeros(3)]))
+        moved = np.linalg.solve(J, np.concatenate([self._place, np.zeros(3)]))  # the tip yields without a rotation
         speed = np.linalg.solve(J, np.concatenate([self._velocity, np.zeros(3)]))
         return Goals(reference.q[row] + moved, reference.speed[row] + speed)
 
@@ -186,7 +173,7 @@ class Admittance:
         of = self._virtual
         pull = force_n - of.damping_ns_m * self._velocity - of.stiffness_n_m * self._place
         self._velocity = self._velocity + self.dt / of.mass_kg * pull
-        self._place = self._place + self.dt * self._velocity
+        self._place = self._place + self.dt * self._velocity  # semi-implicit: the new speed
 
 
 REFRESH_STEPS = 5
@@ -203,7 +190,7 @@ class Impedance:
         model: Of the arm's masses.
         stiffness: At the tip.
         dt: Its step, s.
-        keep_compliance: Whether the integral stands still while contact is felt.
+        keep_compliance: Whether the integral stops while contact is measured.
     """
 
     def __init__(self, model: RigidModel, stiffness: Stiffness, dt: float, *, keep_compliance: bool = True) -> None:
@@ -230,9 +217,9 @@ class Impedance:
         turn = rotation_error(reference.R_base_tip[row], tip.R_base_tip[0])
         error = np.concatenate([reference.position_m[row] - tip.position_m[0], turn])
         if not (self._keep_compliance and np.linalg.norm(measured.force_n) > CONTACT_N):
-            self._integral = self._integral + self.dt * error
+            self._integral = self._integral + self.dt * error  # of position (m s) and rotation (rad s)
         spring = self._K * (error + self._stiffness.integral_per_s * self._integral)
-        wrench = spring + self._D @ (reference.twist[row] - J @ measured.speed)
+        wrench = spring + self._D @ (reference.twist[row] - J @ measured.speed)  # damps what differs from the motion
         feedforward = self._model.inverse_dynamics(measured.q, measured.speed, reference.acceleration[row])
         return Torques(feedforward + J.T @ wrench)
 
@@ -247,10 +234,10 @@ def rotation_error(R_reference: Floats, R: Floats) -> Floats:
 
 
 MOST_RATIO = 0.8
-"""Of sqrt(K / m) dt over every mode of the tip: five sixths of where the loop diverges."""
+"""Limit of sqrt(K / m) dt over every mode of the tip: five sixths of where the loop diverges."""
 
 STEPS_S = (RECORD_S / 17, RECORD_S / 34, RECORD_S / 68)
-"""Of a controller, the longest first: about 1, .5 and .25 ms, and records fall on steps."""
+"""Time steps of a controller, the longest first: about 1, .5 and .25 ms, and records fall on steps."""
 
 
 @dataclass(frozen=True)
@@ -288,14 +275,14 @@ def damping(stiffness: Stiffness, J: Floats, M: Floats) -> Floats:
     """
     root = np.sqrt(stiffness.diagonal)
     squares, U = np.linalg.eigh(root[:, None] * (J @ np.linalg.solve(M, J.T)) * root)
-    modes = root[:, None] * U
+    modes = root[:, None] * U  # K^1/2 U
     w = np.sqrt(np.maximum(squares, SLOWEST**2 * squares[-1]))
     return np.asarray(2.0 * stiffness.damping_ratio * (modes / w) @ modes.T)
 
 
 def stability_ratio(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> float:
     """sqrt(K / m) dt of the fastest mode: the largest eigenvalue of Lambda^-1 K = J M^-1 J' K."""
-    root = np.sqrt(stiffness.diagonal)[:, None] * J
+    root = np.sqrt(stiffness.diagonal)[:, None] * J  # symmetric form: the same eigenvalues
     fastest = np.linalg.eigvalsh(root @ np.linalg.solve(M, root.T))[-1]
     return float(np.sqrt(fastest) * dt)
 
@@ -359,14 +346,14 @@ class Reference:
 
 
 def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float, hold_s: float = 0.0) -> Reference:
-    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then held.
+    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then constant.
 
     Args:
         model: The arm.
         tip_m: Flange to tip.
         trajectory: From rest to rest.
         dt: The controller's step, s.
-        hold_s: How long its end is held.
+        hold_s: How long its end is kept.
     """
     moving = int(np.ceil(trajectory.duration_s / dt)) + 1
     times = np.minimum(dt * np.arange(moving + round(hold_s / dt)), trajectory.duration_s)
@@ -374,7 +361,7 @@ def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float
         still = np.zeros((len(times), 6))
         return _reference(model, tip_m, np.tile(trajectory.q[0], (len(times), 1)), still, still)
     spline = CubicSpline(trajectory.times_s, trajectory.q, bc_type="clamped")
-    at_rest = (times >= trajectory.duration_s)[:, None]
+    at_rest = (times >= trajectory.duration_s)[:, None]  # the spline's slopes there are rounding
     return _reference(
         model, tip_m, spline(times), np.where(at_rest, 0.0, spline(times, 1)), np.where(at_rest, 0.0, spline(times, 2))
     )
@@ -418,7 +405,7 @@ TIP_LINK = "needle"
 
 
 class Measured(NamedTuple):
-    """What a controller is told at one step."""
+    """Measurements that a controller gets at one step."""
 
     q: Floats
     """Shape (6,), rad, what the encoders say."""
@@ -429,14 +416,14 @@ class Measured(NamedTuple):
 
 
 class Torques(NamedTuple):
-    """For the next step, the motors off."""
+    """Joint torques for the next step, the motors off."""
 
     torque_nm: Floats
     """Shape (6,)."""
 
 
 class Goals(NamedTuple):
-    """Of the position motors."""
+    """Goals of the position motors."""
 
     q: Floats
     """Shape (6,), rad, encoders."""
@@ -450,7 +437,7 @@ class Controller(Protocol):
     dt: float
 
     def act(self, measured: Measured, reference: Reference, row: int) -> Torques | Goals:
-        """What the joints shall do in the next step."""
+        """Torques or goals for the next step."""
 
 
 class Push(NamedTuple):
@@ -463,17 +450,17 @@ class Push(NamedTuple):
 
 
 Resistance = Callable[[Tip], Sequence[Push]]
-"""What tissue presses on the needle with, now that its tip is there (one row). It may remember where the tip was."""
+"""Forces of tissue on the needle for the present tip (one row). It may remember where the tip was."""
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One row a step: at its start, and the force of the step before.
+    """Records of a run, one row a step: at its start, and the force of the step before.
 
     Attributes:
         dt: Between rows, s.
         q: Shape (n, 6), rad, encoders.
-        tip_m: Shape (n, 3), where the tip truly was, base frame.
+        tip_m: Shape (n, 3), true tip, base frame.
         force_n: Shape (n, 3), N, on the tip.
         stopped: Whether it ended before its reference did.
     """
@@ -490,7 +477,7 @@ Stop = Callable[[Measured], bool]
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What acts on the arm besides its controller.
+    """Forces on the arm besides its controller.
 
     Attributes:
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
@@ -511,9 +498,9 @@ def run(
     """Follow a reference from where the arm is.
 
     Args:
-        arm: Of an open room whose world is the base frame.
+        arm: Of an open workcell whose world is the base frame.
         controller: Its step becomes that of the physics.
-        reference: What is wanted, a row a step.
+        reference: The motion to follow, a row a step.
         tip_of: The true tip of true joints.
         around: What else acts.
     """
@@ -523,7 +510,7 @@ def run(
     for row in range(len(reference)):
         state = arm.state()
         tip = tip_of(state.q)
-        force = felt_force(arm, TIP_LINK)
+        force = contact_force(arm, TIP_LINK)
         for push in () if around.resistance is None else around.resistance(tip):
             arm.push(TIP_LINK, push.force_n, push.point_m)
             force = force + push.force_n
@@ -544,11 +531,11 @@ def _give(arm: Arm, action: Torques | Goals, joint_offsets: Floats) -> None:
     if isinstance(action, Torques):
         arm.torque(action.torque_nm)
     else:
-        arm.command(action.q + joint_offsets, action.speed)
+        arm.command(action.q + joint_offsets, action.speed)  # encoders to true joints
 
 
 class Motors:
-    """The reference's joints are the motors' goals, whatever is measured."""
+    """A controller that passes the reference's joints to the motors, whatever is measured."""
 
     dt = TIME_STEP_S
 
@@ -560,7 +547,11 @@ class Motors:
 
 @dataclass(frozen=True)
 class RigidModel:
-    """What the controller knows of the arm's masses; it never moves.
+    """The controller's model of the arm's masses; it never moves.
+
+    PyBullet evaluates inverse dynamics as if the body's base were not rotated in the world: gravity enters in world
+    axes and leaves in base axes. The model therefore has a world of its own, its URDF base unrotated, under a gravity
+    that was rotated instead: g_urdf = R_urdf_base g_base.
 
     Attributes:
         kinematics: Lengths of the arm.

@@ -1,7 +1,4 @@
-"""Commands in, what happened out: the arm moved by its motors, step by step of the physics.
-
-Who touches the arm, and how near two bodies are, according to the physics.
-"""
+"""Execution by the position motors, step by step of the physics, and the contacts that the physics reports."""
 
 from __future__ import annotations
 
@@ -30,13 +27,13 @@ class TouchAt(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """What was measured, one row for each of m records.
+    """Records of an execution, one row for each of m.
 
     Attributes:
         times_s: Shape (m,), of each record, from the first command.
-        q_command: Shape (m, 6), rad, what was asked.
+        q_command: Shape (m, 6), rad, commanded joints.
         q: Shape (m, 6), rad, what the encoders say: true angle minus offset.
-        T_base_flange: Shape (m, 4, 4), mm, where the flange truly was.
+        T_base_flange: Shape (m, 4, 4), mm, true pose of the flange.
         touches: Every contact at every physics step.
         max_speed: Shape (6,), rad/s, over every step.
     """
@@ -50,10 +47,10 @@ class Execution:
 
 
 class Recorder:
-    """Looks at the arm after every physics step, and keeps a record `RECORD_S` apart and at the end.
+    """Records the arm after physics steps: `RECORD_S` apart, and at the end.
 
     Args:
-        workcell: An open room.
+        workcell: An open workcell.
         q_command: Shape (n, 6), rad, one row a physics step.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
         dt: The physics step, s.
@@ -72,7 +69,7 @@ class Recorder:
         self._max_speed = np.zeros(6)
 
     def see(self, row: int) -> None:
-        """Look after the step of a row."""
+        """Record after the step of a row."""
         arm, state = self._room.arm, self._room.arm.state()
         self._max_speed = np.maximum(self._max_speed, np.abs(state.speed))
         time = self._time(row)
@@ -83,7 +80,7 @@ class Recorder:
             self._poses.append(arm.flange_pose())
 
     def execution(self) -> Execution:
-        """What was seen so far."""
+        """The records so far."""
         times = np.array([self._time(row) for row in self._rows])
         found = np.array(self._q), np.array(self._poses), tuple(self._touches), self._max_speed
         return Execution(times, self._q_command[self._rows], *found)
@@ -96,7 +93,7 @@ def execute(workcell: SimulatedWorkcell, q_command: Floats, joint_offsets: Float
     """Move the arm by its position motors from rest at the first command through all of them, one a physics step.
 
     Args:
-        workcell: An open room.
+        workcell: An open workcell.
         q_command: Shape (n, 6), rad, spaced by the physics time step.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
     """
@@ -147,7 +144,7 @@ def touches(arm: Arm) -> tuple[Touch, ...]:
     return tuple(Touch(arm.link_name(link), other, depth) for (link, other), depth in sorted(deepest.items()))
 
 
-def felt_force(arm: Arm, link: str) -> Floats:
+def contact_force(arm: Arm, link: str) -> Floats:
     """The force of the workcell's bodies on one link, as of the last physics step: shape (3,), N, world frame."""
     force = np.zeros(3)
     for point in pybullet.getContactPoints(bodyA=arm.body, linkIndexA=arm.links[link], physicsClientId=arm.client):

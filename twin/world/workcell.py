@@ -1,10 +1,6 @@
-"""The whole workcell: the arm with its needle, the patient at their true place, and the boxes around them.
+"""The simulated workcell: the arm with its needle, the patient at their true place, boxes, and headless images of it.
 
-The world frame is the controller's base frame.
-
-What else stands in the workcell: the patient's skin, boxes, and surfaces that are only seen.
-
-Pictures of the workcell, drawn without a screen or a graphics card.
+The world frame is the controller's base frame. Surfaces may be loaded to be seen only.
 """
 
 from __future__ import annotations
@@ -31,7 +27,7 @@ from puncture_twin.twin.world.client import physics_client, pose_to_m, pybullet,
 
 @dataclass(frozen=True)
 class SimulatedWorkcell:
-    """A room that is open.
+    """An open simulated workcell.
 
     Attributes:
         client: Physics client id.
@@ -54,7 +50,7 @@ def open_workcell(
     *,
     down_ct: Floats,
 ) -> Iterator[SimulatedWorkcell]:
-    """Build the room, yield it, and take it down.
+    """Build the workcell, yield it, and take it down.
 
     The needle's shaft passes the skin without resistance; its holder and the arm collide with it.
 
@@ -82,7 +78,7 @@ def open_workcell(
 Rgba = tuple[float, float, float, float]
 
 MAX_PHYSICS_FACES = 20_000
-"""Surfaces with more triangles are thinned for physics and pictures; verdicts come from FCL on the full ones."""
+"""Surfaces with more triangles are thinned for physics and images; verdicts come from FCL on the full ones."""
 
 SKIN_RGBA: Rgba = (0.93, 0.78, 0.68, 1.0)
 BOX_RGBA: Rgba = (0.60, 0.63, 0.67, 1.0)
@@ -91,7 +87,7 @@ CONTACT_MARGIN_M = 0.0
 """Bullet grows concave shapes by this; contact shall begin at the surface itself."""
 
 CONTACT_DAMPING_NS_M = 100.0
-"""Of bodies that yield."""
+"""Damping of bodies that yield."""
 
 
 def load_surface(
@@ -109,7 +105,7 @@ def load_surface(
         mesh: The surface, mm; thinned to ``max_faces``.
         T_world_mesh: Its pose, shape (4, 4), mm.
         solid: Whether bodies collide with it, or it is only seen.
-        max_faces: How many triangles physics and pictures bear.
+        max_faces: How many triangles physics and images bear.
 
     Returns:
         Body id.
@@ -158,7 +154,7 @@ def remove(client: int, body: int) -> None:
 
 
 def soften(client: int, body: int, stiffness_n_m: float) -> None:
-    """Let a body that stands still yield in contact like a spring, N/m, lightly damped."""
+    """Let a fixed body yield in contact like a spring, N/m, lightly damped."""
     soft = {"contactStiffness": stiffness_n_m, "contactDamping": CONTACT_DAMPING_NS_M}
     pybullet.changeDynamics(body, -1, **soft, physicsClientId=client)
 
@@ -183,17 +179,17 @@ NEAR_M = 0.05
 FAR_M = 10.0
 
 LIGHT_UP = 1.5
-"""The lamp hangs above the camera: its direction is the camera's plus this much of up."""
+"""The light is above the camera: its direction is the camera's plus this much of up."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCamera:
-    """Where one looks from, and the picture's size.
+    """Place and view direction of a camera, and the image's size.
 
     Attributes:
         eye_mm: Shape (3,), world frame.
-        look_at_mm: Shape (3,), the middle of the picture.
-        up: Shape (3,), what is up in the picture, world frame.
+        look_at_mm: Shape (3,), the middle of the image.
+        up: Shape (3,), what is up in the image, world frame.
         width: Pixels.
         height: Pixels.
     """
@@ -206,7 +202,7 @@ class SimulatedCamera:
 
 
 def picture(client: int, camera: SimulatedCamera) -> NDArray[np.uint8]:
-    """The room as it stands, shape (height, width, 3), RGB."""
+    """An image of the workcell as it is, shape (height, width, 3), RGB."""
     view = pybullet.computeViewMatrix(
         to_m(camera.eye_mm).tolist(), to_m(camera.look_at_mm).tolist(), camera.up.tolist()
     )
@@ -219,7 +215,7 @@ def picture(client: int, camera: SimulatedCamera) -> NDArray[np.uint8]:
 def pinhole_picture(
     client: int, size: tuple[int, int], K: NDArray[np.float64], T_camera_world: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """The room as a calibrated camera sees it, without its lens's distortion, shape (height, width, 3), RGB.
+    """An image of the workcell by a calibrated camera, without its lens's distortion, (height, width, 3), RGB.
 
     For looking at, not for measuring: the renderer samples pixel corners and has no anti-aliasing.
 
@@ -243,7 +239,7 @@ def pinhole_picture(
 def _drawn(
     client: int, size: tuple[int, int], view: list[float], projection: list[float], light: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """A picture by PyBullet's software renderer; the lamp shines from a direction (3,)."""
+    """An image by PyBullet's software renderer; the light shines from a direction (3,)."""
     width, height = size
     image = pybullet.getCameraImage(
         width,

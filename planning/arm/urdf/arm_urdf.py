@@ -22,7 +22,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
 ROUND_SIDES = 48
-"""Of the prism about a cylinder: up to 0.2 % wider than it is (0.1 mm at a radius of 50 mm)."""
+"""Sides of the prism about a cylinder: up to 0.2 % wider than it is (0.1 mm at a radius of 50 mm)."""
 
 Read = Callable[[str], bytes]
 """The content of a mesh file, by its address in the URDF."""

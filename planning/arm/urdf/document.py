@@ -1,4 +1,4 @@
-"""A URDF as plain values: links with their shapes, and joints; in mm and rad. What cannot be read whole is refused."""
+"""URDF documents as plain values, mm and rad: links with shapes, and joints. What cannot be read whole is refused."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MM_PER_M = 1000.0
 """URDFs speak metres."""
 
 MOST_BYTES = 10_000_000
-"""Of a URDF: the largest of a whole humanoid has a tenth of it."""
+"""Bytes of a URDF: the largest of a whole humanoid has a tenth of it."""
 
 MOST_LINKS = 1000
 """Of a URDF: an arm has ten."""

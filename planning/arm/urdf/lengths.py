@@ -1,11 +1,10 @@
-"""The lengths of an arm built as a UR, from its URDF's chain; another arm is refused, with the joint that differs.
+"""Denavit-Hartenberg lengths and joint limits of an arm built as a UR, from its URDF; another arm is refused.
 
-At the angle zero a UR's axes are, in the controller's base frame (Denavit-Hartenberg, see `planning.arm.ur`): axis 1
-along z through the origin; axes 2, 3 and 4 along -y at the heights d1, at x = 0, a2 and a2 + a3; axis 5 along -z at
-x = a2 + a3, y = -d4; axis 6 along -y at the height d1 - d5; the flange d6 farther, its z along axis 6, its x along x.
-Joint limits are its own, or narrower ones that the case states; none is guessed.
-
-Which joints of a URDF are the arm: six that turn, one after another from the root to the flange, and fixed ones.
+`arm_chain` finds the six rotating joints, one after another from the root to the flange; `ur_lengths` compares their
+axes at the angle zero with a UR's, and names the joint that differs. In the controller's base frame (see
+`planning.arm.ur`) these are: axis 1 along z through the origin; axes 2, 3 and 4 along -y at the heights d1, at x = 0,
+a2 and a2 + a3; axis 5 along -z at x = a2 + a3, y = -d4; axis 6 along -y at the height d1 - d5; the flange d6 farther,
+its z along axis 6, its x along x. Joint limits are its own, or narrower ones that the case states; none is guessed.
 """
 
 from __future__ import annotations
@@ -27,28 +26,29 @@ SQUARE_RAD = 1e-4
 """How far an axis may be from where a UR has it: 1.5708 for a right angle is off by 4e-6, 1.57 by 8e-4."""
 
 OFF_MM = 0.05
-"""The same for an axis' place and the flange's: what a UR repeats. Rounded angles leave 0.005 mm at a metre."""
+"""mm by which an axis' place and the flange's may be off: what a UR repeats. Rounded angles leave 0.005 mm at a
+metre."""
 
 DIGITS_MM = 6
-"""To which lengths are rounded: a URDF's right angles are rounded, so that its chain gives 89.15899999999999."""
+"""Decimals of a length: a URDF's right angles are rounded, so that its chain gives 89.15899999999999."""
 
 DIGITS_TURN = 9
-"""To which the base's rotation is rounded, for the same reason."""
+"""Decimals of the base's rotation, for the same reason."""
 
 BASE = "base"
 """The link that ROS has for the controller's base frame."""
 
 DIRECTIONS = np.array([[0, 0, 1], [0, -1, 0], [0, -1, 0], [0, -1, 0], [0, 0, -1], [0, -1, 0]], dtype=np.float64)
-"""Of a UR's six axes at the angle zero, base frame."""
+"""Directions of a UR's six axes at the angle zero, base frame."""
 
 R_BASE_FLANGE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Of a UR's flange at the angle zero."""
+"""Orientation of a UR's flange at the angle zero, base frame."""
 
 AS_UR = "six axes as a UR's, zero and sense of rotation included (docs/how-to/own-arm.md)"
 
 
 class UrLengths(NamedTuple):
-    """What a chain gives where it is a UR's."""
+    """Denavit-Hartenberg lengths of a chain that is a UR's, and its root in the controller's base frame."""
 
     lengths_mm: tuple[float, ...]
     """d1, a2, a3, d4, d5, d6."""
@@ -67,7 +67,7 @@ class _Axes(NamedTuple):
     """Shape (4, 4), mm."""
 
     def moved(self, T: Floats) -> _Axes:
-        """The same in another frame."""
+        """The axes in another frame."""
         return _Axes(apply(T, self.points), self.directions @ T[:3, :3].T, T @ self.T_flange)
 
 
@@ -99,7 +99,7 @@ def ur_lengths(chain: ArmChain, document: UrdfDocument, T_base_root: Floats | No
 
 
 def _axes(chain: ArmChain) -> _Axes:
-    """In the root's frame."""
+    """The six axes and the flange at the angle zero, in the root's frame."""
     poses = chain.body_poses(np.eye(4), np.zeros(len(chain.joints)))
     directions = np.stack([T[:3, :3] @ joint.axis for T, joint in zip(poses[1:], chain.joints, strict=True)])
     return _Axes(poses[1:, :3, 3], directions, poses[-1] @ chain.T_body_flange)
@@ -154,11 +154,11 @@ def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
             what = f"passes {np.linalg.norm(off):.4g} mm beside where a UR's does, by ({_mm(off)}) mm in the base"
             raise _other(chain, joint, what, document)
     off = [float(T[0, 3] - p[3, 0]), 0.0, float(T[2, 3] - p[5, 2])]
-    turned = rotation_angle(R_BASE_FLANGE.T @ T[:3, :3])
-    if np.linalg.norm(off) > OFF_MM or turned > SQUARE_RAD:
+    off_angle = rotation_angle(R_BASE_FLANGE.T @ T[:3, :3])
+    if np.linalg.norm(off) > OFF_MM or off_angle > SQUARE_RAD:
         what = (
             f"the flange '{chain.flange}' is {np.linalg.norm(off):.4g} mm beside axis 6 and turned by "
-            f"{np.degrees(turned):.4g} degrees against a UR's"
+            f"{np.degrees(off_angle):.4g} degrees against a UR's"
         )
         raise InputError(what, where=document.where, allowed=f"the link that a UR has as tool0; {AS_UR}")
 
@@ -178,11 +178,11 @@ MOST_RAD_S = 4.0 * math.pi
 """Twice as fast as any joint of a UR: beyond, a speed is in degrees."""
 
 ROUNDING_RAD = 1e-4
-"""By which a stated limit may exceed the URDF's: 6.2832 for a whole turn."""
+"""rad by which a stated limit may exceed the URDF's: 6.2832 for a whole turn."""
 
 
 class JointLimits(NamedTuple):
-    """What six joints can do."""
+    """Angle, speed and torque limits of six joints."""
 
     angles: Floats
     """Shape (6, 2), rad."""

@@ -1,6 +1,6 @@
 """A surface packed for the fast search: blocks of 16 triangles under an implicit 16-ary tree of discs.
 
-The discs about blocks of triangles, and about 16 discs of the level below.
+Each disc bounds a block's triangles, or 16 discs of the level below.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class Blocks:
 
     @property
     def nbytes(self) -> int:
-        """What the arrays hold."""
+        """Bytes of the arrays."""
         return sum(array.nbytes for array in (self.triangles, self.local, self.center, self.disc, self.base))
 
 
 def block_order(mesh: TriangleMesh) -> NDArray[np.int32]:
-    """The order in which a surface's triangles fill its blocks, shape (m,): what takes longest to find of them."""
+    """Order in which a surface's triangles fill its blocks, shape (m,): half of the time of packing."""
     return kd_order(_middles(mesh.vertices, mesh.faces), LANES).astype(np.int32)
 
 
@@ -106,7 +106,7 @@ def _fill(vertices, faces, order, triangles):  # type: ignore[no-untyped-def]  #
 
 
 PARALLEL = 1e-6
-"""Share of its triangles' area below which a block's mean normal says nothing."""
+"""Fraction of its triangles' area below which a block's mean normal says nothing."""
 
 FAINT = 1e-140
 """Length, mm^2, below which a mean normal says nothing: its square nears the least number, and is not its length's."""
@@ -164,7 +164,7 @@ def _center_along(corners, n, c):  # type: ignore[no-untyped-def]  # numba infer
 
 @allocation_free(nogil=True)
 def _mean_normal(corners):  # type: ignore[no-untyped-def]  # numba infers
-    """Unit mean of the triangles' normals by area, all turned to the side of the largest; z where there is none."""
+    """Unit mean of the triangles' normals by area, all flipped to the side of the largest; z where there is none."""
     first, largest = (0.0, 0.0, 0.0), 0.0
     for row in range(LANES):
         normal = _normal(corners[row])
@@ -208,7 +208,7 @@ def parent_discs(center, disc, child, count, parent):  # type: ignore[no-untyped
 
 @allocation_free(nogil=True)
 def _mean_of_discs(disc, low, high):  # type: ignore[no-untyped-def]  # numba infers
-    """Unit mean of the discs' normals by area, all turned to the side of the first; z where there is none."""
+    """Unit mean of the discs' normals by area, all flipped to the side of the first; z where there is none."""
     first = _axis(disc, low)
     x, y, z = 0.0, 0.0, 0.0
     for j in range(low, high):

@@ -168,7 +168,7 @@ def heed_ends(local, block, lanes, u, depth, length, slack, squares, first):  # 
 def lower_upper_bounds(frames, lanes, corners, length, error, upper):  # type: ignore[no-untyped-def]  # numba infers
     """Let one triangle lower the upper bounds of a bundle's members, all at once.
 
-    Where the triangle lies beside the axis its nearest edge is taken, else its nearest corner.
+    Where the triangle lies next to the axis its nearest edge is taken, else its nearest corner.
 
     Args:
         frames: Shape (9, 16), float32, each member's direction u, and e and f that complete it to a frame.

@@ -14,10 +14,11 @@ from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, least
 from puncture_twin.planning.clearance.kernels.side_by_side import PAIRS, bring_into_frame, measure_beside, measure_other
 
 ROUNDING = np.float32(4e-6)
-"""Share of its corners' distance from the line by which a float32 distance may err (docs/concepts/fast-search.md)."""
+"""Fraction of its corners' distance from the line by which a float32 distance may err
+(docs/concepts/fast-search.md)."""
 
 AREA_ROUNDING = np.float32(2e-6)
-"""Share of that distance's square by which a float32 edge function may err."""
+"""Fraction of that distance's square by which a float32 edge function may err."""
 
 SINGLE = np.float32(2e-7)
 """Chord of one direction: what float32 takes from a unit vector."""
@@ -113,7 +114,7 @@ def _others(needle, groups, m, group, low, waiting, scratch, answer):  # type: i
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _contact_from(chosen, group, lane, u, slack):  # type: ignore[no-untyped-def]  # numba infers
-    """Depth before which an axis cannot meet what a disc holds: where it enters its sphere and its slab, mm."""
+    """Depth before which an axis cannot touch a disc's content: where it enters its sphere and its slab, mm."""
     center = (chosen[group, 0, lane], chosen[group, 1, lane], chosen[group, 2, lane])
     normal = (chosen[group, 3, lane], chosen[group, 4, lane], chosen[group, 5, lane])
     h, slope = chosen[group, 7, lane] + slack, _dot(normal, u)

@@ -1,10 +1,8 @@
-"""Sixteen float32 numbers side by side, written as LLVM's own vectors.
+"""Vectors of sixteen float32 numbers for compiled code, written as LLVM's own.
 
-What LLVM makes of a loop over 16 lanes depends on what else stands in it, and on its taste in register widths; a
-comparison of all lanes ends there as one number per lane. Here it ends as one integer, a bit per lane, so what passes
-is gone through by its bits and the rest costs nothing. Processors with shorter registers get two or four of them.
-
-Arrays without their reference count, for the inside of hot loops.
+What LLVM makes of a loop over 16 lanes depends on the code around it; a comparison of all lanes then ends as one number
+per lane. Here it ends as one integer, a bit per lane, so that only the lanes that pass cost anything. Processors with
+shorter registers use two or four of them. `bare` hands arrays to hot loops without their reference count.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ intrinsic: Any = extending.intrinsic
 
 @intrinsic  # type: ignore[untyped-decorator]  # numba's own types
 def bare(typing_context: Any, array: Any) -> Any:
-    """The same array without its reference count, which numba would touch at every call in a loop.
+    """The array without its reference count, which numba would touch at every call in a loop.
 
     Only for arguments of a function called from Python: the caller holds them until it returns.
     """
@@ -94,7 +92,7 @@ class Vector:
         return self._call("llvm.sqrt")
 
     def choose(self, yes: Vector, no: Vector | Number) -> Vector:
-        """Of a comparison: ``yes`` in the lanes where it holds, else ``no``."""
+        """Lane by lane ``yes`` where this comparison holds, else ``no``."""
         return Vector(self.builder, self.builder.select(self.value, yes.value, yes._like(no)))
 
     def _like(self, other: Vector | Number) -> Any:

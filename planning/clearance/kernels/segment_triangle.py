@@ -1,17 +1,12 @@
-"""Exact distance of a needle axis from one triangle, in float64, degenerate triangles included.
+"""Exact distance of a needle axis from triangles, in float64, degenerate triangles included.
 
 The axis starts at the origin and ends at ``length * u``. Every candidate below is a point *of the triangle*, given by
-non-negative weights of its corners, and its distance from the axis is evaluated honestly; so no candidate, however
-badly conditioned the arithmetic that proposed it, can make the answer too small. One of them is the nearest point.
+non-negative weights of its corners, and its distance from the axis is computed from that point. So no candidate,
+however badly conditioned, can make the distance too small; and one of them is the nearest point (`axis_triangle`).
 
-The target's own distance from a packed surface: the upper bound of every needle axis that starts there.
-
-Distances of one needle axis from the few faces near it, for axes that are displaced again and again, in float64.
-
-The arithmetic of a face is the engine's own (`axis_triangle`). Spheres around faces, and around blocks of 16 of them,
-only say which faces need not be asked.
-
-Which blocks of faces lie near a needle axis, and spheres around what they hold.
+`nearest_triangle` gives the target's own distance from a packed surface, an upper bound for every axis from there.
+`displaced_distance` measures an axis that is displaced again and again from the few faces near it: spheres around
+faces, and around blocks of 16, tell which faces may be skipped.
 """
 
 from __future__ import annotations
@@ -95,7 +90,7 @@ def _edge(ux, uy, uz, length, px, py, pz, qx, qy, qz):  # type: ignore[no-untype
     """Nearest of an edge's candidates: its corner p, and the nearest points to the line, to its start and to its end.
 
     The squared distance from the axis is convex and smooth along the edge, and on each of its pieces (behind the start,
-    beside the axis, beyond the end) it is one of three parabolas; its minimum is that of one of them.
+    next to the axis, beyond the end) it is one of three parabolas; its minimum is that of one of them.
     """
     dx, dy, dz = qx - px, qy - py, qz - pz
     tp, td = px * ux + py * uy + pz * uz, dx * ux + dy * uy + dz * uz
@@ -184,7 +179,7 @@ def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-
 
 @nb.njit(cache=True, error_model="numpy")
 def _distance(triangles, row, target):  # type: ignore[no-untyped-def]  # numba infers
-    """Of a point from one triangle: an axis of length 0, mm."""
+    """Distance of a point from one triangle, as an axis of length 0, mm."""
     t, (x, y, z) = triangles[row], (target[0], target[1], target[2])
     a, b, c = (t[0] - x, t[1] - y, t[2] - z), (t[3] - x, t[4] - y, t[5] - z), (t[6] - x, t[7] - y, t[8] - z)
     return np.sqrt(axis_triangle((0.0, 0.0, 1.0), 0.0, a, b, c)[0])

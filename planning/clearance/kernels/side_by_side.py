@@ -1,10 +1,9 @@
-"""Exact distances of many axes from many triangles, in float64, pair by pair and side by side.
+"""Exact distances of many axes from many triangles, in float64, pair by pair.
 
-Each pair is brought into the axis' own frame. Most triangles lie beside their axis, where the distance is that of their
-shadows in the plane across it; those are all done in one loop without a branch. The few others are told apart there.
-As in `segment_triangle.py` every answer is the distance of a point *of the triangle*.
-
-The room in which one structure is searched: arrays made once, passed down as one.
+Each pair is brought into the frame of its axis. Most triangles lie next to their axis, where the distance is that of
+their projection on the plane across it; those are all measured in one loop without a branch, the few others singly.
+As in `segment_triangle.py`, every distance is that of a point *of the triangle*.
+`Scratch` holds the arrays in which one structure is searched: made once, passed down as one.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.segment_triangle import CONTACT_MM, LEAST, STACK, axis_triangle
 
 ROWS = 12
-"""Of a buffer of pairs: nine coordinates, squared distance, depth, length of the axis."""
+"""Rows of a buffer of pairs: nine coordinates, squared distance, depth, length of the axis."""
 
 UNDECIDED, BEYOND = -1.0, -2.0
 """In place of a squared distance: `axis_triangle` must be asked; the triangle lies wholly beyond the axis' top."""
@@ -38,7 +37,7 @@ def bring_into_frame(u, e, f, triangles, row, origin, pairs, k):  # type: ignore
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def measure_beside(pairs, count):  # type: ignore[no-untyped-def]  # numba infers
-    """Answer the pairs whose triangle lies beside the axis or is pierced by it; mark the others.
+    """Answer the pairs whose triangle lies next to the axis or is pierced by it; mark the others.
 
     Args:
         pairs: Shape (12, m); rows 0 to 8 as `bring_into_frame` writes them, row 11 the axes' lengths; rows 9
@@ -144,7 +143,7 @@ APART = 8
 
 
 class Scratch(NamedTuple):
-    """Room for one bundle of at most 16 directions.
+    """Scratch arrays for one bundle of at most 16 directions.
 
     Attributes:
         found: Shape (r,), the blocks that the bundle may have to look at.
@@ -178,7 +177,7 @@ class Scratch(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a search writes: squared distance (mm^2), depth (mm), nearest triangle of each axis; `COUNTED`."""
+    """Output of a search: squared distance (mm^2), depth (mm), nearest triangle of each axis; `COUNTED`."""
 
     square: NDArray[np.float64]
     depth: NDArray[np.float64]
@@ -187,7 +186,7 @@ class Found(NamedTuple):
 
 
 class NeedleAxes(NamedTuple):
-    """Where all axes start and how long they are, and two float32 numbers.
+    """Start and length of all axes, and two float32 numbers.
 
     Attributes:
         target: Three numbers, mm.
@@ -203,7 +202,7 @@ class NeedleAxes(NamedTuple):
 
 
 def scratch_for(groups: int) -> Scratch:
-    """Room for bundles that may have to look at all of ``groups`` groups of blocks."""
+    """Scratch arrays for bundles that may have to test all of ``groups`` groups of blocks."""
     size = groups + 1
     return Scratch(
         found=np.empty(size * LANES, np.int64),

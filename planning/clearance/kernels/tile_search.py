@@ -64,7 +64,7 @@ def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _bare_scratch(s):  # type: ignore[no-untyped-def]  # numba infers
-    """The same arrays without their reference counts."""
+    """The scratch arrays without their reference counts."""
     return Scratch(
         bare(s.found), bare(s.chosen), bare(s.bounds), bare(s.stack), bare(s.frames), bare(s.frames32), bare(s.upper),
         bare(s.pairs), bare(s.squares), bare(s.least), bare(s.errors), bare(s.tried), bare(s.corners),
@@ -73,7 +73,7 @@ def _bare_scratch(s):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _bare_found(f):  # type: ignore[no-untyped-def]  # numba infers
-    """Likewise."""
+    """The output arrays without their reference counts."""
     return Found(bare(f.square), bare(f.depth), bare(f.triangle), bare(f.counts))
 
 

@@ -1,6 +1,6 @@
 """Compiled distance of two convex hulls, between two bounds that are each a proof: a plane, and two points.
 
-A direction is searched by climbing from corner to corner; what it proves is then told by all corners.
+A direction is searched by climbing from corner to corner; what it proves is then evaluated over all corners.
 
 Source: Gilbert, Johnson and Keerthi 1988, "A fast procedure for computing the distance between complex objects in
 three-dimensional space". The nearest point of a triangle: Ericson 2005, "Real-time collision detection", 5.1.5.
@@ -74,7 +74,7 @@ class Hulls(NamedTuple):
 
 @allocation_free()
 def _climb(corners, starts, ends, at, x, y, z):
-    """Row of the corner farthest along a direction, by way of ever better neighbours from row ``at`` on."""
+    """Row of the corner farthest along a direction, by ever better neighbours from row ``at`` on."""
     best, better = x * corners[at, 0] + y * corners[at, 1] + z * corners[at, 2], True
     while better:
         better = False
@@ -127,7 +127,7 @@ def _nearest_of_triangle(S, i, j, k):
 
 @allocation_free()
 def _outside(S, p, q, r, opposite):
-    """Whether the origin lies beyond the face p q r of a tetrahedron, or its inside cannot be told."""
+    """Whether the origin lies beyond the face p q r of a tetrahedron, or its inside cannot be decided."""
     ax, ay, az = S[p, 0], S[p, 1], S[p, 2]
     ux, uy, uz = S[q, 0] - ax, S[q, 1] - ay, S[q, 2] - az
     vx, vy, vz = S[r, 0] - ax, S[r, 1] - ay, S[r, 2] - az
@@ -168,7 +168,7 @@ def _keep(S, i, j, k):
 def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
     """A lower and an upper bound on the distance of two convex hulls, mm; (``TOUCHING``, 0) where they overlap.
 
-    The lower one is the gap between the hulls along a direction: a plane square to it stands between them. The upper
+    The lower one is the gap between the hulls along a direction: a plane square to it lies between them. The upper
     one is the distance of a point of the one to a point of the other. The search ends when the lower bound exceeds
     what is needed, or when the upper one does not and both are near enough.
 

@@ -1,7 +1,7 @@
-"""Compiled proofs that parts of an arm are clear, check by check, at states and all about them.
+"""Compiled proofs that parts of an arm are clear, check by check, at states and in boxes of joint angles about them.
 
-Each answer is a lower bound on a distance, in mm: above 0 it proves that nothing touches; at or below, nothing is said.
-The bounds themselves are those of `surfaces` and `hulls` beside this file.
+Each bound is a lower one on a distance, in mm: above 0 it proves that nothing touches; at or below, it proves nothing.
+The bounds themselves are those of `surfaces` and `hulls`.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -30,7 +30,7 @@ ENOUGH_MM = 12.0
 """Along a path a larger gap saves questions; beyond this it is not worth a closer look."""
 
 FAR_MM = 200.0
-"""Larger distances to the skin are not told apart."""
+"""Larger distances to the skin are not distinguished."""
 
 
 class SkinTree(NamedTuple):
@@ -39,7 +39,7 @@ class SkinTree(NamedTuple):
     tree: tuple[Floats, Floats, Floats]
     """Lowest and highest corners of its boxes and the triangles' corners: see :class:`TriangleTree`."""
     field: NDArray[np.float32]
-    """Shape (i, j, k), mm: distances of the middles of cells; NaN where nobody has computed yet."""
+    """Shape (i, j, k), mm: distances of the middles of cells; NaN where not computed yet."""
     origin: Floats
     """Shape (3,), mm: the lowest corner of the field."""
     outside: NDArray[np.bool_]
@@ -63,7 +63,7 @@ class ProofScene(NamedTuple):
 
 
 class Movers(NamedTuple):
-    """What moves in each check, and a sphere about it in the frame that it moves with."""
+    """The moving body of each check, and a sphere about it in the frame that it moves with."""
 
     of_check: Ints
     frames: Ints
@@ -72,14 +72,14 @@ class Movers(NamedTuple):
 
 
 class ProofScratch(NamedTuple):
-    """What the search for a proof remembers and where it works: see :func:`scratch`."""
+    """Memory and scratch of the search for a proof: see :func:`scratch`."""
 
     axes: Floats
     """Shape (k, 3): the last direction of each check; zero to begin anew."""
     corners: Ints
     """Shape (k, 2): the last corners."""
     spheres: Floats
-    """Shape (h, 3), mm: where the centres of the hulls' spheres stand."""
+    """Shape (h, 3), mm: where the centres of the hulls' spheres are."""
     stack: Ints
     inner_stack: Ints
     M: Floats
@@ -88,7 +88,7 @@ class ProofScratch(NamedTuple):
 
 @nb.njit(cache=True)
 def scratch(checks, hulls):
-    """Room to work in for so many checks and hulls."""
+    """Scratch for so many checks and hulls."""
     axes, corners, spheres = np.zeros((checks, 3)), np.zeros((checks, 2), np.int64), np.empty((hulls, 3))
     stacks = np.empty(STACK, np.int64), np.empty(STACK, np.int64)
     return ProofScratch(axes, corners, spheres, stacks[0], stacks[1], np.empty((3, 4)), np.empty((4, 3)))
@@ -154,7 +154,7 @@ def near_gap(scene, work, at, frames, enough, far, needed):
 def state_gap(scene, work, at, frames, enough, far, needed):
     """Lower bound as of :func:`near_gap`, sooner where the spheres about two hulls are ``enough`` apart.
 
-    The spheres stand where :func:`place_spheres` has put them.
+    The spheres are where :func:`place_spheres` has put them.
     """
     kind, first, second = scene.checks[at, 0], scene.checks[at, 1], scene.checks[at, 2]
     if kind != SKIN:
@@ -217,7 +217,7 @@ def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
         motion: (frames, moved, rotated), with
             frames: Shape (m, 7, 4, 4), mm: the states;
             moved: Shape (m, 7), mm: how far each frame's bodies may have moved since the first state; rising;
-            rotated: Shape (m, 6), rad: how far each joint has turned since the first state; rising.
+            rotated: Shape (m, 6), rad: how far each joint has rotated since the first state; rising.
         work: See :class:`ProofScratch`.
         due: Shape (k,): the state at which each check is due; 0 at the beginning.
         tested: Shape (k,): which checks.
@@ -246,7 +246,7 @@ def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
 
 @allocation_free()
 def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
-    """How far a body may move while each joint turns by no more than a fraction of ``turns`` (6,), rad, either way.
+    """How far a body may move while each joint rotates by at most a fraction of ``turns`` (6,), rad, either way.
 
     Fills ``paths`` (7,), mm: entry j bounds the motion against the frame before joint j, the arm standing at ``frames``
     (7, 4, 4) in the middle. A point's distance from axis j is at most that of the body's sphere, plus what the joints
@@ -264,7 +264,7 @@ def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
 
 @nb.njit(cache=True)
 def clear_about(scene, movers, frames, turns, work, gaps, unproven):
-    """Which checks are not proven clear at some states and wherever each joint turns by ``turns`` either way from them.
+    """Which checks are not proven clear at some states and wherever each joint rotates by ``turns`` from them.
 
     Args:
         scene: See :class:`ProofScene`.

@@ -1,14 +1,8 @@
 # mypy: disable-error-code="no-untyped-def"
-"""Compiled check of one straight joint segment: what surely touches, what is surely clear, and what is left to ask.
+"""Compiled check of one straight joint segment: certain contacts, what is certainly clear, and what FCL has to decide.
 
-It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.segments`, of those that it calls and of
-:mod:`puncture_twin.planning.arm.kinematics`.
-
-Compiled halving of a segment for all checks together: each part keeps those that no middle of a part has cleared.
-
-It calls the kernels of :mod:`puncture_twin.planning.collision.kernels.proofs` and of those that they call.
-
-What compiled checks of a segment share: the segment, its answer, and the room to work in.
+`divide` halves the segment for all checks together: each part keeps the checks that the middle of no larger part has
+cleared. `check_segment` goes on with each check alone. It calls the kernels of `proofs` and of the arm's kinematics.
 """
 
 from __future__ import annotations
@@ -39,7 +33,8 @@ from puncture_twin.planning.collision.kernels.proofs import (
 )
 
 KEPT = 0.8
-"""Of the clearance at the nearer end of a segment, what all of it is to keep: bounds are loose by up to a tenth."""
+"""Fraction of the clearance at the nearer end of a segment that all of it is to keep: bounds are loose by up to a
+tenth."""
 
 
 @allocation_free()
@@ -138,7 +133,7 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
         fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.
         clear_mm: What the arm is to keep from skin and boxes where both ends do, see :func:`_keep`; 0 for none.
         order: Shape (k,): the checks in the order in which they are tested.
-        room: See :class:`Room`.
+        room: See :class:`SegmentScratch`.
         answer: See :class:`Answer`.
     """
     step, frames = end - start, np.empty((1, 7, 4, 4))
@@ -203,7 +198,7 @@ def left_of(scene, movers, segment, part, span, into, room, answered, answer):
         part: Its middle and half its width, fractions of the segment.
         span: Which list of ``room.lists``, and from where to where, holds the checks that are to be cleared.
         into: Where in the other list the rest goes.
-        room: See :class:`Room`.
+        room: See :class:`SegmentScratch`.
         answered: See :func:`check_segment`.
         answer: Likewise.
 
@@ -292,7 +287,7 @@ PARTS = 256
 
 
 class Answer(NamedTuple):
-    """What a segment came to, filled by :func:`segments.check_segment`."""
+    """Result of a segment's check, filled by :func:`segments.check_segment`."""
 
     status: Ints
     """Shape (4,)."""
@@ -316,8 +311,8 @@ class Segment(NamedTuple):
     """Shape (1, 7, 4, 4), mm: filled by :func:`place_arm`."""
 
 
-class Room(NamedTuple):
-    """Where a segment is checked: see :func:`segment_room`. Nothing in it outlasts the segment."""
+class SegmentScratch(NamedTuple):
+    """Scratch in which a segment is checked: see :func:`segment_scratch`. Nothing in it outlasts the segment."""
 
     work: ProofScratch
     kept: Floats
@@ -334,12 +329,12 @@ class Room(NamedTuple):
     """Shape (``PARTS``, 2): parts of a segment that wait."""
 
 
-def segment_room(scene: ProofScene, movers: Movers) -> Room:
-    """Room for the checks of a cell."""
+def segment_scratch(scene: ProofScene, movers: Movers) -> SegmentScratch:
+    """Scratch for segments of a workcell's checks."""
     checks, count = len(scene.checks), len(movers.frames)
     lists, spans = np.empty((2, checks << HALVINGS), np.int64), np.empty((2, 2 << HALVINGS, 2), np.int64)
     work, paths = scratch(checks, len(scene.hulls.radii)), np.empty((count, 7))
-    return Room(work, np.zeros(checks), lists, spans, paths, np.zeros(count, np.bool_), np.empty((PARTS, 2)))
+    return SegmentScratch(work, np.zeros(checks), lists, spans, paths, np.zeros(count, np.bool_), np.empty((PARTS, 2)))
 
 
 @allocation_free()

@@ -1,8 +1,8 @@
-"""Compiled answers to single checks: clear, or surely a contact; the reference is queried where neither is proven.
+"""Compiled decisions of single checks: clear, or certainly a contact; FCL is queried where neither is proven.
 
-What of the bounds of :mod:`puncture_twin.planning.collision.kernels.proofs` proves nothing is looked at once more: two
-hulls overlap surely where some of their corners' differences enclose the origin, and holder and needle are held
-against each triangle of the skin that is near them.
+Where the bounds of :mod:`puncture_twin.planning.collision.kernels.proofs` prove nothing, two more tests follow. Two
+hulls certainly overlap where some differences of their corners enclose the origin; holder and needle are tested against
+each triangle of the skin near them.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -51,8 +51,8 @@ class Triangle(NamedTuple):
     stack: Ints
 
 
-def beside_triangle(hulls: Hulls, stack: int) -> Triangle:
-    """Room for a triangle beside the hulls, and for a descent as deep as ``stack``."""
+def triangle_scratch(hulls: Hulls, stack: int) -> Triangle:
+    """Scratch for a triangle tested against hulls, and for a descent as deep as ``stack``."""
     count, spare = len(hulls.corners), np.zeros((3, 3))
     starts = np.concatenate([hulls.neighbour_starts, hulls.neighbour_starts[-1] + np.array([2, 4, 6])])
     ends = np.concatenate([hulls.neighbours, count + np.array([1, 2, 0, 2, 0, 1])])
@@ -63,7 +63,7 @@ def beside_triangle(hulls: Hulls, stack: int) -> Triangle:
 
 @allocation_free()
 def _far(lx, ly, lz, hx, hy, hz, line, reach):
-    """Whether a box is farther than ``reach`` from a segment, told by the box and by the sphere about it.
+    """Whether a box is farther than ``reach`` from a segment, by the box and by the sphere about it.
 
     The box is given by its lowest and its highest corner; ``line`` holds the segment's middle, its unit direction and
     half of its length.
@@ -128,7 +128,7 @@ def _farthest(corners, begin, end, x, y, z):
 
 @allocation_free()
 def _axis(hulls, hull, T):
-    """The axis of the round body in a hull that stands at ``T`` (4, 4): see :func:`_far`; and a radius that holds it.
+    """The axis of the round body in a hull at ``T`` (4, 4): see :func:`_far`; and a radius that holds it.
 
     The hull is a prism: the corners of one end come before those of the other.
     """
@@ -155,7 +155,7 @@ def _axis(hulls, hull, T):
 
 @allocation_free()
 def _gap_along(hulls, hull, M, triangle, x, y, z):
-    """The gap between a triangle (3, 3) and a hull that stands at ``M``, along a direction, by all corners."""
+    """The gap between a triangle (3, 3) and a hull at ``M``, along a direction, by all corners."""
     far = -math.inf
     for k in range(3):
         far = max(far, triangle[k, 0] * x + triangle[k, 1] * y + triangle[k, 2] * z)
@@ -170,12 +170,12 @@ def _gap_along(hulls, hull, M, triangle, x, y, z):
 
 @allocation_free()
 def against_triangle(hulls, hull, M, triangle, line, room):
-    """Whether the round body in a hull touches a triangle: ``CLEAR``, ``TOUCHES``, or ``OPEN`` where that is not told.
+    """Whether the round body in a hull touches a triangle: ``CLEAR``, ``TOUCHES``, or ``OPEN`` if undecided.
 
     Args:
         hulls: See :class:`Hulls`.
         hull: Row of the body's prism.
-        M: Shape (3, 4) or (4, 4), mm: where its frame stands.
+        M: Shape (3, 4) or (4, 4), mm: pose of its frame.
         triangle: Shape (3, 3), mm: its corners.
         line: The body's axis, see :func:`_far`.
         room: See :class:`Triangle`.
@@ -203,7 +203,7 @@ def against_triangle(hulls, hull, M, triangle, line, room):
 
 @allocation_free()
 def on_skin(skin, hulls, hull, T, room):
-    """What the round body in a hull that stands at ``T`` (4, 4) comes to against each triangle of the skin.
+    """Result of the round body in a hull at ``T`` (4, 4) against each triangle of the skin.
 
     It touches as soon as one triangle of the skin does. What the CT shows besides counts where all of the skin is
     clear.
@@ -243,7 +243,7 @@ def on_skin(skin, hulls, hull, T, room):
 
 @allocation_free()
 def settled(scene, work, room, at, frames, gap):
-    """What a check comes to whose bound ``gap`` proves nothing, the arm standing at ``frames`` (7, 4, 4).
+    """Result of a check whose bound ``gap`` proves nothing, the arm at ``frames`` (7, 4, 4).
 
     Of a bound that is ``TOUCHING``, ``work`` is as the bound has left it.
     """
@@ -255,7 +255,7 @@ def settled(scene, work, room, at, frames, gap):
 
 @allocation_free()
 def settled_at(scene, work, room, at, frames):
-    """What a check comes to, the arm standing at ``frames`` (7, 4, 4)."""
+    """Result of a check, the arm at ``frames`` (7, 4, 4)."""
     gap = near_gap(scene, work, at, frames, MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
     return CLEAR if gap > MIN_GAP_MM else settled(scene, work, room, at, frames, gap)
 

@@ -1,6 +1,6 @@
 """Compiled distances to a surface of triangles: of points, and of a tree of bounding spheres that encloses a body.
 
-Each answer for a body is a lower bound, in mm: above 0 it proves that nothing touches; at or below, nothing is said.
+Each bound for a body is a lower one, in mm: above 0 it proves that nothing touches; at or below, it proves nothing.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -14,7 +14,7 @@ from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.geometry.triangle_distance import to_triangle
 
 CELL_MM = 16.0
-"""Of the field of distances to the skin."""
+"""mm: edge of a cell in the field of distances to the skin."""
 
 HALF_CELL_MM = CELL_MM * math.sqrt(3.0) / 2.0 + 1e-3
 """No point of a cell is farther from its middle; the rounding of float32 included."""
@@ -24,7 +24,7 @@ ROUGH = 0.9
 of the time goes into which of many triangles is the nearest by a hair, and a cell is no smaller than that."""
 
 STACK = 64
-"""Of the descents: deeper than any tree here (a balanced one of 2^40 triangles needs 41)."""
+"""Depth of the descents: deeper than any tree here (a balanced one of 2^40 triangles needs 41)."""
 
 
 @allocation_free(inline="always")

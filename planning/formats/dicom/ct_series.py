@@ -39,7 +39,7 @@ UNMEASURED_HU = -2000.0
 
 @dataclass(frozen=True, eq=False)
 class _Series:
-    """What the headers of all files say together."""
+    """Facts of the headers of all files together."""
 
     stack: Stack
     grid: StraightGrid
@@ -55,7 +55,7 @@ class CtSeries:
 
     Attributes:
         path: What was named: the folder, or a file in it.
-        files: Every file of the series, as the content is wanted it.
+        files: Every file of the series, by its key in ``content``.
         content: Gives the bytes of each.
         aside: What else lies in the folder, one sentence.
     """
@@ -68,7 +68,7 @@ class CtSeries:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was left out, and what was done to the slices."""
+        """Notes on what was left out, and what was done to the slices."""
         notes = list(self.aside)
         if (tilt := self._series.grid.tilt_deg) > 0:
             notes.append(
@@ -100,7 +100,7 @@ class CtSeries:
 
     @cached_property
     def grid(self) -> VolumeGrid:
-        """Where the voxels of `volume` lie, LPS mm.
+        """Grid of the voxels of `volume`, LPS mm.
 
         Raises:
             InputError: Headers that cannot be trusted, or that make no volume.
@@ -134,7 +134,7 @@ class CtSeries:
         slices: list[Slice] = []
         layouts: dict[str, PixelLayout] = {}
         stated = set()
-        doubts = Counter[str]()
+        counts = Counter[str]()
         for file in self.files:
             data = parse_dicom(self.content(file), Path(file))
             header = described(data, Path(file))
@@ -144,14 +144,14 @@ class CtSeries:
             layouts[file] = pixel_layout(data, file)
             own = slices_of(data, file, layouts[file].frames)
             slices += own
-            doubts[LOSSY] += text(data, "LossyImageCompression", where=file) == "01"
-            doubts[CLASS_IN_META] += not text(data, "SOPClassUID", where=file)
-            doubts[SCOUTS] += layouts[file].frames - len(own)
+            counts[LOSSY] += text(data, "LossyImageCompression", where=file) == "01"
+            counts[CLASS_IN_META] += not text(data, "SOPClassUID", where=file)
+            counts[SCOUTS] += layouts[file].frames - len(own)
         series_uid, frame_of_reference = _one(stated, self.path)
         stack = stack_of(slices, self.path)
         rows, columns = _one_size(layouts, self.path)
         grid = straight_grid(stack, rows, columns, self.path)
-        notes = tuple(f"{self.path.name}: {said.format(count)}" for said, count in doubts.items() if count)
+        notes = tuple(f"{self.path.name}: {note.format(count)}" for note, count in counts.items() if count)
         return _Series(stack, grid, layouts, series_uid, frame_of_reference, notes)
 
 

@@ -23,7 +23,7 @@ from puncture_twin.planning.formats.dicom.encoding_check import whole_length
 from puncture_twin.planning.formats.dicom.storage import BIG_ENDIAN, DEFLATED, IMPLICIT, META_START, is_dicom
 
 MAX_INFLATED_BYTES = 1 << 26
-"""Of one deflated file: two slices of the largest size, or 128 of the usual one; a bomb ends here."""
+"""Bytes of one inflated file at most: two slices of the largest size, or 128 of the usual one; a bomb ends here."""
 ALLOWED = "a complete DICOM file"
 
 
@@ -107,7 +107,7 @@ def refuse_big_endian(path: Path) -> NoReturn:
 
 
 def how_to_convert() -> str:
-    """What to do with a file in a transfer syntax that is not read."""
+    """Advice on converting a file in a transfer syntax that is not read."""
     return "Explicit VR Little Endian; convert it with 'gdcmconv --raw IN OUT' or 'dcmdjpeg IN OUT'"
 
 
@@ -123,12 +123,12 @@ def value(data: Dataset, keyword: str, *, where: str) -> Any:
 
 
 def has(data: Dataset, keyword: str) -> bool:
-    """Whether an element is there, empty or not."""
+    """Whether an element is present, empty or not."""
     return keyword in data
 
 
 def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[float, ...]:
-    """So many finite numbers.
+    """The value of an element as so many finite numbers.
 
     Raises:
         InputError: Missing, of another count, or not finite.
@@ -149,7 +149,7 @@ def number(data: Dataset, keyword: str, *, where: str) -> float:
 
 
 def whole(data: Dataset, keyword: str, *, low: int, high: int, where: str) -> int:
-    """One whole number between two others.
+    """The value of an element as one whole number between two others.
 
     Raises:
         InputError: Missing, not whole or out of range.
@@ -161,21 +161,21 @@ def whole(data: Dataset, keyword: str, *, low: int, high: int, where: str) -> in
 
 
 def text(data: Dataset, keyword: str, *, where: str) -> str:
-    """A text without the spaces around it, the empty one where there is none; unprintable characters become ``?``."""
+    """The value as text without surrounding spaces, "" where absent; unprintable characters become ``?``."""
     found = value(data, keyword, where=where)
     plain = "" if found is None else str(found).strip(" \0")[:MAX_TEXT]
     return "".join(letter if letter.isprintable() else "?" for letter in plain)
 
 
 def texts(data: Dataset, keyword: str, *, where: str) -> tuple[str, ...]:
-    """Texts, none where the element is absent."""
+    """The values of an element as texts, none where it is absent."""
     found = value(data, keyword, where=where)
     listed = list(found) if isinstance(found, MultiValue | list | tuple) else [] if found is None else [found]
     return tuple(str(one).strip() for one in listed)
 
 
 def sop_class_of(data: Dataset, *, where: str) -> str:
-    """What kind of object a data set is; where it does not say, what its file's meta information says."""
+    """SOP class of a data set; where it does not say, that of its file's meta information."""
     own = text(data, "SOPClassUID", where=where)
     return own or text(data.file_meta, "MediaStorageSOPClassUID", where=where)
 

@@ -52,7 +52,7 @@ class _Walk:
         self._count = 0
 
     def data_set(self, at: int, end: int, *, implicit: bool, depth: int, closed: bool) -> int:
-        """Where a data set ends that begins here.
+        """Offset at which a data set ends that begins at an offset.
 
         Args:
             at: Its first byte.
@@ -77,7 +77,7 @@ class _Walk:
         return at
 
     def _element(self, tag: int, at: int, end: int, *, implicit: bool, depth: int) -> int:
-        """Where an element ends."""
+        """Offset at which an element ends."""
         kind, at, length = self._head(tag, at, end, implicit=implicit)
         if length == UNDEFINED:
             if tag == PIXEL_DATA and kind in (b"OB", b"OW"):
@@ -107,7 +107,7 @@ class _Walk:
         return kind, at + 12, struct.unpack_from("<L", self._data, at + 8)[0]
 
     def _items(self, at: int, end: int, *, implicit: bool, depth: int, closed: bool) -> int:
-        """Where the items of a sequence end."""
+        """Offset at which the items of a sequence end."""
         while closed or at < end:
             tag, length = self._tag(at, end), struct.unpack_from("<L", self._data, at + 4)[0]
             if closed and tag == SEQUENCE_END:
@@ -123,7 +123,7 @@ class _Walk:
         return at
 
     def _fragments(self, at: int, end: int) -> int:
-        """Where compressed pixels end."""
+        """Offset at which compressed pixels end."""
         while True:
             tag, length = self._tag(at, end), struct.unpack_from("<L", self._data, at + 4)[0]
             if tag == SEQUENCE_END:

@@ -26,7 +26,7 @@ class MaskVolume:
 
     Attributes:
         path: The file that holds it.
-        files: Every file that decides it, as the content is wanted it: also the CT's, where it lies on its grid.
+        files: Every file that decides it, by its key in ``content``: also the CT's, where it lies on its grid.
         part: Which structure of the file it is.
         grid: Where the voxels lie, LPS mm; sheared where the CT's gantry was tilted.
         make: Makes the voxels, of the grid's shape.
@@ -46,11 +46,11 @@ class MaskVolume:
 
 @dataclass(frozen=True, eq=False)
 class NamedMasks:
-    """The structures of one file.
+    """Named structures of one file as masks.
 
     Attributes:
         masks: Name to mask.
-        notes: What a person should be told, one sentence each.
+        notes: Notes for a person, one sentence each.
     """
 
     masks: dict[str, MaskVolume]

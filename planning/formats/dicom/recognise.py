@@ -1,4 +1,4 @@
-"""What lies in a folder of DICOM files, told from the headers alone."""
+"""The contents of a folder of DICOM files, from the headers alone."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 MAX_FILES = 50_000
 """In one folder; the longest series have some 5,000 slices."""
 NO_SLICES = frozenset(("LOCALIZER", "SCOUT", "TOPOGRAM", "SCREEN SAVE", "DOSE_INFO", "DOSE", "SUMMARY", "PROTOCOL"))
-"""Of ImageType: scouts, and pages of text that are stored among the slices."""
+"""Values of ImageType that are no slices: scouts, and pages of text that are stored among the slices."""
 _TAGS = [
     tag_for_keyword(keyword) or 0
     for keyword in (
@@ -84,7 +84,7 @@ class DicomFile:
 
 
 def recognise(path: Path) -> DicomFile | None:
-    """What a file is; None if it is no DICOM file.
+    """The kind of a file by its header; None if it is no DICOM file.
 
     Raises:
         InputError: It begins as DICOM, and its header is damaged.
@@ -110,7 +110,7 @@ def recognise(path: Path) -> DicomFile | None:
 
 
 def _big_endian(meta: FileMetaDataset, path: Path) -> DicomFile:
-    """What is none of what this project reads, as its meta information says.
+    """Description of a big-endian file, which this project does not read, by its meta information.
 
     Raises:
         InputError: It may be: no value of such a file is read.
@@ -122,7 +122,7 @@ def _big_endian(meta: FileMetaDataset, path: Path) -> DicomFile:
 
 
 def described(data: Dataset, path: Path) -> DicomFile:
-    """What a data set that was read says that it is.
+    """Description of a data set by its own header.
 
     Raises:
         InputError: Its header is damaged.
@@ -148,7 +148,7 @@ def described(data: Dataset, path: Path) -> DicomFile:
 
 
 def _date(data: Dataset, where: str) -> str:
-    """Of the acquisition, else of its series or study: eight digits, all else is none."""
+    """Date of the acquisition, else of its series or study: eight digits, or none."""
     stated = (text(data, keyword, where=where) for keyword in ("AcquisitionDate", "SeriesDate", "StudyDate"))
     plain = next((one for one in stated if len(one) == DATE_DIGITS and one.isascii() and one.isdigit()), "")
     return plain and f"{plain[:4]}-{plain[4:6]}-{plain[6:]}"
@@ -178,7 +178,7 @@ def _is_enough(tag: BaseTag, vr: str | None, length: int) -> bool:
 
 
 SHOWN, LOOKED_AT = 6, 100
-"""Series that a message lists, and files of a folder beside the slices that are opened."""
+"""Series that a message lists, and files of a folder next to the slices that are opened."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ def choose_series(path: Path) -> SeriesFiles:
     left = unaccounted(folder, (*others, *read.values()), lambda path: path.name in read)
     if lost := [one for one in left if _may_be_slice(one, names)]:
         raise InputError(
-            f"beside the slices lies what is not read, and may be a slice: {first_few([one.said for one in lost])}",
+            f"beside the slices lies what is not read, and may be a slice: {first_few([one.line for one in lost])}",
             where=path,
             allowed="every slice of the series as a whole DICOM file (fetch it, copy it again, or move it elsewhere)",
             code="slices_not_read",
@@ -233,14 +233,14 @@ def choose_series(path: Path) -> SeriesFiles:
 
 
 def _may_be_slice(one: Entry, names: Sequence[str]) -> bool:
-    """What can be read by nobody, and files with the ending of the slices, or that of a part of one behind it."""
+    """Whether an unreadable file may be a slice: by its ending, or that of a part of one."""
     endings = {Path(name).suffix.lower() for name in names} | {".dcm", ".ima"}
     named = {end for end in map(str.lower, Path(one.name).suffixes) if not end[1:].isdigit()} & endings
     return one.what != FOLDER and bool(one.what not in (FILE, HIDDEN) or named)
 
 
 def _holds_dicom(folder: Path) -> bool:
-    """Whether slices may lie in a folder beside the series: its first files tell."""
+    """Whether slices may lie in a folder next to the series, by its first files."""
     return any(is_dicom_file(folder / one.name) for one in entries(folder, most=MAX_FILES)[:LOOKED_AT])
 
 
@@ -250,7 +250,7 @@ def _check_one_series(
     if not slices:
         classes = Counter(one.sop_class for one in found)
         shown = [f"{count} {name}" for name, count in classes.most_common()] or ["no DICOM file"]
-        what = f"no CT series here: {first_few([*shown, *(one.said for one in others)])}"
+        what = f"no CT series here: {first_few([*shown, *(one.line for one in others)])}"
         raise InputError(what, where=path, allowed="a folder with a CT series; folders in it are not entered")
     series: dict[str, list[DicomFile]] = {}
     for one in slices:

@@ -48,7 +48,7 @@ from puncture_twin.planning.formats.volumes.volume_source import Content
 MAX_SLICES = 20_000
 """Between the first and the last frame."""
 ON_GRID = 0.05
-"""Of a voxel, by which a segmentation's grid may miss the CT's and still be on it."""
+"""Fraction of a voxel by which a segmentation's grid may miss the CT's and still be on it."""
 HALF = 0.5
 """From this fraction on, a voxel of a fractional segment belongs to it."""
 
@@ -84,7 +84,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
 
     Args:
         path: Its name.
-        file: As the content is wanted it.
+        file: Its key in ``content``.
         content: Gives its bytes.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
 
@@ -162,7 +162,7 @@ def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
 
 
 def _stated_step(groups: Groups, where: str, ct: CtSeries | None) -> float | None:
-    """The distance of slices that header or CT state, mm. How thick a slice is says less: it may be thinner."""
+    """Distance of slices by header or CT, mm; not the slice thickness, which may be thinner."""
     measures = groups.holder("PixelMeasuresSequence", where)
     if has(measures, "SpacingBetweenSlices"):
         step = number(measures, "SpacingBetweenSlices", where=where)
@@ -226,7 +226,7 @@ def _keep_to(gaps: Floats, step: float) -> bool:
 
 
 def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
-    """On the CT's own slices where the frames lie on them, else on a grid of their own."""
+    """The masks' grid: the CT's own slices where the frames lie on them, else a grid of their own."""
     own = (frames.columns, frames.rows, int(frames.slices.max()) + 1)
     if ct is not None:
         T_ct_slices, shape = ct.stack.T_ct_index, (*ct.slice_shape, len(ct.stack.slices))

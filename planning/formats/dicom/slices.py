@@ -1,12 +1,9 @@
-"""The slices of CT files: where each lies, and how its stored values become Hounsfield units.
+"""The slices of CT files: Hounsfield units and place of each, and whether together they make one regular stack.
 
 A classic file holds one slice; an enhanced one holds many, each with functional groups of its own or shared by all
-(DICOM PS3.3, C.7.6.16). Here both are the same.
-
-Slices in the order in which they lie, and whether they make one regular stack.
-
-Order and steps come from each slice's own position and orientation. Names, instance numbers and slice locations are
-not looked at: they are often wrong, and nothing in the patient depends on them.
+(DICOM PS3.3, C.7.6.16). Here both are the same. Order and steps come from each slice's own position and orientation.
+Names, instance numbers and slice locations are not used: they are often wrong, and nothing in the patient depends on
+them.
 """
 
 from __future__ import annotations
@@ -27,7 +24,8 @@ from puncture_twin.planning.formats.dicom.storage import CLASSIC_CT
 from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, MAX_SPACING_MM, MIN_SPACING_MM
 
 UNIT_TOLERANCE = 1e-3
-"""Of an axis' length, and of the cosine between two: positions are written with six digits, some with four."""
+"""Tolerance of an axis' length, and of the cosine between two: positions are written with six digits, some with
+four."""
 HOUNSFIELD = ("HU", "US", "")
 """Types of rescaled values that are Hounsfield units in a CT, where the standard's default is HU."""
 WITH_RESCALE = (
@@ -38,7 +36,7 @@ WITH_RESCALE = (
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Where an image lies.
+    """Position and orientation of an image.
 
     Attributes:
         origin_ct: Shape (3,), the centre of its first pixel, LPS mm.
@@ -61,7 +59,7 @@ class Slice:
     """One slice of a CT.
 
     Attributes:
-        file: The file's name, as its bytes are wanted.
+        file: The file's key in ``content``.
         frame: Its number in the file, from 0.
         label: How a person finds it.
         plane: Where it lies.
@@ -142,7 +140,7 @@ def frame_groups(data: Dataset, frames: int, *, where: str) -> list[Groups]:
 
 
 def plane_of(groups: Groups, label: str) -> Plane:
-    """Where a frame lies.
+    """Position and orientation of a frame.
 
     Raises:
         InputError: Position, orientation or spacing is missing or wrong.
@@ -195,17 +193,17 @@ def _types(item: Dataset, label: str) -> tuple[str, ...]:
 
 
 AXES_TOLERANCE = 1e-3
-"""By which the axes of two slices may differ: 0.25 mm at the corner of a slice, below a pixel; cosines are rounded."""
+"""Tolerance between the axes of two slices: 0.25 mm at the corner of a slice, below a pixel; cosines are rounded."""
 PLACE_TOLERANCE_MM = 0.1
-"""By which a slice may lie off its place in the stack: positions that are rounded to a tenth are within 0.05."""
+"""Tolerance of a slice's place in the stack: positions that are rounded to a tenth are within 0.05."""
 PLACE_TOLERANCE = 0.1
-"""The same as a fraction of the step, where that is less."""
+"""Tolerance of its place as a fraction of the step, where that is less."""
 SPACING_TOLERANCE = 1e-4
-"""By which the pixels of two slices may differ in size, as a fraction."""
+"""Relative tolerance between the pixel sizes of two slices."""
 ONE_PLACE_MM = 1e-3
 """No two slices of any scanner are so near."""
 SHOWN = 4
-"""Slices that a message names."""
+"""Slices that a message names at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +273,7 @@ def _check_alike(first: Slice, other: Slice, where: Path) -> None:
 
 
 def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> None:
-    """Two slices nearer than a tenth of the usual step lie at one place; a gap makes others no nearer."""
+    """Refuse slices at one place: nearer than a tenth of the usual step; a gap makes others no nearer."""
     apart = steps[steps >= ONE_PLACE_MM]
     near = steps < (max(ONE_PLACE_MM, PLACE_TOLERANCE * float(np.quantile(apart, 0.75))) if len(apart) else np.inf)
     if not near.any():
@@ -308,11 +306,11 @@ def _tolerance(step: float) -> float:
 
 
 NO_TILT_MM = 0.05
-"""Of shift from the first slice to the last: less is the rounding of positions."""
+"""mm of shift from the first slice to the last: less is the rounding of positions."""
 MAX_TILT_DEG = 45.0
 """Gantries tilt to 30 degrees; beyond, the slices are no stack."""
 WHOLE_PIXEL = 1e-6
-"""Of a pixel: a shift so near to a whole number of pixels needs no interpolation."""
+"""Fraction of a pixel: a shift so near to a whole number of pixels needs no interpolation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,7 +321,7 @@ class StraightGrid:
         shape: Voxels along columns, rows and slices.
         T_ct_index: Shape (4, 4), maps them to LPS mm.
         shifts: Shape (n, 2), where pixel (0, 0) of each slice lies in the grid, along columns and rows, in pixels.
-        tilt_deg: Between the slices' normal and the way from one to the next.
+        tilt_deg: Between the slices' normal and the direction from one to the next.
     """
 
     shape: tuple[int, int, int]
@@ -340,7 +338,7 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
     """
     plane, count = stack.plane, len(stack.slices)
     along = float(stack.step_ct @ plane.normal_ct)
-    sideways_mm = plane.axes_ct.T @ stack.step_ct
+    sideways_mm = plane.axes_ct.T @ stack.step_ct  # how far each slice is shifted in its own plane
     tilt = float(np.degrees(np.arctan2(np.linalg.norm(sideways_mm), along)))
     if tilt > MAX_TILT_DEG:
         what = f"the slices' normal and the way from slice to slice are {tilt:.0f} degrees apart"
@@ -352,13 +350,13 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
     low, high = np.floor(shifts.min(axis=0) + WHOLE_PIXEL), np.ceil(shifts.max(axis=0) - WHOLE_PIXEL)
     T = stack.T_ct_index
     T[:3, 2] = along * plane.normal_ct
-    T[:3, 3] += T[:3, :2] @ low
+    T[:3, 3] += T[:3, :2] @ low  # its corner moves with the least shift
     size = (high - low).astype(int) + (columns, rows)
     return StraightGrid((int(size[0]), int(size[1]), count), T, shifts - low, tilt)
 
 
 def moved(image: NDArray[np.float32], shift: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """An image in a larger one, NaN where it says nothing.
+    """An image placed in a larger one, NaN outside of it.
 
     Args:
         image: Shape (columns, rows), NaN where nothing was measured.

@@ -16,7 +16,7 @@ META_START = PREAMBLE_BYTES + len(MAGIC)
 
 
 class Kind(StrEnum):
-    """What this project makes of a DICOM file."""
+    """How this project treats a DICOM file."""
 
     CT = "CT"
     SEGMENTATION = "SEG"
@@ -46,12 +46,12 @@ PLAIN = (IMPLICIT, EXPLICIT, DEFLATED)
 
 
 def kind_of(sop_class: str) -> Kind:
-    """What a file of this SOP class is."""
+    """How a file of this SOP class is treated."""
     return _KINDS.get(sop_class, Kind.OTHER)
 
 
 def is_dicom(start: bytes) -> bool:
-    """Whether a file that begins so is DICOM: ``DICM`` stands behind a preamble of 128 bytes."""
+    """Whether a file that begins so is DICOM: ``DICM`` follows a preamble of 128 bytes."""
     return start[PREAMBLE_BYTES:META_START] == MAGIC
 
 

@@ -42,7 +42,7 @@ from puncture_twin.planning.geometry.rigid import apply
 CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
 """Contours that enclose an area; one within another leaves it out."""
 ON_SLICE = 0.1
-"""Of the step, by which a contour may miss its slice."""
+"""Fraction of the step by which a contour may miss its slice."""
 MAX_CONTOUR_POINTS = 100_000
 """In one contour: an image of 1000 pixels has 4000 around it."""
 MAX_LENGTH = 5_000_000
@@ -79,13 +79,13 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
 
     Args:
         path: Its name.
-        file: As the content is wanted it.
+        file: Its key in ``content``.
         content: Gives its bytes.
         ct: The CT on which it was drawn.
 
     Raises:
         InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that
-            lie beside the CT's slices.
+            lie off the CT's slices.
     """
     data = parse_dicom(content(file), path)
     where = path.name
@@ -181,7 +181,7 @@ def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> Mask:
 
 
 def _between(below: Bools, above: Bools, contours: tuple[Contour, ...]) -> Bools:
-    """What lies in slices that were left out: what either neighbour encloses, where the two overlap.
+    """Masks of left-out slices: where the contours of both neighbours overlap.
 
     What is drawn in every so-many slices goes on between them too where it leans too much to overlap: within the
     convex hull of both.
@@ -200,7 +200,7 @@ def _is_every_so_many(contours: tuple[Contour, ...]) -> bool:
 
 
 def _slice_mask(contours: list[Contour], shape: tuple[int, int]) -> Bools:
-    """What contours enclose, and the pixels along what is too narrow to enclose a centre.
+    """Pixels inside contours, and those along what is too narrow to enclose a centre.
 
     A contour within another is a hole if a pixel of the other is left all around it. Copies of a contour, and contours
     that overlap in part, enclose what any of them does: by an odd count they would erase each other.
@@ -229,7 +229,7 @@ def _narrow_parts(points: Floats, filled: Bools) -> Bools:
 
 
 def grown(pixels: Bools) -> Bools:
-    """The same pixels and their eight neighbours."""
+    """Pixels and their eight neighbours."""
     return np.asarray(scipy.ndimage.maximum_filter(pixels.view(np.uint8), 3, mode="constant").view(bool))
 
 
@@ -260,7 +260,7 @@ def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[st
         (small, "contours smaller than a pixel count for the pixels along them, in"),
         (cut, "contours that reach beyond the CT's image end there, in"),
     )
-    return [f"{where}: {said} {first_few(some)}" for some, said in findings if some]
+    return [f"{where}: {problem} {first_few(some)}" for some, problem in findings if some]
 
 
 def _is_tiny(points: Floats, shape: tuple[int, int]) -> bool:

@@ -86,7 +86,7 @@ def field_surface(
 ) -> TriangleMesh:
     """The closed surface around where a field is positive, in LPS mm, normals outward.
 
-    Along the border the field is continued with its sign turned, so the surface closes on the outer faces of
+    Along the border the field is continued with its sign flipped, so the surface closes on the outer faces of
     the border voxels.
 
     Args:

@@ -24,7 +24,7 @@ ROUNDED_BY = 0.02
 """So far a value may lie off a whole number: of labels stored in 8 bits with a slope some are off by half a step."""
 
 LEAST_WHOLE = 0.15
-"""Of voxels beside the background: a blended map is whole inside its labels, an image in 4 % by chance."""
+"""Fraction of voxels besides the background: a blended map is whole inside its labels, an image in 4 % by chance."""
 
 Box = tuple[slice, slice, slice]
 

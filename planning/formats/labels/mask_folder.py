@@ -15,7 +15,7 @@ from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, cor
 MASK_ENDINGS = (".nii.gz", ".nii", ".seg.nrrd", ".nrrd")
 """Endings of files that are masks."""
 MAX_MASKS, MAX_ENTRIES = 1000, 60_000
-"""TotalSegmentator has 117 classes; the slices of a CT may lie beside them."""
+"""TotalSegmentator has 117 classes; the slices of a CT may lie next to them."""
 SAME_PLACE_MM = 0.1
 """Two grids whose corners lie this close are one: headers in single precision round to 0.01 mm."""
 
@@ -57,7 +57,7 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
 
 
 def refuse_one_name(files: Sequence[str], where: str | Path) -> None:
-    """Whether each mask of a folder is of another structure: ``liver.nii`` beside ``liver.nii.gz`` is not.
+    """Whether each mask of a folder is of another structure: ``liver.nii`` next to ``liver.nii.gz`` is not.
 
     Raises:
         InputError: Two are of one; names both.
@@ -76,9 +76,9 @@ def is_mask(entry: Entry) -> bool:
 
 
 def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError:
-    """What lies in a folder of masks, or of meshes, and would be passed over: its organ would count as free."""
+    """Entries of a folder of masks or meshes that would be passed over: their organs would count as free."""
     return InputError(
-        f"beside the {among} lies what is not read, and may be an organ: {first_few([one.said for one in left])}",
+        f"beside the {among} lies what is not read, and may be an organ: {first_few([one.line for one in left])}",
         where=where,
         allowed=f"{among} in formats that are read, and nothing else: convert it, fetch it, or move it elsewhere",
         code="entries_not_read",
@@ -86,7 +86,7 @@ def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError
 
 
 def refuse_label_map(mask: LabelMap) -> None:
-    """Whether a mask's voxels have one value beside 0, often 1 or 255, or none.
+    """Whether a mask's voxels have one value besides 0, often 1 or 255, or none.
 
     Raises:
         InputError: Several values: a label map, not the mask of one structure.

@@ -1,4 +1,4 @@
-"""Tables that say which label is which structure, as programs and people write them beside a label map.
+"""Tables that say which label is which structure, as programs and people write them for a label map.
 
 CSV with any common naming of its columns, JSON (``{"1": "liver"}``, ``{"liver": 1}``, nnU-Net's ``labels``), ITK-SNAP's
 label descriptions and 3D Slicer's colour tables.
@@ -30,7 +30,7 @@ NUMBER_COLUMNS = (
 )  # fmt: skip
 """Headers of a column of numbers, the surest first."""
 BACKGROUND = frozenset({"", "background", "clearlabel", "clear", "none", "unlabelled", "unlabeled", "air"})
-"""What 0 may be called."""
+"""Names of the background."""
 
 ALLOWED_CSV = "a CSV with a header such as id,name or label,name, and one label per line"
 ALLOWED_JSON = 'JSON such as {"1": "liver"}, {"liver": 1} or {"labels": {...}}'
@@ -106,7 +106,7 @@ def _rows(data: bytes, path: Path) -> list[list[str]]:
 
 
 def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
-    """Where numbers and names stand: ``label`` is a name beside an id, and a number beside a name."""
+    """Columns of numbers and names: ``label`` is a name next to an id, and a number next to a name."""
     plain = [_plain(cell) for cell in header]
     name = next((plain.index(one) for one in NAME_COLUMNS if one in plain), None)
     number = next((plain.index(one) for one in NUMBER_COLUMNS if one in plain and plain.index(one) != name), None)

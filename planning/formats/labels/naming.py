@@ -1,9 +1,8 @@
-"""Which label is which organ, and which organs a case's name patterns mean.
+"""Names of labels: which label is which organ, and which organs a case's name patterns select.
 
-Class numbers of TotalSegmentator's main task, versions 1 (104 classes) and 2 (117 classes).
-
-Facts from its ``map_to_binary.py`` (``total_v1`` and ``total``), Wasserthal et al., Radiology: Artificial
-Intelligence 2023;5(5):e230024. The versions number organs differently: the aorta is 7 or 52.
+The class numbers are those of TotalSegmentator's main task, versions 1 (104 classes) and 2 (117 classes), from its
+``map_to_binary.py`` (``total_v1`` and ``total``), Wasserthal et al., Radiology: Artificial Intelligence
+2023;5(5):e230024. The versions number organs differently: the aorta is 7 or 52.
 """
 
 from __future__ import annotations
@@ -90,13 +89,13 @@ OWN_NAMES = "seg.nrrd"
 REST = "*"
 """The pattern of whatever no other pattern names."""
 WILDCARD = re.compile(r"\[[^\]]+\]|[*?]")
-"""What stands for characters in a shell pattern."""
+"""Placeholders of characters in a shell pattern."""
 MAX_CSV_BYTES = 10_000_000
 """A table of all 65,535 labels stays below 4 MB."""
 
 
 class RuleKind(StrEnum):
-    """What a case wants of the labels that a pattern names."""
+    """Treatment of the labels that a pattern names."""
 
     AVOID = "avoid"
     UNKNOWN = "unknown"
@@ -111,7 +110,7 @@ DEMANDING = frozenset((RuleKind.AVOID, RuleKind.UNKNOWN))
 
 @dataclass(frozen=True)
 class LabelRule:
-    """What holds for one label that is present.
+    """Rule of one label that is present.
 
     Attributes:
         label: Its number in the map.
@@ -130,7 +129,7 @@ class LabelRule:
 
 @dataclass(frozen=True)
 class Selection:
-    """What the patterns of a case say about the labels of a map.
+    """Rules of a case's patterns for the labels of a map.
 
     Attributes:
         rules: One per label present, by rising label, those to ignore included.
@@ -142,7 +141,7 @@ class Selection:
 
 
 class OwnNames(Protocol):
-    """Whatever may hold names of its own: a label map."""
+    """A label map that may bring names of its own."""
 
     @property
     def path(self) -> Path:
@@ -197,7 +196,7 @@ def select(
     all_named: bool = True,
     where: str | Path,
 ) -> Selection:
-    """Gives every label present its rule.
+    """The rule of every label present, by the case's patterns.
 
     Patterns are shell patterns (``*``, ``?``, ``[...]``), capitals count. Of several that name one label the most
     specific holds: the label's own name, else the one with most characters that are no wildcards; ``"*"`` is the rest.
@@ -207,7 +206,7 @@ def select(
         names: Label to name.
         present: The labels of the map.
         avoid: Pattern to margin in mm.
-        unknown: Likewise, of what nobody knows whether a path may cross it.
+        unknown: Likewise, for which it is unknown whether a path may cross it.
         traverse: Patterns of what may be crossed.
         target: Patterns of what holds the lesion.
         ignore: Patterns of what does not count.
@@ -238,7 +237,7 @@ def select(
     unused = [p for p in patterns if not any(fnmatchcase(name, p.pattern) for name in here)]
     absent = [f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused]
     taken = tuple(rule for rule in rules if rule is not None)
-    weaker = [said for rule in taken for said in _weaker_warnings(rule, patterns, where)]
+    weaker = [warning for rule in taken for warning in _weaker_warnings(rule, patterns, where)]
     return Selection(taken, (*absent, *weaker))
 
 
@@ -300,7 +299,7 @@ def _listed(items: Sequence[object]) -> str:
 
 
 def _unique(names: Mapping[int, str], where: Path) -> dict[int, str]:
-    """The names, each of one label: two structures of one name could not be told apart in a result."""
+    """The names, each of one label: two structures of one name could not be distinguished in a result."""
     seen: dict[str, int] = {}
     for label, name in names.items():
         check_name(name, f"label {label}", where=where)
@@ -316,7 +315,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ByName(Generic[T]):
-    """Patterns of names, and what each stands for.
+    """Values by patterns of names.
 
     Attributes:
         of_pattern: Shell patterns; the most specific that matches a name holds.
@@ -325,7 +324,7 @@ class ByName(Generic[T]):
     of_pattern: Mapping[str, T]
 
     def of(self, name: str) -> T | None:
-        """What stands for one name; None where no pattern matches it.
+        """The value of one name; None where no pattern matches it.
 
         >>> ByName({"*": 0.0, "rib*": 0.5}).of("rib_1"), ByName({"rib*": 0.5}).of("liver")
         (0.5, None)
@@ -360,7 +359,7 @@ class ByName(Generic[T]):
 
 
 def _refuse_contradiction(of_pattern: Mapping[str, T], name: str, key: str, where: str | Path) -> None:
-    """Two equally specific patterns that give one name two meanings."""
+    """Refuse two equally specific patterns that give one name two meanings."""
     matching = [pattern for pattern in of_pattern if fnmatchcase(name, pattern)]
     best = max((specificity(pattern, name) for pattern in matching), default=0.0)
     equal = [pattern for pattern in matching if specificity(pattern, name) == best]

@@ -1,4 +1,4 @@
-"""Which version of TotalSegmentator numbered a label map: told by whether its organs lie where organs lie.
+"""Which version of TotalSegmentator numbered a label map, inferred from whether its organs lie where organs lie.
 
 Versions 1 and 2 give the same numbers to other organs. Under the wrong one, left organs lie on the right, or vertebrae
 lie in no order.
@@ -22,7 +22,8 @@ from puncture_twin.planning.geometry.rigid import apply
 LEAST_RULES = 3
 """With fewer that can be checked, chance decides."""
 MOST_BROKEN, LEAST_BROKEN = 0.1, 0.15
-"""Of the rules: so few may be broken in the right naming (curved spines, moved organs), so many are in the wrong."""
+"""Fractions of the rules: so few may be broken in the right naming (curved spines, moved organs), so many are in the
+wrong."""
 
 LEAST_WRONG = 2
 """One rule alone may be broken by a patient."""
@@ -62,12 +63,12 @@ class Plausibility(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether organs lie where they do in a body."""
+        """Whether organs lie in the order of a body."""
         return self.nameless == 0 and self.rules >= LEAST_RULES and self.broken <= MOST_BROKEN * self.rules
 
     @property
     def fails(self) -> bool:
-        """Whether they surely do not."""
+        """Whether organs certainly lie in another order."""
         return self.nameless > 0 or self.broken >= max(LEAST_WRONG, LEAST_BROKEN * self.rules)
 
 
@@ -109,9 +110,9 @@ def _rules(at: Mapping[str, Floats]) -> Iterator[bool]:
     spine = [centre[0] for name, centre in at.items() if name.startswith("vertebrae")]
     if spine:
         middle = float(np.mean(spine))
-        beside = {name: at[name][0] - middle for name in at if name.startswith(BESIDE_SPINE)}
-        yield from (bool(x > 0) for name, x in beside.items() if "left" in name)
-        yield from (bool(x < 0) for name, x in beside.items() if "right" in name)
+        lateral = {name: at[name][0] - middle for name in at if name.startswith(BESIDE_SPINE)}
+        yield from (bool(x > 0) for name, x in lateral.items() if "left" in name)
+        yield from (bool(x < 0) for name, x in lateral.items() if "right" in name)
     for chains, axis, sign in ((FROM_RIGHT, 0, 1.0), (FROM_HEAD, 2, -1.0)):
         for chain in chains:
             known = [at[name] for name in chain if name in at]

@@ -24,12 +24,12 @@ from puncture_twin.planning.formats.volumes.volume_source import Content
 from puncture_twin.planning.formats.volumes.voxels import decoded
 
 SEGMENT_ENDING = ".nrrd"
-"""Of segmentations that Slicer saves, in lower case: their header and voxels are one file."""
+"""Ending of segmentations that Slicer saves, in lower case: their header and voxels are one file."""
 ALLOWED = "a .seg.nrrd as Slicer saves it, with names, label values and layers of its segments"
 
 
 class Segment(NamedTuple):
-    """Where the voxels of a segment are.
+    """Layer and label of a segment.
 
     Attributes:
         layer: From 0.
@@ -45,7 +45,7 @@ def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
 
     Args:
         path: Its name.
-        file: As the content is wanted it.
+        file: Its key in ``content``.
         content: Gives its bytes.
 
     Raises:

@@ -133,7 +133,7 @@ class GlbFile(NamedTuple):
 
 
 def read_document(data: bytes, where: str) -> GlbFile:
-    """What a GLB file holds, with chunks, buffer and views that reach as far as they say.
+    """The document of a GLB file, its chunks, buffer and views checked to reach as far as they say.
 
     Raises:
         InputError: If it is cut, contradicts itself, or uses what would change the surface and is not supported.

@@ -1,12 +1,10 @@
 """Mesh files of other programs, as guarded meshes in mm: STL, OBJ, PLY, GLB, VTP and legacy VTK.
 
-Each format has its own strict reader beside this file, because a lost triangle makes a path "free": a file must hold
-what it promises to the byte. General loaders are made to show something. trimesh 5.2, measured on a box of 12
-triangles: half an ASCII STL loads as 6, one misspelt ``vertex`` as 11, an ASCII PLY without its last line as 11, and
-relative OBJ indices put every face on the last vertices; none with an exception. The tests hold our readers against
-trimesh on whole files.
-
-What a mesh leaves open: triangles without area, an open surface, inverted normals.
+Each format has its own strict reader, because a lost triangle makes a path "free": a file must hold what it promises to
+the byte. General loaders are made to show something. trimesh 5.2, measured on a box of 12 triangles: half an ASCII STL
+loads as 6, one misspelt ``vertex`` as 11, an ASCII PLY without its last line as 11, and relative OBJ indices put every
+face on the last vertices; none with an exception. The tests compare our readers with trimesh on whole files.
+`mesh_warnings` names triangles without area, open surfaces and inverted normals.
 """
 
 from __future__ import annotations
@@ -65,7 +63,7 @@ def read_mesh(
 
     The caller declares the unit, also for GLB, whose standard says metres, and the space. A file that Slicer wrote
     states its space, which must be the declared one. All parts of a file become one surface, placed by their node
-    transforms, in the file's order; nothing is welded and no triangle dropped. Axes of a file whose y is up are turned
+    transforms, in the file's order; nothing is welded and no triangle dropped. Axes of a file whose y is up are rotated
     about x, so that z is; of a GLB it must be stated.
 
     Args:
@@ -93,7 +91,7 @@ def parse_mesh(
     up: Up | None = None,
     stretch: NDArray[np.float64] | None = None,
 ) -> TriangleMesh:
-    """The same of a file that has been read; it is not opened again.
+    """As `read_mesh`, of a file that has been read; it is not opened again.
 
     Args:
         data: The whole file.
@@ -119,7 +117,7 @@ def parse_mesh(
 
 
 def _z_up(vertices: NDArray[np.float64], up: Up | None, path: Path) -> NDArray[np.float64]:
-    """Points (n, 3) of a file, turned by a quarter about x where its y is up."""
+    """Points (n, 3) of a file, rotated by a quarter about x where its y is up."""
     if up is None and path.suffix.lower() == ".glb":
         allowed = 'up = "y" (turned to z up) or up = "z" (kept as it is), or another format'
         raise InputError(UP_NOT_STATED, where=path, allowed=allowed, code="up_not_stated")
@@ -142,7 +140,7 @@ def _actual_space(stated: Space, space: Space, *, default: bool, where: str) -> 
 
 
 class MeshExtent(NamedTuple):
-    """What is told of a mesh file before its unit is known.
+    """Box and space of a mesh file before its unit is known.
 
     Attributes:
         box: Its lowest and highest corner in its own unit, whatever that is, shape (2, 3).
@@ -177,7 +175,7 @@ def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
 
 
 def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
-    """What can no longer be known about a structure, or looks unusual, one sentence each.
+    """Warnings about a structure's mesh, one sentence each.
 
     Args:
         mesh: The structure's surface, mm.
@@ -199,8 +197,8 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def kept_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tuple[str, ...]:
-    """As `mesh_warnings` of each mesh, by name; what was found of the same meshes before is not found again.
+def cached_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tuple[str, ...]:
+    """`mesh_warnings` of each mesh, by name, from the cache for meshes seen before.
 
     The meshes know then whether they are closed and wound alike, see `TriangleMesh.known`.
     """
@@ -211,12 +209,12 @@ def kept_mesh_warnings(meshes: Mapping[str, TriangleMesh], cache: Cache) -> tupl
         facts = [(mesh.closed, mesh.wound_alike) for mesh in meshes.values()]
         return {"lines": np.array(lines, np.str_), "facts": np.array(facts, np.bool_).reshape(-1, 2)}
 
-    def check(kept: Arrays) -> None:
-        lines, facts = kept["lines"], kept["facts"]
+    def check(cached: Arrays) -> None:
+        lines, facts = cached["lines"], cached["facts"]
         if lines.dtype.kind != "U" or lines.ndim != 1 or facts.dtype != np.bool_ or facts.shape != (len(meshes), 2):
             raise ValueError("no lines, or not of these meshes")
 
-    kept = cache.arrays(made_from, found, by=__name__, check=check)
-    for mesh, (closed, wound_alike) in zip(meshes.values(), kept["facts"].tolist(), strict=True):
+    cached = cache.arrays(made_from, found, by=__name__, check=check)
+    for mesh, (closed, wound_alike) in zip(meshes.values(), cached["facts"].tolist(), strict=True):
         mesh.known(closed=closed, wound_alike=wound_alike)
-    return tuple(kept["lines"].tolist())
+    return tuple(cached["lines"].tolist())

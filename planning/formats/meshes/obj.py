@@ -1,7 +1,7 @@
 """Wavefront OBJ: vertices and faces, every line understood or refused.
 
 OBJ states no counts and has no end mark, so that a file cut between two face lines is itself a valid OBJ. What can be
-told is refused: a last line without its end, a vertex that no face uses, fewer faces than a comment counts. What
+detected is refused: a last line without its end, a vertex that no face uses, fewer faces than a comment counts. What
 remains shows as an open mesh, of which ``mesh_warnings`` tells. Material files are never opened.
 """
 

@@ -75,7 +75,7 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
 
 
 def _sections(cursor: _Cursor, *, offsets: bool, where: str) -> tuple[NDArray[np.float64] | None, _Polygons | None]:
-    """The points and the polygons, whatever stands between; what comes after the surface is left."""
+    """The points and the polygons, whatever is between; what comes after the surface is left."""
     points: NDArray[np.float64] | None = None
     polygons: _Polygons | None = None
     while (words := cursor.words()) and words[0].upper() not in _DATA:
@@ -121,7 +121,7 @@ def _cells(cursor: _Cursor, words: list[str], *, offsets: bool, where: str) -> _
 
 
 def _find_starts(table: NDArray[np.int64], starts: NDArray[np.int64], where: str) -> None:
-    """Where each cell begins: with the count of its corners, which says where the next one does."""
+    """Start of each cell: at the count of its corners, which gives the next start."""
     at = 0
     for cell in range(len(starts)):
         if not 0 <= at < len(table) or table[at] < 1:
@@ -183,7 +183,7 @@ class _Cursor:
         return line.rstrip(b"\r")
 
     def words(self) -> list[str]:
-        """Those of the next line that is not empty; none at the end of the file."""
+        """Words of the next line that is not empty; none at the end of the file."""
         while self._at < len(self._data):
             line = self.line().strip()
             if line:

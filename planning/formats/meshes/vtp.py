@@ -1,9 +1,7 @@
 """VTK XML PolyData (.vtp): the polygons of all pieces, with arrays of exactly the stated length.
 
-Arrays in ASCII, inline base64, or appended (raw or base64), plain or zlib-compressed. Source: the VTK file formats
-document (Kitware), "XML file formats"; the order of header and blocks from its section on binary data.
-
-One DataArray of a VTK XML file: its numbers, exactly as many as stated, from any of the encodings.
+Arrays in ASCII, inline base64, or appended (raw or base64), plain or zlib-compressed (`array_values`). Source: the VTK
+file formats document (Kitware), "XML file formats"; the order of header and blocks from its section on binary data.
 """
 
 from __future__ import annotations
@@ -66,7 +64,7 @@ def read_vtp(data: bytes, where: str) -> RawMesh:
 
 
 def _space(root: ElementTree.Element, encoding: Encoding, where: str) -> Space | None:
-    """What Slicer writes of the axes: a field named SPACE with the letters LPS or RAS and the zero that ends them."""
+    """The space that Slicer states: a field named SPACE with the letters LPS or RAS and a closing zero."""
     fields = root.findall("PolyData/FieldData/Array[@Name='SPACE']")
     if not fields:
         return None

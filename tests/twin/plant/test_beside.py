@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.jobs.experiment.scan_beside import parse_beside
-from puncture_twin.twin.plant.outside_objects import Beside, Outline, drawn, lay_beside, tube
+from puncture_twin.twin.plant.outside_objects import Outline, OutsideObjects, drawn, place_outside_objects, tube
 from tools.phantoms.drawn.trunk import draw_trunk
 
 SEEDS = range(4)
@@ -17,7 +17,7 @@ def laid(seed, **wanted):
     """A trunk's skin for trimesh, and what lies beside it by name."""
     rng = np.random.default_rng(seed)
     trunk = draw_trunk(rng)
-    parts = lay_beside(trunk.skin, float(trunk.target[2]), Beside(**wanted), rng)
+    parts = place_outside_objects(trunk.skin, float(trunk.target[2]), OutsideObjects(**wanted), rng)
     return as_trimesh(trunk.skin), {one.name: one for one in parts}
 
 
@@ -137,4 +137,4 @@ def test_a_word_that_is_not_known_is_refused(arms, bed, said):
     with pytest.raises(InputError, match=f"{said}.*is not known; allowed: none"):
         parse_beside(arms, bed, 0)
     assert parse_beside("none", "none", 0) is None
-    assert parse_beside("across", "pad", 2) == Beside("across", "pad", 2)
+    assert parse_beside("across", "pad", 2) == OutsideObjects("across", "pad", 2)

@@ -7,7 +7,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.uncertainty.pose_error import Bend, _bend_covariance
 from puncture_twin.twin.plant.true_needle import TrueNeedle
-from puncture_twin.twin.rehearsal.rooms import bent
+from puncture_twin.twin.rehearsal.trials import bent
 
 BEND, COUNT = Bend(2.5, 150.0), 100_000
 Q = np.radians([20, -70, 90, -60, -80, 0])

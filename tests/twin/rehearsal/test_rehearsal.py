@@ -34,8 +34,8 @@ from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.distribution import bend_along
 from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, plan_truth, spread_rows
 from puncture_twin.twin.rehearsal.rehearsal import rehearse, split_error
-from puncture_twin.twin.rehearsal.result import Standing, ordinal
-from puncture_twin.twin.rehearsal.rooms import Puncture, draw_rooms
+from puncture_twin.twin.rehearsal.result import ErrorRank, ordinal
+from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
 UR3 = ur_model("ur3")
 APART_MM = 0.003
@@ -235,9 +235,9 @@ def through_tissue(control: str):
 
 def test_the_tissues_force_acts_on_the_needle_while_it_goes_in(exact):
     """A skin that ruptures at 4 N takes the tip .15 mm off its path at most; who yields to it, is off by F / K."""
-    assert exact.felt is None and exact.off_path_mm < 0.05 and "declares none" in exact.force_text
+    assert exact.tissue_force is None and exact.off_path_mm < 0.05 and "declares none" in exact.force_text
     done, yielding = through_tissue("impedance"), through_tissue("admittance")
-    assert done.felt.along_n == pytest.approx(4.0, rel=0.02) and done.felt.across_n > 0.05
+    assert done.tissue_force.along_n == pytest.approx(4.0, rel=0.02) and done.tissue_force.across_n > 0.05
     assert 0.02 < done.off_path_mm <= 0.15
     assert np.linalg.norm(done.tip_true_ct[-1] - exact.tip_true_ct[-1]) < 0.02
     assert yielding.off_path_mm > 3.0
@@ -422,7 +422,7 @@ def rooms():
         plan.outward_ct,
         plan.insertion.q[-1],
     )
-    drawn = draw_rooms(puncture, errors, 1000, np.random.default_rng(3))
+    drawn = draw_trials(puncture, errors, 1000, np.random.default_rng(3))
     assert drawn.reached.all()
     return plan, puncture, drawn
 
@@ -457,8 +457,8 @@ def test_rows_are_spread_over_the_order_of_the_errors(count, wanted):
 
 def test_standing_in_words():
     """What headline and film say."""
-    assert Standing(50.05, 1000).text == "median of 1,000 rooms (50th percentile of their tip errors)"
-    assert Standing(2.6).text == "3rd percentile of the tip errors that are predicted"
+    assert ErrorRank(50.05, 1000).text == "median of 1,000 rooms (50th percentile of their tip errors)"
+    assert ErrorRank(2.6).text == "3rd percentile of the tip errors that are predicted"
     assert [ordinal(n) for n in (1, 2, 3, 4, 11, 12, 13, 21, 99)] == (
         ["1st", "2nd", "3rd", "4th", "11th", "12th", "13th", "21st", "99th"]
     )

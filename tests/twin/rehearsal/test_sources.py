@@ -9,7 +9,7 @@ from uncertainty_world import ball
 
 from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.rehearsal.distribution import rehearse_rooms
+from puncture_twin.twin.rehearsal.distribution import rehearse_trials
 
 ROOMS = 1000
 NOTHING = {
@@ -65,7 +65,7 @@ def rehearsed(folder, keys, *, hit_radius=None, voxel_ct=None):
         context = replace(context, anatomy=replace(context.anatomy, structures=structures))
     found = context.search()
     assert found.safe[0]
-    return rehearse_rooms(context, found.outward_ct[0], found.arm.q_insertion[0], ROOMS, 5)
+    return rehearse_trials(context, found.outward_ct[0], found.arm.q_insertion[0], ROOMS, 5)
 
 
 def agrees(share, chance, more=0.005):

@@ -88,7 +88,7 @@ def executed(context, plan, truth):
 
 
 def test_touches_are_slow_soft_and_exact(done):
-    """Felt within .03 mm of the face, at 2 mm/s at most, with 2 N at most."""
+    """TissueForce within .03 mm of the face, at 2 mm/s at most, with 2 N at most."""
     for one in done[0].touched.readings:
         assert 0.0 <= one.bias_mm <= 0.03
         assert one.speed_mm_s <= 2.0

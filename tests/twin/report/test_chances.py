@@ -8,7 +8,7 @@ import pytest
 import report_world as world
 from PIL import Image
 
-from puncture_twin.planning.search.doubt import Doubt, Goal, Remedy
+from puncture_twin.planning.search.uncertainty_breakdown import Goal, Remedy, UncertaintyBreakdown
 from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
 from puncture_twin.twin.report.error_pictures import draw_rooms_picture, needle_frame
@@ -21,7 +21,7 @@ from puncture_twin.twin.report.page.page_chances import rooms_section
 from puncture_twin.twin.report.page.page_map import map_data
 
 BUDGET = ErrorBudget(1.0, 0.8, 0.6, np.array([1.9, 1.5, 1.2]), {"touch": 0.75, "ct_slice": 0.25})
-DOUBT = Doubt(
+BREAKDOWN = UncertaintyBreakdown(
     0.93, {"rib_right_9": 0.02}, 0.02, BUDGET, "residuals agree with the declared errors",
     (Goal("", 0.99, False, (Remedy("touch", 0.35, 0.1),), 0.6),), "breathing, a needle that bends, tissue that moves",
 )  # fmt: skip
@@ -87,7 +87,7 @@ def test_the_page_says_how_sure_it_is(shown, tmp_path):
     told, plain = tmp_path / "told.html", tmp_path / "plain.html"
     anatomy, plan = world.make_anatomy(), world.make_plan(case, found)
     parts = (case, anatomy, found, plan, None, world.make_registration())
-    write_page(*parts, told, uncertainty=Uncertainty(DOUBT, ROOMS, picture))
+    write_page(*parts, told, uncertainty=Uncertainty(BREAKDOWN, ROOMS, picture))
     write_page(case, anatomy, replace(found, chances=None), *parts[3:], plain)
     text = told.read_text()
     for words in TOLD:
@@ -115,8 +115,8 @@ def test_the_page_says_where_the_next_millimetre_is_won(shown, tmp_path):
     case, found = shown
     told, plain = tmp_path / "told.html", tmp_path / "plain.html"
     parts = (case, world.make_anatomy(), found, world.make_plan(case, found), None, world.make_registration())
-    write_page(*parts, told, uncertainty=Uncertainty(DOUBT, None, None, BUDGET))
-    write_page(*parts, plain, uncertainty=Uncertainty(DOUBT, None, None))
+    write_page(*parts, told, uncertainty=Uncertainty(BREAKDOWN, None, None, BUDGET))
+    write_page(*parts, plain, uncertainty=Uncertainty(BREAKDOWN, None, None))
     text = told.read_text()
     section = text[text.index('<h2 id="budget">') : text.index('<h2 id="windows">')]
     assert "The next 0.75 mm is won by slices of 1 mm." in section

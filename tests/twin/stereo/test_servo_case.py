@@ -12,7 +12,12 @@ from puncture_twin.twin.guidance.stereo.robot_calibration import carried_rod, gr
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import configurations, path_upward
 from puncture_twin.twin.guidance.stereo.servo_loop import path_contact
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, head_pose, workcell_checker
+from puncture_twin.twin.guidance.stereo.stereo_workcell import (
+    StereoWorkcell,
+    draw_workcell,
+    head_pose,
+    workcell_checker,
+)
 from tools.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM, head_field, head_targets
 
 HEAD = folder() / "head"

@@ -1,7 +1,7 @@
-"""Markers and a lesion found in a CT, by a voxel and by less than a voxel.
+"""Markers and a lesion found in a CT: by a voxel, as a person reads them, and by less than a voxel.
 
-The rule of Chen 2019, section 3.1: the number of the slice that shows a marker best, times the spacing, and its place
-in that slice to 1 mm. Beside it the middle of the metal, by weights.
+The rule of Chen 2019, section 3.1, is a voxel's: the number of the slice that shows a marker best, times the spacing,
+and its place in that slice to 1 mm. The finer place is the middle of the metal, by weights.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BLUR_MM = 1.5
 """So far from its voxels a piece of metal still blurs into others; beyond, they show what it lies in."""
 
 EDGE_MM = 1.5
-"""By which the edges of wide metal stand out of the balls that fit into it."""
+"""mm by which the edges of wide metal protrude from the balls that fit into it."""
 
 SOLID_HU = 8000.0
 """Assumed of a voxel that is wholly metal, whose value the range of the image clips. It only decides at which part of
@@ -42,7 +42,7 @@ Box = tuple[slice, slice, slice]
 
 
 class Metal(NamedTuple):
-    """One connected piece.
+    """One connected piece of metal.
 
     Attributes:
         box: Its voxels' box with `AROUND_MM` about it.
@@ -73,7 +73,7 @@ def wide_metal(volume: Volume, diameter_mm: float) -> Bools:
     """
     metal, spacing = volume.values > METAL_HU, spacing_mm(volume)
     radius = diameter_mm / 2 + BLUR_MM
-    core = ndimage.distance_transform_edt(np.pad(metal, 1), spacing)[1:-1, 1:-1, 1:-1] > radius
+    core = ndimage.distance_transform_edt(np.pad(metal, 1), spacing)[1:-1, 1:-1, 1:-1] > radius  # erosion
     if not core.any():
         return np.zeros_like(metal)
     return np.asarray(ndimage.distance_transform_edt(~core, spacing) <= radius + EDGE_MM + BLUR_MM)
@@ -95,7 +95,7 @@ def metal_pieces(volume: Volume, level_hu: float = METAL_HU, without: Bools | No
 
 
 def metal_parts(volume: Volume, metal: Metal) -> Floats:
-    """How much of each voxel of a piece's box is metal, 0 to 1, as far as a clipped range tells.
+    """Part of each voxel of a piece's box that is metal, 0 to 1, as far as a clipped range allows.
 
     What a voxel would show without metal is what the nearest voxel shows that is too far away to be blurred by it:
     air on one side of a marker and skin on the other. Without that, air would hide the outer edge of a marker.
@@ -108,20 +108,20 @@ def metal_parts(volume: Volume, metal: Metal) -> Floats:
         return np.asarray(metal.voxels, dtype=np.float64)
     nearest = ndimage.distance_transform_edt(~outside, spacing, return_distances=False, return_indices=True)
     background = _smooth(values, outside)[tuple(nearest)]
-    parts = (values - background) / (SOLID_HU - background)
+    parts = (values - background) / (SOLID_HU - background)  # linear partial volume
     others = every & ~metal.voxels
     mine = ndimage.distance_transform_edt(~metal.voxels, spacing)
-    strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)
+    strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)  # nearer to another piece
     return np.where(outside | strange | (parts < LEAST_PART), 0.0, parts)
 
 
 def full_part(volume: Volume) -> float:
-    """From which part of metal on a voxel is clipped, in soft tissue."""
+    """Part of metal from which a voxel is clipped, in soft tissue."""
     return float(volume.values.max()) / SOLID_HU
 
 
 def metal_weights(volume: Volume, metal: Metal) -> Floats:
-    """The same, counted as full from where it may be clipped: in air and in tissue alike."""
+    """Weights of metal, counted as full from where a voxel may be clipped: in air and in tissue alike."""
     full = full_part(volume)
     return np.asarray(np.minimum(metal_parts(volume, metal), full) / full)
 
@@ -145,7 +145,7 @@ def _others(axis: int) -> tuple[int, int]:
 
 
 READING_MM = 1.0
-"""To what a person reads a place in a slice."""
+"""mm to which a person reads a place in a slice."""
 FARTHEST_MM = 15.0
 """A marker lies no farther from where it is expected."""
 LARGEST_MM = 25.0
@@ -153,7 +153,7 @@ LARGEST_MM = 25.0
 
 
 class Markers(NamedTuple):
-    """What was found, in the order of what was expected.
+    """Markers that were found, in the order of those expected.
 
     Attributes:
         fine: By the middle of the metal.
@@ -198,7 +198,7 @@ def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[M
 
 
 def _by_rule(weights: Floats, piece: Metal, volume: Volume) -> Floats:
-    """The slice with most of the metal, and there its middle to a millimetre."""
+    """The place by the paper's rule: the slice with most of the metal, and there its middle to a millimetre."""
     k = int(np.argmax(weights.sum(axis=(0, 1))))
     i, j = (float(line @ np.arange(len(line)) / line.sum()) for line in _sides(weights[:, :, k]))
     spacing = spacing_mm(volume)

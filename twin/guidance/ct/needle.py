@@ -1,4 +1,4 @@
-"""A needle in a CT: its axis by the line of least squares through its metal, its tip by a blurred rod's image."""
+"""A needle found in a CT: its axis by the least-squares line through its metal, its tip by a blurred rod's image."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SHAFT_MM = 12.0
 WIDE_MM = 3.0
 """About the axis of a needle, so far; of a wide rod half of its width."""
 WIDEST_SLICE = 0.6
-"""Of a slice's thickness: one slice at least is so near to the axis."""
+"""Fraction of a slice's thickness: one slice at least is so near to the axis."""
 SLENDER = 8.0
 """Length over width: a rib is bent, and so wider."""
 BLUR_SIGMA_MM = 0.5
@@ -45,7 +45,7 @@ LEVELS_HU = (METAL_HU, 1000.0, 600.0, 400.0)
 
 
 FITTED_MM = 80.0
-"""Behind the tip, so much of a needle is held to be straight."""
+"""Behind the tip, so much of a needle is taken as straight."""
 GROWTHS = 2
 """The first line through a short piece is not yet the needle's."""
 SEEN_MM = 3.0
@@ -63,7 +63,7 @@ class _Line(NamedTuple):
 
 
 class FoundNeedle(NamedTuple):
-    """What was found, LPS mm.
+    """A needle that was found, LPS mm.
 
     Attributes:
         tip_ct: Shape (3,).
@@ -80,7 +80,7 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
     """Find the needle of a control CT.
 
     Metal that is wider than the needle (bolts, plates) is not looked at, nor what it blurs into: the axis is that of
-    the thin metal beside it. A tip there cannot be told from it and is refused.
+    the thin metal next to it. A tip there cannot be distinguished from it and is refused.
 
     Args:
         volume: The CT.
@@ -108,7 +108,7 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
 
 
 def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bools) -> None:
-    """Refuse a tip at other metal: what is found there is where that begins, not where the needle ends.
+    """Refuse a tip at other metal: there the other metal begins, and the needle's end is not seen.
 
     Raises:
         InputError: It is.
@@ -119,13 +119,13 @@ def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bo
     if not hidden[tuple(at[inside].T)].any():
         return
     away = target_ct - found.tip_ct
-    beside = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
-    what = f"the needle ends at other metal, which hides its tip; its axis passes the target by {beside:.1f} mm"
+    lateral = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
+    what = f"the needle ends at other metal, which hides its tip; its axis passes the target by {lateral:.1f} mm"
     raise InputError(what, where=volume.path, allowed=f"a tip {SEEN_MM:g} mm clear of wider metal and its blur")
 
 
 def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats, hidden: Bools) -> tuple[Metal, _Line]:
-    """All of a needle of which thick slices, between which it is diluted, show only pieces at first."""
+    """All of a needle that thick slices, between which it is diluted, show only in pieces at first."""
     for _ in range(GROWTHS):
         at = np.argwhere((volume.values > LEVELS_HU[-1]) & ~hidden)
         points = apply(volume.T_ct_index, at.astype(float)) - line.middle
@@ -166,9 +166,9 @@ def _axis(volume: Volume, metal: Metal, target_ct: Floats) -> _Line:
     heavy = weights[tuple(at.T)]
     points = apply(volume.T_ct_index, at + np.array([axis.start for axis in metal.box], dtype=float))
     middle = centroid(weights, metal.box, volume.T_ct_index)
-    spread = (points - middle) * np.sqrt(heavy / heavy.sum())[:, None]
+    spread = (points - middle) * np.sqrt(heavy / heavy.sum())[:, None]  # weighted for the SVD
     _, sizes, axes = np.linalg.svd(spread, full_matrices=False)
-    forward = axes[0] if (target_ct - middle) @ axes[0] > 0 else -axes[0]
+    forward = axes[0] if (target_ct - middle) @ axes[0] > 0 else -axes[0]  # toward the target
     return _Line(middle, forward, float(np.hypot(sizes[1], sizes[2])))
 
 
@@ -203,7 +203,7 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
     across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
     reach = WIDE_MM + WIDEST_SLICE * float(spacing_mm(volume).max())
     near = (across <= reach) & (along > -FITTED_MM) & (along < SHAFT_MM) & ~hidden[tuple(index.T)]
-    side = np.linalg.svd(line.forward[None])[2][1:]
+    side = np.linalg.svd(line.forward[None])[2][1:]  # two unit vectors across the axis
 
     def rod(change: Floats) -> tuple[Floats, Floats]:
         forward = line.forward + change[3:] @ side
@@ -260,7 +260,7 @@ def _blur(volume: Volume) -> Floats:
 
 
 class NeedleError(NamedTuple):
-    """Where a needle ended, seen from the target, mm: total² = lateral² + depth², depth positive when too deep."""
+    """A needle's error seen from the target, mm: total² = lateral² + depth², depth positive when too deep."""
 
     tip_to_target_mm: float
     lateral_mm: float

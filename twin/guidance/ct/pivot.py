@@ -1,4 +1,4 @@
-"""Pivot calibration: where the tip is on the flange, from arms that stand differently with the tip in one place.
+"""Pivot calibration: the tip's place on the flange, from poses of the arm with the tip in one place.
 
 With T_base_flange = (R_i, p_i) of pose i, the tip x in the flange frame and the place c in the base frame:
 
@@ -25,10 +25,10 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.registration.marker_noise import reading_noise
 
 MOST_OFF_MM = 50.0
-"""By which a stated tip may be wrong: more is another needle."""
+"""mm by which a stated tip may be wrong: more is another needle."""
 
 SLACK_MM = 5.0
-"""By which an arm that nobody calibrated may miss one place."""
+"""mm by which an uncalibrated arm may miss one place."""
 
 LEAST_POSES = 3
 """Two leave the tip free along a line."""
@@ -37,7 +37,7 @@ LARGE = 2.0
 """Residuals so many times the expected ones are not the declared noise: the arm's own errors, or a tip that slipped."""
 
 WORST_FACTOR = 30.0
-"""Of the noise in the worst direction of the tip: poses that turn too little magnify it so."""
+"""Magnification of the noise in the worst direction of the tip: poses that turn too little magnify it so."""
 
 
 def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, *, where: str) -> None:
@@ -58,8 +58,8 @@ def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, 
     worst, two = 0.0, (0, 0)
     for i, j in combinations(range(len(names)), 2):
         cosine = (np.trace(axes_base[i].T @ axes_base[j]) - 1) / 2
-        turned = float(np.sqrt(max(2 - 2 * min(cosine, 1.0), 0.0)))  # 2 sin(angle / 2)
-        beyond = float(np.linalg.norm(tips_base[i] - tips_base[j])) - turned * MOST_OFF_MM - SLACK_MM
+        chord = float(np.sqrt(max(2 - 2 * min(cosine, 1.0), 0.0)))  # 2 sin(angle / 2)
+        beyond = float(np.linalg.norm(tips_base[i] - tips_base[j])) - chord * MOST_OFF_MM - SLACK_MM
         if beyond > worst:
             worst, two = beyond, (i, j)
     if worst > 0:
@@ -111,7 +111,7 @@ def pivot_calibration(
     Args:
         T_base_flange: Shape (n, 4, 4), mm, as the controller computes them.
         noise_mm: Standard deviation of one touch, per axis.
-        arm_cov: Shape (3 n, 3 n), mm^2: of what the arm misses the place by, beside that noise; None for nothing.
+        arm_cov: Shape (3 n, 3 n), mm^2: of what the arm misses the place by, besides that noise; None for nothing.
         where: What errors name.
 
     Raises:
@@ -137,7 +137,7 @@ def pivot_calibration(
 
 
 def arm_covariance(errors: ErrorModel, model: UrModel, tip_mm: float, q: Floats) -> Floats:
-    """Of n touches of one place, all that is declared but touch noise and the tip itself.
+    """Covariance of n touches of one place by all that is declared but touch noise and the tip itself.
 
     Args:
         errors: As declared.

@@ -1,8 +1,8 @@
-"""The one declaration of errors of a servo case, in the estimator's units: what may be off, and by how much.
+"""Declared errors of a servo case, in the estimator's units: what may be off, and by how much.
 
-The belief computes with it, the twin's truth is drawn from it. Defaults and reasons: docs/reference/servo-case.md. What
-is not here (a rod that bends, cameras that move after the calibration, tissue) is not modelled, which is something else
-than 0.
+The belief computes with them, the twin's truth is drawn from them. Defaults and reasons: docs/reference/servo-case.md.
+What is not here (a rod that bends, cameras that move after the calibration, tissue) is not modelled, which is something
+else than 0.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Degrees = Annotated[Number, Field(ge=0, le=10)]
 Pixels = Annotated[Number, Field(ge=0, le=200)]
 DetectionPixels = Annotated[Number, Field(ge=1e-4, le=50)]
 Part = Annotated[Number, Field(ge=0, le=0.2)]
-"""Of a whole that is 1."""
+"""A fraction, 0 to 1."""
 
 DEFAULT_REPEATABILITY_DEG = 0.003
 """As in the CT case: .1 mm and less at the reach of a UR3, its data sheet's pose repeatability."""
@@ -32,10 +32,10 @@ DEFAULT_BACKLASH_DEG = 0.0
 """The gears of these arms have no play worth naming."""
 
 DEFAULT_MEASURING_MM = 0.01
-"""Of a coordinate measuring arm."""
+"""Deviation of a coordinate measuring arm."""
 
 DEFAULT_MARKER_MM = 0.3
-"""Of a marker's centre in an image with voxels of a millimetre: 1 / sqrt(12)."""
+"""Deviation of a marker's centre in an image with voxels of a millimetre: 1 / sqrt(12)."""
 
 
 ANGLES = ("twist", "joint", "backlash", "repeatability", "needle_direction", "head_turn")
@@ -68,7 +68,7 @@ class ServoErrorsSection(Section):
 
 
 class ServoRehearsalSection(Section):
-    """From what the truth of a workcell is drawn, where that is not what the belief declares."""
+    """Errors from which a workcell's truth is drawn, where they are not those that the belief declares."""
 
     errors: ServoErrorsSection | None = None
 
@@ -106,7 +106,7 @@ class ServoErrors:
         tip_offset_mm: Of the needle's tip against the ball's centre, flange axes; no camera sees it.
         needle_direction: Of the needle, about each of the flange's x and y axes.
         camera: Of each camera.
-        ball_px: Of the centre of a ball or marker in one look; None takes what the tracker states of each picture.
+        ball_px: Of the centre of a ball or marker in one look; None takes what the tracker states of each image.
         measuring_mm: Of the measuring arm.
         marker_mm: Of a marker in the image.
         target_mm: Of the target in the image.
@@ -132,21 +132,21 @@ class ServoErrors:
 
     @property
     def arrival(self) -> float:
-        """Of every joint at one arrival, rad: play leaves a joint at either edge, so half of it is its deviation."""
+        """Deviation of every joint at one arrival, rad; play leaves a joint at either edge, so half of it counts."""
         return float(np.hypot(self.repeatability, self.backlash / 2))
 
     def arm_deviations(self) -> Floats:
-        """Of the 26 parameters that move the ball, shape (26,), in the order of `error_jacobian`; mm and rad."""
+        """Deviations of the 26 parameters that move the ball, shape (26,), ordered as `error_jacobian`; mm, rad."""
         kinds = ((self.link_mm, 11), (self.twist, 6), (self.joint, 6), (self.ball_offset_mm, 3))
         return np.repeat([value for value, _ in kinds], [count for _, count in kinds])
 
     def camera_deviations(self) -> Floats:
-        """Of a camera's 13 parameters, shape (13,): focal length (part), axis (px), lens, turn (rad), shift (mm)."""
+        """Deviations of a camera's 13 parameters: focal length (part), axis (px), lens, rotation (rad), shift (mm)."""
         one = self.camera
         return np.array([one.focal, *[one.axis_px] * 2, *one.lens, *[one.turn] * 3, *[one.shift_mm] * 3])
 
     def stated(self) -> dict[str, float | tuple[float, ...] | None]:
-        """By the keys of ``[errors]``, mm, degrees and px."""
+        """The deviations by the keys of ``[errors]``, mm, degrees and px."""
         one, degrees = self.camera, {name: float(np.degrees(getattr(self, name))) for name in ANGLES}
         return {
             "link_mm": self.link_mm,

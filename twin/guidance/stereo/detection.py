@@ -1,7 +1,7 @@
-"""What the guidance gets to see: a ball's centre in each camera, from pictures of the true workcell.
+"""Detections of the stereo guidance: a ball's centre in each camera, from images of the true workcell.
 
-``picture_detector`` draws a picture with the true camera and measures it with the believed one. Another `Detector` may
-leave the picture out: for studies of everything behind it.
+``image_detector`` renders an image with the true camera and measures it with the believed one. Another `Detector` may
+leave the image out: for studies of everything behind it.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.triangulation import Points, triangulate
 from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell
 
 DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
-"""Fraction of the light that comes from everywhere; the rest is a lamp's."""
+"""Fraction of diffuse light; the rest is from one direction."""
 
 WINDOW_MARGIN_PX = 24
-"""A picture, and the rod in it, are drawn this far beyond the region that is searched: the rest is never looked at."""
+"""An image, and the rod in it, are drawn this far beyond the region that is searched: the rest is never looked at."""
 
 
 class LocatedPair(NamedTuple):
-    """A ball as it truly stands, C, mm."""
+    """The true ball, C, mm."""
 
     center_c: Floats
     """Shape (3,)."""
@@ -40,8 +40,8 @@ class LocatedPair(NamedTuple):
     """Whether the head stands in the workcell and may hide it; it does not during the calibration."""
 
 
-class Spot(NamedTuple):
-    """A ball's centre in one picture."""
+class Detection(NamedTuple):
+    """A ball's centre in one image."""
 
     pixel: Floats
     """Shape (2,)."""
@@ -50,7 +50,7 @@ class Spot(NamedTuple):
 
 
 class Search(NamedTuple):
-    """Where to look for a ball."""
+    """Search region of a ball."""
 
     camera: Camera
     """As it is believed."""
@@ -59,8 +59,8 @@ class Search(NamedTuple):
     search_px: float
 
 
-Detector = Callable[[int, LocatedPair, Search], Spot | Lost]
-"""Takes the camera's number, the ball as it truly is, and where to look."""
+Detector = Callable[[int, LocatedPair, Search], Detection | Lost]
+"""Takes the camera's number, the true ball, and the search region."""
 
 
 class Detections(NamedTuple):
@@ -72,11 +72,11 @@ class Detections(NamedTuple):
     """Shape (c, 2, 2), px^2."""
 
 
-def picture_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Detector:
+def image_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Detector:
     """Pictures of the true workcell, each drawn anew with noise; what the head hides is hidden."""
     plan = workcell.case.file.cameras
 
-    def see(number: int, ball: LocatedPair, search: Search) -> Spot | Lost:
+    def see(number: int, ball: LocatedPair, search: Search) -> Detection | Lost:
         true = workcell.cameras[number]
         hidden = workcell.hidden_fraction(true, ball.center_c, ball.radius_mm) if ball.head_there else 0.0
         away = np.abs(true.project(ball.center_c) - search.camera.project(search.predicted_c)).max()
@@ -92,13 +92,13 @@ def picture_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Dete
             search_px=search.search_px,
             hough_only=plan.centre == "hough",
         )
-        return Lost(found.reason) if isinstance(found, LostBall) else Spot(found.pixel, found.covariance)
+        return Lost(found.reason) if isinstance(found, LostBall) else Detection(found.pixel, found.covariance)
 
     return see
 
 
 def ball_scene(plan: CamerasSection, ball: LocatedPair, hidden: float, rng: np.random.Generator) -> BallScene:
-    """The ball for the picture; an occluder that the case asks for comes from any side."""
+    """The scene of a ball; an occluder that the case demands comes from any side."""
     fraction = min(max(plan.occlusion if ball.rod_c is not None else 0.0, hidden), 0.99)
     return BallScene(
         ball.center_c,
@@ -112,7 +112,7 @@ def ball_scene(plan: CamerasSection, ball: LocatedPair, hidden: float, rng: np.r
 
 
 def look_at(detector: Detector, ball: LocatedPair, searches: tuple[Search, ...], frames: int = 1) -> Detections | Lost:
-    """One ball in every camera, several pictures each; all must show it.
+    """One ball in every camera, several images each; all must show it.
 
     Pictures of one camera are averaged by their inverse covariances.
     """
@@ -132,5 +132,5 @@ def look_at(detector: Detector, ball: LocatedPair, searches: tuple[Search, ...],
 
 
 def in_space(cameras: tuple[Camera, ...], detections: Detections) -> Points:
-    """One ball's place in C from its pixels."""
+    """Position of one ball in C from its pixels."""
     return triangulate(cameras, detections.pixels[:, None], detections.covariances[:, None])

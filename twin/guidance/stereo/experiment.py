@@ -1,4 +1,4 @@
-"""Many seeds of one case, in processes of this machine, and what they say together."""
+"""Many seeds of one servo case, in processes of this machine, and the statistics over them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleOutcome
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop
 from puncture_twin.twin.guidance.stereo.session import Session, run_session
-from puncture_twin.twin.guidance.stereo.stereo_room import workcell_checker
+from puncture_twin.twin.guidance.stereo.stereo_workcell import workcell_checker
 
 BATCH = 5
-"""Seeds that a process takes at a time; they share the judge of the empty room."""
+"""Seeds that a process takes at a time; they share the checker of the empty workcell."""
 
 
 class TargetRow(NamedTuple):
@@ -38,14 +38,14 @@ class TargetRow(NamedTuple):
     needle_open_loop: NeedleOutcome | None = None
     """The needle where the robot alone brought it, predicted and realised; None where there is no prediction."""
     needle_servoed: NeedleOutcome | None = None
-    """Likewise at the last look of the servo."""
+    """The needle at the last image of the servo, predicted and realised."""
 
 
 class DeclarationTest(NamedTuple):
-    """Are the measurements as far apart as the declared errors make them?"""
+    """Test whether the measurements are as far apart as the declared errors make them."""
 
     chi_squared: float
-    """Of the joint estimate's residuals."""
+    """Chi-squared of the joint estimate's residuals."""
     freedom: int
 
     @property
@@ -55,7 +55,7 @@ class DeclarationTest(NamedTuple):
 
 
 class ServoTrial(NamedTuple):
-    """One seed."""
+    """Result of one seed."""
 
     seed: int
     stereo_mm: tuple[float, ...]
@@ -64,13 +64,13 @@ class ServoTrial(NamedTuple):
     robot_residual_mm: float
     rows: tuple[TargetRow, ...]
     refused: str
-    """Why the session could not be held at all; empty when it was."""
+    """Why the session failed as a whole; empty when it did not."""
     declaration: DeclarationTest | None = None
-    """Of everything that was measured; None where the joint estimate does not settle."""
+    """Test of everything that was measured; None where the joint estimate does not settle."""
 
 
 class NeedleStatistics(NamedTuple):
-    """Predicted beside realised, over the needles of all seeds that have a prediction; mm."""
+    """Predicted and realised errors over the needles of all seeds that have a prediction; mm."""
 
     needles: int
     predicted_rms_mm: float
@@ -87,12 +87,12 @@ class NeedleStatistics(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """Over all targets of all seeds; mm."""
+    """Statistics over all targets of all seeds; mm."""
 
     seeds: int
     targets: int
     refused: int
-    """Seeds whose session could not be held."""
+    """Seeds whose session failed."""
     stereo_mean: float
     stereo_max: float
     mapping_mean: float
@@ -153,7 +153,7 @@ def declaration_test(trials: Sequence[ServoTrial]) -> DeclarationTest | None:
 
 
 def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> ServoTrial:
-    """One seed; a session that cannot be held becomes a trial that says why.
+    """The trial of one seed; a session that fails becomes a trial with its reason.
 
     Args:
         case: The case.
@@ -167,7 +167,7 @@ def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> 
 
 
 def run_trials(case: ServoCase, seeds: Sequence[int], *, jobs: int = 1, done: Count | None = None) -> list[ServoTrial]:
-    """Every seed, in the order given.
+    """The trials of every seed, in the order given.
 
     Args:
         case: The case.
@@ -192,7 +192,7 @@ def run_trials(case: ServoCase, seeds: Sequence[int], *, jobs: int = 1, done: Co
 
 
 def statistics(trials: Sequence[ServoTrial]) -> Statistics:
-    """What trials say together.
+    """Statistics over trials.
 
     Raises:
         NoAnswerError: No trial reached a target.
@@ -224,7 +224,7 @@ def statistics(trials: Sequence[ServoTrial]) -> Statistics:
 
 
 def needle_statistics(outcomes: Sequence[NeedleOutcome | None]) -> NeedleStatistics | None:
-    """What needles say together; None where none has a prediction. Those of one seed share a room."""
+    """Statistics over needles; None where none has a prediction. Those of one seed share a workcell."""
     known = [one for one in outcomes if one is not None]
     if not known:
         return None

@@ -1,4 +1,4 @@
-"""Who tells the servo where ball and target are: the paper's chain, or the joint estimate of everything."""
+"""Estimates of ball and target for the servo: the paper's chain, or the joint estimate of everything."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, o
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, carried_rod
 from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, planned_cameras
 
 
 class Known(NamedTuple):
-    """What a session knows when the servo begins, and the workcell for its pictures."""
+    """Knowledge of a session when the servo begins, and the workcell for its images."""
 
     workcell: StereoWorkcell
-    """Of which only the pictures are used."""
+    """The workcell, of which only the images are used."""
     calibration: RobotCalibration
     mapping: Mapping
     markers: list[Detections]
@@ -34,7 +34,7 @@ class Known(NamedTuple):
 
 
 class Guide:
-    """The chain: calibrated cameras triangulate the ball; the target is where the mapping put it."""
+    """The paper's chain: calibrated cameras triangulate the ball; the mapping gives the target."""
 
     def __init__(self, known: Known) -> None:
         workcell, calibration, mapping, markers, markers_m, detector = known
@@ -52,16 +52,16 @@ class Guide:
         self.target_c = np.zeros(3)
 
     def aim_at(self, target_m: Floats) -> None:
-        """Name the target, shape (3,), mm, image frame."""
+        """Set the target, shape (3,), mm, image frame."""
         self.target_m = target_m
         self.target_c = self._mapping.to_c(target_m)
 
     def look(self, q_command: Floats, q_true: Floats) -> Seen | Lost:
-        """Take pictures of the ball and say where it and the target are.
+        """Measure the ball in new images; returns ball and target.
 
         Args:
             q_command: Shape (6,), rad: where the arm was sent; predicts where to search.
-            q_true: Shape (6,), rad: where it truly is, for the pictures alone.
+            q_true: Shape (6,), rad: true joints, for the images alone.
         """
         tool, limits = self._case.file.tool, self._case.file.servo
         ball = LocatedPair(self._room.ball_c(q_true), tool.ball_diameter_mm / 2, self._room.rod_c(q_true))
@@ -81,11 +81,11 @@ class Guide:
         return Seen(points.points_c[0], self.target_c, points.covariance[0])
 
     def needle_unseen(self, q_command: Floats) -> NeedleError | None:
-        """What is believed of the needle where the arm is sent, (6,), rad; None where the estimate does not settle."""
+        """Predicted needle at commanded joints (6,), rad; None where the estimate does not settle."""
         return self._believed(lambda found: open_loop_error(found, q_command, self.target_m))
 
     def needle_seen(self) -> NeedleError | None:
-        """What is believed of the needle since the last look at its ball, of which there was one; None likewise."""
+        """Predicted needle after the last image with its ball; None where the estimate does not settle."""
         return self._believed(lambda found: servoed_error(found, -1, self.target_m))
 
     def _believed(self, estimate: Callable[[Adjusted], NeedleError]) -> NeedleError | None:
@@ -127,16 +127,16 @@ class Guide:
         )
 
     def _of_pixels(self, measured: Floats) -> Floats:
-        """Covariances (c, n, 2, 2), px^2: what is declared, else what the tracker told of each picture."""
+        """Covariances (c, n, 2, 2), px^2: what is declared, else what the tracker reported of each image."""
         declared = self._case.errors.ball_px
         return measured if declared is None else np.broadcast_to(declared**2 * np.eye(2), measured.shape)
 
 
 class JointGuide(Guide):
-    """The joint estimate: every picture of the session, the servo's own among them, is adjusted together."""
+    """The joint estimate: every image of the session, the servo's own among them, is adjusted together."""
 
     def aim_at(self, target_m: Floats) -> None:
-        """Name the target; it moves as the estimate does."""
+        """Set the target; it moves as the estimate does."""
         self.target_m = target_m
         self.target_c = self.adjusted().offset(0, target_m).target_c
 

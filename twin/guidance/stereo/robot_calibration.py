@@ -1,7 +1,7 @@
-"""The robot holds the ball at twelve points: they calibrate the cameras, define C, and tie the robot to it.
+"""Calibration by the robot: its ball at twelve points calibrates the cameras, defines C, and ties the robot to it.
 
 A coordinate measuring arm measures each point once, in its own frame: that is C. Each camera is calibrated from the
-ball's images against those points; r_T_c is the rigid fit of where the robot believes it held the ball (Liu 2007).
+ball's images against those points; r_T_c is the rigid fit of where the robot believes it had the ball (Liu 2007).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, 
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, configurations, rod_orientation
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, path_contact
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, planned_cameras
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, planned_cameras
 
 GRID = (3, 2, 2)
 """Points along the base's x, y and z."""
@@ -33,7 +33,7 @@ FIRST_SEARCH_PX = 80.0
 
 @dataclass(frozen=True, eq=False)
 class RobotCalibration:
-    """The calibration, k points.
+    """Result of a calibration with k points.
 
     Attributes:
         cameras: The calibrated cameras.
@@ -44,7 +44,7 @@ class RobotCalibration:
         covariances: Shape (c, k, 2, 2), px^2.
         rms_px: Residual of each camera.
         robot_residual_mm: Shape (k,): what the rigid fit leaves; mostly the robot's own error.
-        q_true: Shape (k, 6), rad: where the arm truly stood; for the twin alone.
+        q_true: Shape (k, 6), rad: true joints; for the twin alone.
         branch: Of the inverse kinematics; the arm's errors are known on this one.
     """
 
@@ -61,20 +61,20 @@ class RobotCalibration:
 
 
 def carried_rod(case: ServoCase, workcell: StereoWorkcell) -> CarriedRod:
-    """The nominal arm with the case's rod, as it is held at the targets."""
+    """The nominal arm with the case's rod, in the orientation of the targets."""
     tool = case.file.tool
     return CarriedRod(workcell.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
 
 
 def calibrating_rod(case: ServoCase, workcell: StereoWorkcell) -> CarriedRod:
-    """The same, as it is held during the calibration."""
+    """The nominal arm with the case's rod, in the orientation of the calibration."""
     tilt = case.file.calibration.tilt_deg
     rod = carried_rod(case, workcell)
     return rod if tilt is None else rod._replace(R_base_flange=rod_orientation(float(np.radians(tilt))))
 
 
 def grid_points(case: ServoCase) -> Floats:
-    """The calibration's points, base frame, shape (12, 3), mm: neighbours in the order of the arm's way."""
+    """The calibration's points, base frame, shape (12, 3), mm: neighbours in the order of the arm's path."""
     cal = case.file.calibration
     steps = np.array(list(product(*(np.linspace(-0.5, 0.5, count) for count in GRID))))
     return np.asarray(cal.center_mm + steps * cal.size_mm)
@@ -83,12 +83,12 @@ def grid_points(case: ServoCase) -> Floats:
 def calibrate_by_robot(
     workcell: StereoWorkcell, detector: Detector, checker: StateChecker, rng: np.random.Generator
 ) -> RobotCalibration:
-    """Drive to the points, look, measure, and fit.
+    """Move to the points, detect, measure, and fit.
 
     Args:
-        workcell: The true room.
-        detector: Takes the pictures.
-        checker: Judges contacts; the head is not there yet.
+        workcell: The true workcell.
+        detector: Takes the images.
+        checker: Checks contacts; the head is not there yet.
         rng: For the arm's repeatability and the measuring arm.
 
     Raises:

@@ -58,7 +58,7 @@ class CamerasSection(Section):
 
 
 class ServoRobotSection(Section):
-    """The arm; how far it is from its nominal model stands here under older names of ``[errors]``."""
+    """The arm; its deviations from the nominal model are here under older names of ``[errors]``."""
 
     model: Name = "ur3"
     link_mm: Millimetres | None = None
@@ -88,9 +88,9 @@ class ToolSection(Section):
 
 
 class CalibrationSection(Section):
-    """The robot-held points: a 3 x 2 x 2 grid along the base's axes, about a centre; the rod tilted as at the targets.
+    """The robot's points: a 3 x 2 x 2 grid along the base's axes, about a centre; rod tilted as at the targets.
 
-    With another ``tilt_deg`` the arm's errors at the targets are not those that the calibration met.
+    With another ``tilt_deg`` the arm's errors at the targets are not those of the calibration.
     """
 
     center_mm: Vector
@@ -100,7 +100,7 @@ class CalibrationSection(Section):
 
 
 class HeadSection(Section):
-    """The head: its surface and its points in the image frame, and where it stands; z up, face to the cameras."""
+    """The head: its surface and its points in the image frame, and where it is; z up, face to the cameras."""
 
     mesh: str
     unit: Literal["mm", "cm", "m"]
@@ -114,7 +114,7 @@ class HeadSection(Section):
 
 
 class ServoTargetSection(Section):
-    """When a needle hits: within which distance of a target its tip ends."""
+    """When a needle hits: the distance from a target within which its tip ends."""
 
     hit_radius_mm: Annotated[Number, Field(gt=0, le=100)] | None = None
 
@@ -193,7 +193,7 @@ class ServoCase:
         file: Its content.
         model: The arm.
         skin: The head's surface, image frame, mm.
-        markers: The markers' centres, image frame, as they truly are.
+        markers: The markers' centres, image frame, in truth.
         targets: The targets, likewise.
         inputs: Every file, with role and hash.
     """
@@ -213,12 +213,12 @@ class ServoCase:
 
     @cached_property
     def errors(self) -> ServoErrors:
-        """What is declared; all that guidance believes of errors."""
+        """The declared errors: all that guidance believes of errors."""
         return declared_errors(self.file.errors or ServoErrorsSection(), self.file.stated_elsewhere)
 
     @cached_property
     def truth_errors(self) -> ServoErrors:
-        """From what the truth is drawn: what is declared, unless ``[rehearsal.errors]`` states another on purpose."""
+        """Errors from which the truth is drawn: the declared ones, unless ``[rehearsal.errors]`` states others."""
         other = self.file.rehearsal.errors
         return self.errors if other is None else declared_errors(other, {})
 

@@ -1,19 +1,18 @@
-"""One servo step: from where the ball is to where it should be, as a joint path (Liu 2007, section 1).
+"""One servo step: a joint path from where the ball is to where it should be; the mapping of the head; the posture.
 
-    dX = R_base_c (target_c - ball_c),    dq = J^+ [dX; da]
+    dX = R_base_c (target_c - ball_c),    dq = J^+ [dX; da]                             (Liu 2007, section 1)
 
-J is the nominal Jacobian at the ball, da the needle's orientation error from forward kinematics. The way is cut into
+J is the nominal Jacobian at the ball, da the needle's orientation error from forward kinematics. The path is cut into
 short pieces with a Jacobian each, so that it is straight and can be checked for contacts. Near a singularity the
 orientation is given up first: damped steps of the position alone (Nakamura and Hanafusa 1986), as long as the needle
-turns by no more than a limit.
+rotates by no more than a limit.
 
-From the image to the calibration frame: c_T_m by markers that both cameras see, and the error to expect at a target.
+`map_head` estimates c_T_m, from the image to the calibration frame, by markers that both cameras see. Each marker errs
+in the image and in the cameras, and the cameras err most along their view. The fit weighs each marker by both
+covariances (maximum likelihood; Gauss-Newton from the plain rigid fit), and its normal matrix says how far the mapped
+target may be off. With equal round errors both agree with the plain fit and Fitzpatrick's formula.
 
-Each marker errs in the image and in the cameras, and the cameras err most along their view. The fit weighs each marker
-by both covariances (maximum likelihood; Gauss-Newton from the plain rigid fit), and its normal matrix says how far the
-mapped target may be off. With equal round errors both agree with the plain fit and Fitzpatrick's formula.
-
-How the arm holds the rod: one orientation, one inverse-kinematics branch for every point of a session.
+`configurations` gives one orientation and one inverse-kinematics branch of the rod for every point of a session.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ DAMPING = 0.05
 """Damping of a position-only step where the position itself is singular; none where it is not."""
 
 PIECE_MM = 1.0
-"""A step's way is cut into pieces no longer than this: over 1 mm the Jacobian of a UR3 errs by 2 or 3 micrometres."""
+"""A step's path is cut into pieces no longer than this: over 1 mm the Jacobian of a UR3 errs by 2 or 3 micrometres."""
 
 
 class ServoStop(StrEnum):
@@ -72,7 +71,7 @@ class ServoStop(StrEnum):
 
 
 class StepLimits(NamedTuple):
-    """What one step may do."""
+    """Limits of one step."""
 
     step_mm: float = 10.0
     joint_step_rad: float = math.radians(10.0)
@@ -82,18 +81,18 @@ class StepLimits(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A step's way."""
+    """The joint path of one step."""
 
     q_path: Floats
     """Shape (m, 6), rad: from where the arm stands; one row where it may not go anywhere."""
     stop: ServoStop | None
-    """Why there is no way (on)."""
+    """Why there is no path (on)."""
     position_only: bool
     """Whether some piece gave the orientation up."""
 
 
 class CarriedRod(NamedTuple):
-    """What the arm carries and how it is to be held."""
+    """The rod on the arm, and the orientation to keep."""
 
     model: UrModel
     rod_mm: float
@@ -102,7 +101,7 @@ class CarriedRod(NamedTuple):
 
 
 def ball_base(rod: CarriedRod, q: Floats) -> Floats:
-    """Where the nominal arm has its ball, shape (..., 3), mm, base frame."""
+    """Position of the nominal arm's ball, shape (..., 3), mm, base frame."""
     flange = flange_pose(rod.model, q)
     return np.asarray(flange[..., :3, 3] + rod.rod_mm * flange[..., :3, 2])
 
@@ -111,12 +110,12 @@ def ball_jacobian(rod: CarriedRod, q: Floats) -> Floats:
     """The nominal Jacobian at the ball, shape (6, 6): mm and rad per rad, for q of shape (6,)."""
     J = jacobian(rod.model, q)
     lever = rod.rod_mm * flange_pose(rod.model, q)[:3, 2]
-    J[:3] += np.cross(J[3:].T, lever).T
+    J[:3] += np.cross(J[3:].T, lever).T  # v_ball = v_flange + w x r
     return J
 
 
 def orientation_error(rod: CarriedRod, q: Floats) -> Floats:
-    """The turn (3,), rad, base frame, that brings the flange back to the orientation to keep."""
+    """The rotation (3,), rad, base frame, that brings the flange back to the orientation to keep."""
     R = flange_pose(rod.model, q)[:3, :3]
     return log_rotation(rod.R_base_flange @ R.T)
 
@@ -127,7 +126,7 @@ def smallest_sigma(J: Floats) -> float:
 
 
 def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits) -> Step:
-    """The way that moves the ball by a vector and keeps the needle's orientation.
+    """The joint path that moves the ball by a vector and keeps the needle's orientation.
 
     Args:
         rod: The arm and its rod.
@@ -141,9 +140,9 @@ def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits
     start, path, only_position = ball_base(rod, q), [np.asarray(q, dtype=np.float64)], False
     for piece in range(1, count + 1):
         here = path[-1]
-        turn, blind = _piece(rod, here, start + move * (piece / count) - ball_base(rod, here))
-        workcell = limits.joint_step_rad - np.abs(here - q).max()
-        fraction = min(1.0, max(workcell, 0.0) / max(float(np.abs(turn).max()), 1e-12))
+        turn, blind = _piece(rod, here, start + move * (piece / count) - ball_base(rod, here))  # with what is missing
+        slack = limits.joint_step_rad - np.abs(here - q).max()
+        fraction = min(1.0, max(slack, 0.0) / max(float(np.abs(turn).max()), 1e-12))
         there = here + fraction * turn
         stop = _refusal(rod, there, blind, limits)
         if stop is not None:
@@ -156,7 +155,7 @@ def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits
 
 
 def _piece(rod: CarriedRod, q: Floats, move: Floats) -> tuple[Floats, bool]:
-    """Joint turns (6,) of one piece, and whether the orientation was given up."""
+    """Joint rotations (6,) of one piece, and whether the orientation was given up."""
     J = ball_jacobian(rod, q)
     goal = np.concatenate([move / CHARACTERISTIC_MM, orientation_error(rod, q)])
     if smallest_sigma(J) >= MIN_SIGMA:
@@ -172,7 +171,7 @@ def damped(J: Floats, goal: Floats) -> Floats:
         goal: Shape (m,).
     """
     sigma = float(np.linalg.svd(J, compute_uv=False)[-1])
-    squared = DAMPING**2 * max(0.0, 1.0 - (sigma / MIN_SIGMA) ** 2)
+    squared = DAMPING**2 * max(0.0, 1.0 - (sigma / MIN_SIGMA) ** 2)  # lambda^2
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + squared * np.eye(len(J)), goal))
 
 
@@ -194,7 +193,7 @@ CONVERGED = 1e-12
 
 
 class SeenMarkers(NamedTuple):
-    """Markers as the cameras have them."""
+    """Markers as triangulated by the cameras."""
 
     points_c: Floats
     """Shape (n, 3), mm."""
@@ -204,14 +203,14 @@ class SeenMarkers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Mapping:
-    """c_T_m and what is known of its error.
+    """c_T_m with its covariance.
 
     Attributes:
         T_c_m: Shape (4, 4), rigid, mm.
         covariance: Shape (6, 6), of a turn (rad) about ``center_c`` and a shift (mm), axes of C.
         center_c: Shape (3,), the markers' centre, mm.
         residuals: Shape (n, 3), T_c_m markers_m - markers_c, mm.
-        conditioning: The flags of a weak marker set, at the middle of the targets.
+        conditioning: The flags of an ill-conditioned marker set, at the middle of the targets.
     """
 
     T_c_m: Floats
@@ -254,7 +253,7 @@ def map_head(
     *,
     where: str | Path = "mapping",
 ) -> Mapping:
-    """Fit c_T_m.
+    """Fit c_T_m to markers in the image and in C, weighted by both covariances.
 
     Args:
         names: The markers, n at least 3.
@@ -270,7 +269,7 @@ def map_head(
     pairs = MarkerPairs(names, np.asarray(markers_m, dtype=np.float64), seen.points_c)
     plain = register(pairs, method="rigid", target_ct=np.mean(targets_m, axis=0), where=where)
     covariances, center = seen.covariances + max(image_mm, 1e-9) ** 2 * np.eye(3), seen.points_c.mean(axis=0)
-    roots = np.linalg.inv(np.linalg.cholesky(covariances))
+    roots = np.linalg.inv(np.linalg.cholesky(covariances))  # whiten each marker's residual
 
     def linearised(T: Floats) -> System[Floats]:
         fitted = apply(T, pairs.points_ct)
@@ -318,7 +317,7 @@ def flange_poses(rod: CarriedRod, points_base: Floats) -> Floats:
 
 
 class Posture(NamedTuple):
-    """How the arm holds a set of points."""
+    """Joint angles that reach a set of points on one branch."""
 
     q: Floats
     """Shape (n, 6), rad."""
@@ -328,7 +327,7 @@ class Posture(NamedTuple):
 
 
 def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
-    """Joint angles that hold the ball on every point, all on one branch, free of contacts.
+    """Joint angles that put the ball on every point, all on one branch, free of contacts.
 
     Of the branches the one that stays farthest from every singularity is taken; of equals, which mirrored ones are, the
     one whose elbow is on the rod's side.
@@ -336,19 +335,19 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
     Args:
         rod: The arm, its rod and its orientation.
         points_base: Shape (n, 3), mm.
-        checker: Judges contacts.
+        checker: Checks contacts.
         first: Try this branch before the others.
 
     Raises:
         NoAnswerError: No branch holds all points freely; says what the best one lacks.
     """
     every = inverse(rod.model, flange_poses(rod, points_base))
-    workcell = np.nan_to_num(singularity(rod.model, every).least(), nan=0.0).min(axis=0)
+    least = np.nan_to_num(singularity(rod.model, every).least(), nan=0.0).min(axis=0)
     why = f"a {rod.model.name} cannot hold the ball on all {len(points_base)} points on one branch"
     elbow = np.nan_to_num(link_poses(rod.model, every[0])[:, ELBOW, :3, 3] @ -rod.R_base_flange[:, 2])
-    ranks = np.column_stack([np.round(workcell, TIE_DIGITS), np.round(elbow, ELBOW_DIGITS)])
+    ranks = np.column_stack([np.round(least, TIE_DIGITS), np.round(elbow, ELBOW_DIGITS)])
     order = sorted(range(len(ranks)), key=lambda branch: (branch != first, *-ranks[branch]))
-    for branch in (branch for branch in order if workcell[branch] >= LEAST_SINGULARITY):
+    for branch in (branch for branch in order if least[branch] >= LEAST_SINGULARITY):
         q = nearest_within_limits(rod.model, every[:, branch], REFERENCE_RAD)
         if np.isnan(q).any():
             continue

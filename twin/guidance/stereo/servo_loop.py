@@ -1,7 +1,7 @@
-"""Look, move, look again: the servo on what the cameras see of the ball and of the head.
+"""The visual servo loop: look, move, look again, on what the cameras see of the ball and of the head.
 
-The robot's own accuracy does not enter the error that is moved to zero; its kinematics only say which way to turn.
-Where the ball is not seen the arm does not move, and every way is checked for contacts before it is moved.
+The robot's own accuracy does not enter the error that is moved to zero; its kinematics only give the direction of a
+step. Where the ball is not seen the arm does not move, and every path is checked for contacts before it is moved along.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ NOISE_TOLERANCES = 3.0
 
 
 class Seen(NamedTuple):
-    """One look, in C."""
+    """Ball and target of one image, in C."""
 
     ball_c: Floats
     """Shape (3,), mm."""
@@ -47,7 +47,7 @@ class Lost(NamedTuple):
 
 
 Look = Callable[[Floats, Floats], Seen | Lost]
-"""Takes where the arm was sent and where it truly is, each (6,), rad; the truth is for the pictures alone."""
+"""Takes commanded and true joints, each (6,), rad; the truth is for the images alone."""
 
 Move = Callable[[Floats], Floats]
 """Takes the commanded configuration (6,) and returns the true one, rad."""
@@ -55,7 +55,7 @@ Move = Callable[[Floats], Floats]
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What the servo is to do.
+    """Target, limits and devices of one servo.
 
     Attributes:
         rod: The arm, its rod and the orientation to keep.
@@ -64,7 +64,7 @@ class Task:
         max_steps: Moves at most.
         looks: Looks at most before a ball counts as lost.
         limits: What one step may do.
-        checker: Judges contacts, with the head where it is believed to stand.
+        checker: Checks contacts, with the head where it is believed to stand.
     """
 
     rod: CarriedRod
@@ -77,7 +77,7 @@ class Task:
 
 
 class Visit(NamedTuple):
-    """One stay of the arm: what was commanded, what came of it, what was seen."""
+    """One stay of the arm: commanded joints, true joints, and what was seen."""
 
     q_command: Floats
     q_true: Floats
@@ -88,14 +88,14 @@ class Visit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Servoed:
-    """How a servo went.
+    """Result of a servo.
 
     Attributes:
         stop: Why it ended.
         visits: Every stay at which the ball was seen, in order.
         q_command: Shape (6,), rad: the last command.
-        q_true: Shape (6,), rad: where the arm truly stands.
-        detail: What was met or missing, for people.
+        q_true: Shape (6,), rad: true joints.
+        detail: What was touched or missing, for people.
         position_only: Whether some step gave the orientation up.
     """
 
@@ -123,8 +123,8 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, move: Move)
     Args:
         task: What to do.
         q_command: Shape (6,), rad: where the arm was sent.
-        q_true: Shape (6,), rad: where it truly is; only handed on to ``look``.
-        look: Takes pictures and measures.
+        q_true: Shape (6,), rad: true joints; only handed on to ``look``.
+        look: Takes images and measures.
         move: Moves the arm.
     """
     visits: list[Visit] = []
@@ -154,12 +154,12 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, move: Move)
 
 
 def path_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
-    """The first contact on the way through waypoints (m, 6), rad, checked as finely as any motion; None if free."""
+    """First contact along waypoints (m, 6), rad, checked as finely as any motion; None if free."""
     return first_contact(checker, dense_states(checker, q_path, RESOLUTION_RAD / FINER))
 
 
 def _look(task: Task, q_command: Floats, q_true: Floats, look: Look) -> Seen | Lost:
-    """Look, and look again where the ball was not found: the arm stands still meanwhile."""
+    """Look, and look again where the ball was not found, without moving the arm."""
     found = look(q_command, q_true)
     for _ in range(task.looks - 1):
         if isinstance(found, Seen):

@@ -1,4 +1,4 @@
-"""A whole session: calibrate, map the head, then servo onto every target; belief and truth kept apart."""
+"""A whole stereo session: calibrate, map the head, then servo onto every target; belief and truth kept apart."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from puncture_twin.twin.guidance.stereo.detection import (
     Detector,
     LocatedPair,
     Search,
+    image_detector,
     in_space,
     look_at,
-    picture_detector,
 )
 from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide, Known
 from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, NeedleOutcome, needle_outcome
@@ -40,20 +40,20 @@ from puncture_twin.twin.guidance.stereo.servo_law import (
     path_upward,
 )
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, path_contact, servo
-from puncture_twin.twin.guidance.stereo.stereo_room import StereoWorkcell, draw_workcell, workcell_checker
+from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, draw_workcell, workcell_checker
 
 POINTED_MM = 3.0
-"""How well an operator points at a marker in the pictures, per axis: where the search for it begins."""
+"""Deviation of an operator's pointing at a marker in the images, per axis: where the search begins."""
 
 TEST_POINTS = 10
 """Points at which the stereo is tried, as in the paper's Table 1."""
 
 DetectorOf = Callable[[StereoWorkcell, np.random.Generator], Detector]
-"""Makes a sight of a room."""
+"""Makes the detector of a workcell."""
 
 
 class Reached(NamedTuple):
-    """One target, measured in truth; mm."""
+    """Errors at one target, measured in truth; mm."""
 
     target: str
     servoed: Servoed
@@ -64,7 +64,7 @@ class Reached(NamedTuple):
     before_mm: float
     """True ball to true target where the robot alone brought it; the whole distance if it could not start."""
     after_mm: float
-    """The same at the end."""
+    """True ball to true target at the end."""
     servo_only_mm: float
     """True ball to estimated target at the end: what the servo answers for."""
     unseen: NeedleOutcome | None = None
@@ -80,16 +80,16 @@ class Reached(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """What came of a session.
+    """Result of a session.
 
     Attributes:
         seed: What it was drawn from.
         workcell: The truth.
-        calibration: What the robot-held points gave.
+        calibration: Result of the robot's points.
         mapping: What the markers gave.
         stereo_mm: Shape (10,): error of the stereo at points of the calibrated volume.
         reached: One for each target.
-        guide: Who told the servo where ball and target are; knows everything that was measured.
+        guide: The estimates of ball and target for the servo; knows everything that was measured.
     """
 
     seed: int
@@ -116,20 +116,20 @@ def run_session(
     seed: int,
     *,
     targets: tuple[str, ...] | None = None,
-    detector_of: DetectorOf = picture_detector,
+    detector_of: DetectorOf = image_detector,
     empty: StateChecker | None = None,
 ) -> Session:
-    """Everything, in a room drawn from a seed.
+    """Run a whole session in a workcell drawn from a seed.
 
     Args:
         case: The case.
         seed: Of all that is drawn.
         targets: Only these; all when None.
-        detector_of: Who looks; studies of what is behind the pictures leave them out.
+        detector_of: Makes the detector; studies of what is behind the images leave them out.
         empty: Checker of the workcell without the head, where one is at hand.
 
     Raises:
-        NoAnswerError: The calibration, the mapping or a start pose could not be done; says what stood in the way.
+        NoAnswerError: The calibration, the mapping or a start pose could not be done; says what blocked it.
         InputError: The case contradicts itself.
     """
     parts = _Parts(*(np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(len(_Parts._fields))))
@@ -151,7 +151,7 @@ def run_session(
 def see_markers(
     workcell: StereoWorkcell, calibration: RobotCalibration, detector: Detector, rng: np.random.Generator
 ) -> list[Detections]:
-    """Every marker in every camera.
+    """Pixels of every marker in every camera.
 
     Raises:
         NoAnswerError: A marker is not found.
@@ -251,7 +251,7 @@ def _reach(
     aim: _Aim,
     rng: np.random.Generator,
 ) -> Reached:
-    """From where the arm hovers onto the target by the robot alone, then by the servo."""
+    """Move from the hovering point onto the target by the robot alone, then by the servo."""
     contact, unseen, seen = path_contact(task.checker, np.stack([q_hover, q_aim])), None, None
     if contact is None:
         q_true = workcell.arm.settle(q_aim, q_true, rng)

@@ -1,6 +1,6 @@
-"""Recording in the twin: go to a pose, jog the needle into the slice, take a picture, detect, write down.
+"""Recordings made in the twin: go to a pose, jog the needle into the slice, take an image, detect, record.
 
-The workcell in which a recording is made: two arms as they move, the mounts, the needle.
+`WorkcellTruth` is the workcell in which a recording is made: two arms as they move, the mounts, the needle.
 """
 
 from __future__ import annotations
@@ -31,34 +31,34 @@ JOG_TOUCHES = "jog would touch"
 
 
 class ProbeShot(NamedTuple):
-    """One picture with all that belongs to it."""
+    """One image with all that belongs to it."""
 
     candidate: int
     q_probe: Floats
-    """What the probe's arm was told, shape (6,), rad."""
+    """Commanded joints of the probe's arm, shape (6,), rad."""
     q_needle: Floats
-    """The same of the needle's arm, after the jog."""
+    """Commanded joints of the needle's arm after the jog, shape (6,), rad."""
     turn_probe: Floats
-    """Which way each of its joints last turned, shape (6,): 1, -1, or 0."""
+    """Direction in which each of its joints last rotated, shape (6,): 1, -1, or 0."""
     turn_needle: Floats
-    """The same of the needle's arm."""
-    picture: Pixels
+    """Directions of the needle arm's joints, shape (6,)."""
+    image: Pixels
     found: Detection | Missed
     true_needle: NeedleInImage
-    """Where the needle truly was in the true image."""
+    """The true needle in the true image."""
     touched: bool
-    """Whether the true arms truly touched each other."""
+    """Whether the true arms touched each other."""
 
 
 @dataclass(frozen=True, eq=False)
 class Acquisition:
-    """What was recorded.
+    """A recording with its ground truth.
 
     Attributes:
         recording: Poses as the controllers print them, tips and directions as detected.
-        shots: The pictures behind it, in the same order.
+        shots: The images behind it, in the same order.
         missed: Pictures in which no needle was found, by reason, and poses that were given up.
-        missed_shots: Those pictures.
+        missed_shots: Those images.
         left: Indices of candidates that were never gone to.
     """
 
@@ -74,7 +74,7 @@ class Acquisition:
 
 
 class _Motion:
-    """Both true arms, which remember where their play left them; and whether they touch."""
+    """Both true arms, with the play of their last arrivals; and whether they touch."""
 
     def __init__(self, case: SelfcalCase, truth: WorkcellTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
@@ -83,7 +83,7 @@ class _Motion:
         self.turns = [np.zeros(6), np.zeros(6)]
 
     def settle(self, which: int, q: Floats) -> Floats:
-        """Where the joints of arm 0 (probe) or 1 (needle) come to rest, shape (6,), rad."""
+        """Joints of arm 0 (probe) or 1 (needle) at rest, shape (6,), rad."""
         arm = (self._truth.probe_arm, self._truth.needle_arm)[which]
         before = self._before[which]
         before = q if before is None else before
@@ -104,15 +104,15 @@ def acquire(
     """Record as many poses as the case asks for, choosing others for those in which the needle is not found.
 
     Args:
-        case: The room.
+        case: The self-calibration case.
         workcell: Its collision checker: the jog is checked too.
         candidates: Poses that can be taken.
-        truth: The true room.
-        rng: For the choice, if random, the arms' repeatability, what the jog leaves, and the pictures.
-        count: Told after every picture.
+        truth: The ground truth.
+        rng: For the choice, if random, the arms' repeatability, what the jog leaves, and the images.
+        count: Called after every image.
 
     Raises:
-        NoAnswerError: The candidates are used up before enough pictures show the needle.
+        NoAnswerError: The candidates are used up before enough images show the needle.
     """
     motion, wanted = _Motion(case, truth, rng), case.content.poses.count
     shots: list[ProbeShot] = []
@@ -147,7 +147,7 @@ def choose(
     rng: np.random.Generator,
     shots: list[ProbeShot],
 ) -> NDArray[np.int_]:
-    """The next n candidates of those left: the most informative beside what is recorded, or at random."""
+    """The next n candidates of those left: the most informative given what is recorded, or at random."""
     if case.content.poses.choose == "random":
         return np.sort(rng.choice(left, n, replace=False))
     recorded = candidates.poses.subset(np.array([shot.candidate for shot in shots])) if shots else None
@@ -170,7 +170,7 @@ def _shot(
     row: int,
     rng: np.random.Generator,
 ) -> ProbeShot | str:
-    """Go to one candidate and take its picture, or say why it was given up."""
+    """Go to one candidate and take its image, or return why it was given up."""
     q_probe = candidates.q_probe[row]
     rest_probe = motion.settle(0, q_probe)
     wanted = _after_jog(case, candidates.poses, row, rng)
@@ -182,15 +182,15 @@ def _shot(
     rest_needle = motion.settle(1, q_needle)
     needle = truth.needle_in_image(rest_probe, rest_needle)
     imager = case.content.image.imager()
-    picture = render(imager, needle, rng, echo=case.content.image.echo())
+    image = render(imager, needle, rng, echo=case.content.image.echo())
     touched = not motion.between.apart(rest_probe, rest_needle)
     return ProbeShot(
-        row, q_probe, q_needle, motion.turns[0], motion.turns[1], picture, detect(picture, imager), needle, touched
+        row, q_probe, q_needle, motion.turns[0], motion.turns[1], image, detect(image, imager), needle, touched
     )
 
 
 def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Generator) -> NeedleInImage:
-    """Where the needle is to stand in the image, with what the operator leaves: off the plane, and leaning."""
+    """Intended needle in the image, with what the operator leaves: off the plane, and leaning."""
     off = case.content.truth
     assert poses.v is not None  # candidates are made with directions
     lean = rng.normal(0.0, np.radians(off.lean_deg))
@@ -199,7 +199,7 @@ def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Gen
 
 
 def _recording(workcell: TwoArms, shots: list[ProbeShot], *, play: bool) -> Recording:
-    """What the controllers print and the pictures show; which way the joints turned, where that decides anything."""
+    """The recording of images and controllers; with the joints' directions of rotation, where these matter."""
     found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
     q_probe, q_needle = (np.array([getattr(shot, key) for shot in shots]) for key in ("q_probe", "q_needle"))
     turns = (np.array([getattr(shot, key) for shot in shots]) for key in ("turn_probe", "turn_needle"))
@@ -239,15 +239,15 @@ def _too_few(
 
 
 JOG_STEPS = 4
-"""Of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""
+"""Steps of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""
 
 
 class MovingArm(Protocol):
-    """An arm that is commanded by its nominal model and moves as it does; the plant has one, drawn."""
+    """An arm commanded by its nominal model that moves as the plant drew it."""
 
     @property
     def nominal(self) -> UrModel:
-        """What is believed of it."""
+        """The nominal model."""
 
     @property
     def backlash_rad(self) -> float:
@@ -257,7 +257,7 @@ class MovingArm(Protocol):
         """T_base_flange, shape (..., 4, 4), mm, of true configurations (..., 6), rad."""
 
     def settle(self, q_command: Floats, q_before: Floats, rng: np.random.Generator) -> Floats:
-        """Where the joints come to rest, shape (6,), rad, after those of the arrival before."""
+        """Joints at rest, shape (6,), rad, after those of the arrival before."""
 
 
 class WorkcellTruth(NamedTuple):
@@ -290,11 +290,11 @@ def jog_into_slice(
 ) -> Floats:
     """Move the needle's arm until the true needle is in the true image as wanted.
 
-    It stands for the operator, or a servo on the picture, that jogs until the needle shows: what is left is in
+    It stands for the operator, or a servo on the image, that jogs until the needle shows: what is left is in
     ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
 
     Args:
-        truth: The room.
+        truth: The ground truth.
         q_probe: Where the probe's joints rest, shape (6,), rad.
         q_needle: Where the needle's arm begins, shape (6,), rad.
         wanted: The needle in the image, after the jog.

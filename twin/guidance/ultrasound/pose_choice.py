@@ -1,6 +1,6 @@
-"""Poses that both arms can take with the needle in the image, and which of them to record.
+"""Poses that both arms can take with the needle in the image, and the choice of those to record.
 
-The geometry of the picture is drawn first (where the tip shows, how steep the needle is, how the probe is tilted); the
+The geometry of the image is drawn first (where the tip shows, how steep the needle is, how the probe is tilted); the
 arms follow by inverse kinematics. Every draw that cannot be taken falls to a reason, and the reasons are counted.
 
 Those are recorded that tell most about the error at the tip. The bound can count errors of the arms that all poses
@@ -48,7 +48,7 @@ REASONS = (TIP_OUTSIDE, PROBE_REACH, NEEDLE_REACH, *(reason.value for reason in 
 
 
 class ImageGeometry(NamedTuple):
-    """n draws: where the probe is to be, and how the needle is to stand in its image."""
+    """n drawn geometries: pose of the probe, and the needle in its image."""
 
     T_base1_image: Floats
     """Shape (n, 4, 4), mm."""
@@ -61,7 +61,7 @@ class ImageGeometry(NamedTuple):
 
 
 class CandidatePoses(NamedTuple):
-    """Poses that can be recorded, by the drawing, and what became of the other draws."""
+    """Poses that can be recorded, by the drawing, and the reasons of the other draws."""
 
     q_probe: Floats
     """Shape (n, 6), rad."""
@@ -76,7 +76,7 @@ class CandidatePoses(NamedTuple):
 
 
 def drawing(case: SelfcalCase) -> Estimate:
-    """What is believed before anything is calibrated."""
+    """The nominal drawing, believed before anything is calibrated."""
     X, Y = case.T_end1_image, case.T_base1_base2
     V = case.tip_end2 / np.linalg.norm(case.tip_end2)
     return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], case.tip_end2, np.ones(2), V)
@@ -115,10 +115,10 @@ def _lowest_corner(case: SelfcalCase, T_base1_image: Floats) -> Floats:
 
 
 def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generator) -> CandidatePoses:
-    """Draw, solve, check.
+    """Draw geometries, solve for both arms, check contacts.
 
     Args:
-        case: The room.
+        case: The self-calibration case.
         workcell: Its collision checker.
         rng: For the draws.
 
@@ -156,7 +156,7 @@ def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generat
 
 
 def _flange_goals(case: SelfcalCase, belief: Estimate, seen: ImageGeometry) -> tuple[Floats, Floats]:
-    """T_base1_end1 and T_base2_end2 that make the picture, by the drawing; each (n, 4, 4)."""
+    """T_base1_end1 and T_base2_end2 that make the image, by the drawing; each (n, 4, 4)."""
     A = seen.T_base1_image @ np.linalg.inv(case.T_end1_image)
     T_base2_image = np.linalg.inv(case.T_base1_base2) @ seen.T_base1_image
     along = np.column_stack([seen.direction_image, np.zeros(len(seen.roll))])
@@ -185,7 +185,7 @@ def needle_flange(
 
 
 def configurations(model: UrModel, T_base_flange: Floats, q_home: Floats) -> list[Floats]:
-    """All configurations within the limits that hold each flange pose, the nearest to home first; each (k, 6), rad."""
+    """Configurations within the limits that reach each flange pose, nearest to home first; each (k, 6), rad."""
     q = nearest_within_limits(model, inverse(model, T_base_flange), q_home)
     away = np.linalg.norm(q - q_home, axis=-1)
     order = np.argsort(np.where(np.isnan(away), np.inf, away), axis=1)
@@ -193,7 +193,7 @@ def configurations(model: UrModel, T_base_flange: Floats, q_home: Floats) -> lis
 
 
 def _checked_pose(workcell: TwoArms, inside: bool, probe: Floats, needle: Floats) -> str | tuple[Floats, Floats]:
-    """The first pair of configurations that stands free, or the reason why none does."""
+    """The first pair of configurations that is free, or the reason why none is."""
     if not inside:
         return TIP_OUTSIDE
     if len(probe) == 0:
@@ -226,11 +226,11 @@ MAX_SWEEPS = 20
 """How often all chosen poses are looked at for a better exchange."""
 
 WORTH = 1e-4
-"""An exchange must lower the mean squared error by this share."""
+"""An exchange must lower the mean squared error by this fraction."""
 
 
 class _Design(NamedTuple):
-    """What every candidate tells, and what is to be known."""
+    """Information of every candidate, and the quantity to be known."""
 
     rows: Floats
     """Jacobian of each candidate over its residuals' spread, shape (n, 3, p), p of parameters and arms' errors: its
@@ -241,7 +241,7 @@ class _Design(NamedTuple):
     """Information held beforehand, shape (p, p)."""
 
     def information(self, index: int) -> Floats:
-        """Of one candidate, shape (p, p)."""
+        """Information of one candidate, shape (p, p)."""
         return np.asarray(self.rows[index].T @ self.rows[index])
 
 
@@ -277,13 +277,13 @@ def choose_poses(
     chosen: list[int] = []
     H = design.base
     for _ in range(n):
-        chosen.append(_best(design, H, chosen))
+        chosen.append(_best(design, H, chosen))  # greedy: the next one that lowers the error most
         H = H + design.information(chosen[-1])
     return np.sort(_exchanged(design, H, chosen))
 
 
 class _Belief(NamedTuple):
-    """What is believed before anything is recorded."""
+    """The belief before anything is recorded."""
 
     noise: Noise
     prior: Estimate
@@ -308,7 +308,7 @@ def expected_tre_mm(
 
 
 def _with_prior(H: Floats) -> Floats:
-    """Information with what is known of the arms' errors beforehand: their deviation is 1."""
+    """Information with the prior of the arms' errors: their deviation is 1."""
     return H + np.diag((np.arange(len(H)) >= N_FREE).astype(float))
 
 
@@ -333,7 +333,7 @@ def _wanted(workspace: Recording, belief: _Belief) -> Floats:
 
 def _design(candidates: Recording, belief: _Belief, recorded: Recording | None) -> _Design:
     rows = _whitened(candidates, belief)
-    base = _with_prior(PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0)))
+    base = _with_prior(PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0)))  # makes H invertible
     if recorded is not None:
         known = _whitened(recorded, belief).reshape(-1, rows.shape[2])
         base = base + known.T @ known
@@ -366,7 +366,7 @@ def _exchanged(design: _Design, H: Floats, chosen: list[int]) -> NDArray[np.int_
     for _ in range(MAX_SWEEPS):
         changed = False
         for place, index in enumerate(list(chosen)):
-            without = H - design.information(index)
+            without = H - design.information(index)  # information adds up over poses
             best = _best(design, without, chosen[:place] + chosen[place + 1 :])
             after = without + design.information(best)
             if best != index and _value(design, after) < (1 - WORTH) * _value(design, H):

@@ -1,4 +1,4 @@
-"""After the calibration: the needle is sent to a target that is seen in the image, and where its tip truly ends."""
+"""Punctures after the calibration: the needle sent to a target seen in the image, and the ground truth of its tip."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 
 AIM_STEPS = 3
-"""Of the command that counts the needle arm's errors: each leaves a thousandth of what was left before."""
+"""Iterations of the command that counts the needle arm's errors: each leaves a thousandth of what was left before."""
 
 LESION_MM = 4.0
-"""Radius of the lesion that is drawn about the target in a picture."""
+"""Radius of the lesion that is drawn about the target in an image."""
 
 
 class Puncture(NamedTuple):
-    """One target."""
+    """Prediction and ground truth of one puncture."""
 
     candidate: int
     target_image: Floats
     """True target in the true image, shape (3,), mm; it lies in the plane, for it is seen."""
     needle: NeedleInImage
-    """Where the needle truly ended, in the true image."""
+    """The true needle at its end, in the true image."""
     predicted_mm: float
     """Expected (rms) error from the calibration and the arms."""
     click_mm: float
@@ -54,12 +54,12 @@ class Puncture(NamedTuple):
 
     @property
     def depth_mm(self) -> float:
-        """Its part along the true needle: + is too deep."""
+        """Error along the true needle, mm: + is too deep."""
         return float(self.error_image @ self.needle.direction_image)
 
     @property
     def lateral_mm(self) -> float:
-        """Its part across the needle."""
+        """Error across the needle, mm."""
         return float(np.sqrt(max(self.error_mm**2 - self.depth_mm**2, 0.0)))
 
 
@@ -72,14 +72,14 @@ def punctures(
     calibration: Calibration,
     rng: np.random.Generator,
 ) -> tuple[Puncture, ...]:
-    """Send the needle to the middle of the picture's tip, one held-out candidate after the other.
+    """Send the needle to the middle of the image's tip, one held-out candidate after the other.
 
     Args:
-        case: The room.
+        case: The self-calibration case.
         workcell: Its collision checker; a target at which something would touch is passed over.
         candidates: Where probe and needle can stand.
         rows: The candidates to use: none of them was recorded.
-        truth: The true room.
+        truth: The ground truth.
         calibration: What was found.
         rng: The reading of the target and the arms' repeatability.
     """
@@ -104,7 +104,7 @@ def _puncture(
     if np.isnan(q_needle).any() or workcell.verdict(q_probe, q_needle) is not None:
         return None
     rest_needle = truth.needle_arm.settle(q_needle, q_needle, rng)
-    predicted = expected_error_mm(calibration, _standing(truth, q_probe, q_needle, clicked))
+    predicted = expected_error_mm(calibration, _recorded_pose(truth, q_probe, q_needle, clicked))
     ended = truth.needle_in_image(rest_probe, rest_needle)
     return Puncture(row, target, ended, predicted, case.content.truth.click_mm)
 
@@ -112,7 +112,7 @@ def _puncture(
 def aim(
     candidates: CandidatePoses, row: int, target_mm: Floats, calibration: Calibration, truth: WorkcellTruth
 ) -> Floats:
-    """What the needle's arm is told: by its nominal kinematics and the calibration; (6,), rad, NaN if out of reach.
+    """Commanded joints of the needle's arm by its nominal kinematics and the calibration: (6,), rad; NaN out of reach.
 
     Args:
         candidates: Where probe and needle can stand.
@@ -135,17 +135,17 @@ def aim(
         q = nearest_configuration(truth.needle_arm, command, q)
         if calibration.arms is None or np.isnan(q).any():
             break
-        standing = _standing(truth, candidates.q_probe[row], q, target_mm)
-        command = standing.B[0] @ np.linalg.inv(calibration.corrected(standing)[1][0]) @ goal
+        recorded = _recorded_pose(truth, candidates.q_probe[row], q, target_mm)
+        command = recorded.B[0] @ np.linalg.inv(calibration.corrected(recorded)[1][0]) @ goal
     return q
 
 
 def expected_error_mm(calibration: Calibration, poses: Recording) -> float:
-    """Expected (rms) distance of the tip from where the image has it, over poses that hold the joints."""
+    """Expected (rms) distance of the tip from where the image has it, over poses with joints."""
     return float(np.sqrt(np.mean(np.trace(calibration.tip_covariances(poses), axis1=1, axis2=2))))
 
 
-def _standing(truth: WorkcellTruth, q_probe: Floats, q_needle: Floats, tip_mm: Floats) -> Recording:
+def _recorded_pose(truth: WorkcellTruth, q_probe: Floats, q_needle: Floats, tip_mm: Floats) -> Recording:
     """One pose as both controllers print it, with the tip at a point of the image."""
     A, B = flange_pose(truth.probe_arm.nominal, q_probe), flange_pose(truth.needle_arm.nominal, q_needle)
     return Recording(A[None], B[None], tip_mm[None, :2], q_probe=q_probe[None], q_needle=q_needle[None])
@@ -160,7 +160,7 @@ def unseen_errors_mm(
 ) -> Floats:
     """Predicted minus true tip at candidates that were not recorded, in the image; shape (n,), mm.
 
-    Both arms stand where they were told to by nominal kinematics, and their errors that were found are counted; the
+    Both arms stand where nominal kinematics put them, and their errors that were found are counted; the
     image's are not in it.
     """
     errors = []
@@ -173,8 +173,8 @@ def unseen_errors_mm(
             )
         ]
         seen = truth.needle_in_image(*rests).tip_image
-        standing = _standing(truth, candidates.q_probe[row], candidates.q_needle[row], seen)
-        A, B = calibration.corrected(standing)
+        recorded = _recorded_pose(truth, candidates.q_probe[row], candidates.q_needle[row], seen)
+        A, B = calibration.corrected(recorded)
         T_base1_image, T_base1_end2 = A[0] @ calibration.X, calibration.Y @ B[0]
         tip = T_base1_end2[:3, :3] @ calibration.tip_end2 + T_base1_end2[:3, 3]
         predicted = np.linalg.inv(T_base1_image) @ np.append(tip, 1.0)
@@ -182,7 +182,7 @@ def unseen_errors_mm(
     return np.array(errors)
 
 
-def puncture_picture(case: SelfcalCase, puncture: Puncture, rng: np.random.Generator) -> Pixels:
-    """The picture after the puncture: a lesion about the target, and the needle."""
+def puncture_image(case: SelfcalCase, puncture: Puncture, rng: np.random.Generator) -> Pixels:
+    """The image after the puncture: a lesion about the target, and the needle."""
     lesion = Lesion(puncture.target_image, LESION_MM)
     return render(case.content.image.imager(), puncture.needle, rng, echo=case.content.image.echo(), lesion=lesion)

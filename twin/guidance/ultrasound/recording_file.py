@@ -22,7 +22,7 @@ from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 FILE_NAME = "recording.csv"
-"""What a folder is searched for."""
+"""Name of the file that a folder is searched for."""
 
 MAX_BYTES = 50_000_000
 """More than 50,000 poses: no calibration needs so many, and a larger file is likely something else."""
@@ -39,8 +39,8 @@ def read_recording(path: Path) -> Recording:
     Columns: ``name``; ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``; the same for B; ``P_u_mm, P_v_mm`` (or ``_px``); and,
     where directions were measured, ``v_x, v_y`` or ``v_x, v_y, v_z``, and behind them, where it was measured too, how
     much of the shaft shows, ``shaft_mm``; and, where the joints were recorded,
-    ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``; and, behind these, which way each joint last turned (1, -1; 0 where
-    nobody knows), ``A_turn1 .. B_turn6``. Lines that start with # are passed over.
+    ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``; and, behind these, the direction of each joint's last rotation
+    (1, -1; 0 where unknown), ``A_turn1 .. B_turn6``. Lines that start with # are passed over.
 
     Raises:
         InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
@@ -50,7 +50,7 @@ def read_recording(path: Path) -> Recording:
 
 
 def parse_recording(content: bytes, file: Path) -> Recording:
-    """The same of a file that has been read; it is not opened again.
+    """As `read_recording`, of a file that has been read; it is not opened again.
 
     Raises:
         InputError: As `read_recording`, but for reading.

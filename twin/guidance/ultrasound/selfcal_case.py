@@ -49,7 +49,7 @@ class ErrorsSection(Section):
     repeatability_deg: Deviation = 0.003
 
     def declared(self, model: UrModel) -> DeclaredArm:
-        """What a calibration is told of the arm."""
+        """The declared arm of a calibration, mm and rad."""
         twist, joint, play, repeated = np.radians(
             [self.twist_deg, self.joint_deg, self.backlash_deg, self.repeatability_deg]
         )
@@ -124,7 +124,7 @@ class PhantomSection(Section):
 
 
 class ImageSection(Section):
-    """The machine, and what the needle sends back."""
+    """The ultrasound machine, and the needle's echo."""
 
     pixel_mm: Annotated[Number, Field(ge=0.05, le=1)] = 0.2
     slice_fwhm_mm: Annotated[Number, Field(ge=0.2, le=10)] = 1.2
@@ -159,7 +159,7 @@ class PosesSection(Section):
 
 
 class TruthSection(Section):
-    """How far the truth is from the drawing, and what the operator leaves: standard deviations per axis."""
+    """Deviations of the truth from the drawing and of the operator, per axis."""
 
     mount_mm: Deviation = 3.0
     mount_deg: Deviation = 0.5
@@ -172,7 +172,7 @@ class TruthSection(Section):
 
 
 class NoiseSection(Section):
-    """What the calibration is told; without it, it finds the residuals' spread by itself."""
+    """Noise stated to the calibration; without it, the residuals' spread is estimated."""
 
     robot_mm: Annotated[Number, Field(ge=0, le=100)]
     robot_deg: Annotated[Number, Field(ge=0, le=10)]
@@ -196,7 +196,7 @@ class NoiseSection(Section):
 
 
 class SelfcalFile(Section):
-    """The whole file."""
+    """Schema of the whole file."""
 
     schema_: SchemaOne = Field(alias="schema")
     name: Name
@@ -243,7 +243,7 @@ class SelfcalCase:
 
     @property
     def declared_arms(self) -> DeclaredArms:
-        """What the calibration is told of both arms."""
+        """Declared errors of both arms; None without."""
         arms = (self.content.probe_arm, self.content.needle_arm)
         declared = (arm.errors.declared(model) for arm, model in zip(arms, self.models, strict=True))
         return DeclaredArms(*declared)

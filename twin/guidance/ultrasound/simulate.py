@@ -44,7 +44,7 @@ class PoseRanges(NamedTuple):
 
 
 class SimulatedTruth(NamedTuple):
-    """What a calibration is to find."""
+    """The truth that a calibration is to find."""
 
     X: Floats
     """T_end1_image, shape (4, 4), mm."""
@@ -125,9 +125,9 @@ def exact_recording(truth: SimulatedTruth, A: Floats, seen: ImagePose) -> Record
 
 def needle_orientations(along_image: Floats, direction_end2: Floats, roll: Floats) -> Floats:
     """M, from end2 to image, that lays V along given unit vectors and turns the needle about itself; (n, 3, 3)."""
-    beside = np.cross(along_image, [0.0, 0.0, 1.0])
-    beside /= np.linalg.norm(beside, axis=1, keepdims=True)
-    image = frame_yz(beside, along_image)
+    across = np.cross(along_image, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    image = frame_yz(across, along_image)
     end2 = frame_about(direction_end2)
     turn = exp_rotation(np.column_stack([np.zeros((len(roll), 2)), roll]))
     return np.asarray(image @ turn @ end2.T)

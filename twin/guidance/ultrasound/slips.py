@@ -1,4 +1,4 @@
-"""Recordings that were written in another reading: inverse poses, arms in each other's place, metres.
+"""Calibration of a recording, with refusal of one written in another reading: inverse poses, swapped arms, metres.
 
 Such a recording still has a best fit, with residuals of centimetres, and no pose stands out because all are wrong. So
 where the reading as given does not fit, the slips that people make are undone one by one; the one that then fits is
@@ -23,7 +23,7 @@ from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 
 
 def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:
-    """Calibrate with what the case says of noise and needle; pixels are solved for where the recording has them."""
+    """Calibrate with the case's noise and needle; pixels are solved for where the recording has them."""
     noise = None if case is None or case.content.noise is None else case.content.noise.noise()
     length = case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
     arms = None if case is None or recording.q_probe is None else case.declared_arms
@@ -48,7 +48,7 @@ ALLOWED = "A = T_base1_end1 and B = T_base2_end2 in mm, rotations by rows, P in 
 
 
 def checked_calibration(recording: Recording, case: SelfcalCase | None, where: Path) -> Calibration:
-    """A calibration of a recording from outside, if the recording was read as it was meant.
+    """Calibration of a recording from outside; one that was read otherwise than meant is refused.
 
     Args:
         recording: As its file gives it.
@@ -94,7 +94,7 @@ def _refuse_slip(recording: Recording, rms_mm: float, where: Path) -> None:
 
 
 def _residual_mm(undo: Reading, recording: Recording) -> float:
-    """Of the other reading, over all poses; infinite where it cannot be calibrated."""
+    """Residuals (rms) of the other reading over all poses, mm; infinite where it cannot be calibrated."""
     try:
         return calibrate(undo(recording), scale=recording.pixels, direction=False).rms_mm
     except InputError:

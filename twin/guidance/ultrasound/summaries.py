@@ -16,11 +16,11 @@ from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, expected_e
 
 @dataclass(frozen=True, eq=False)
 class SelfcalTrial:
-    """One seed in the twin: a room, its recording, its calibration, and what came of it.
+    """One seed in the twin: workcell, recording, calibration, and the errors at targets.
 
     Attributes:
         seed: Of this trial.
-        truth: The room.
+        truth: The ground truth.
         acquisition: What was recorded.
         calibration: What was found.
         unseen_mm: Predicted minus true tip at poses that were not recorded, shape (k,).
@@ -37,11 +37,11 @@ class SelfcalTrial:
 
 @dataclass(frozen=True)
 class Choice:
-    """What choosing poses is worth, by the Cramer-Rao bound over all candidates, mm."""
+    """Gain by choosing poses, as the Cramer-Rao bound over all candidates, mm."""
 
     chosen_mm: float
     random_mm: tuple[float, ...]
-    """Of random choices of as many poses."""
+    """Bounds of random choices of as many poses."""
 
     @property
     def median_random_mm(self) -> float:
@@ -72,7 +72,7 @@ def calibration_summary(found: Calibration, recording: Recording) -> dict[str, A
 
 
 def noise_summary(found: Calibration) -> dict[str, float]:
-    """The noise that was stated, or the spread that was found."""
+    """The stated noise, or the estimated spread."""
     if isinstance(found.noise, Noise):
         stated = found.noise
         return {
@@ -91,7 +91,7 @@ def noise_summary(found: Calibration) -> dict[str, float]:
 
 
 def arms_summary(found: Calibration) -> dict[str, Any] | None:
-    """What was found of the declared arms, and whether the residuals agree; None where none were declared."""
+    """Estimated errors of the declared arms, and whether the residuals agree; None where none were declared."""
     if found.arms is None:
         return None
     return {
@@ -109,7 +109,7 @@ def predicted_tre(found: Calibration, recording: Recording) -> float:
 
 
 def choice_summary(choice: Choice) -> dict[str, Any]:
-    """Bounds in mm."""
+    """The bounds of a choice, mm."""
     return {
         "chosen_bound_mm": choice.chosen_mm,
         "random_bound_median_mm": choice.median_random_mm,
@@ -119,7 +119,7 @@ def choice_summary(choice: Choice) -> dict[str, Any]:
 
 
 def trial_summary(trial: SelfcalTrial) -> dict[str, Any]:
-    """One seed: mm and degrees."""
+    """One seed as plain values, mm and degrees."""
     found, truth, errors = trial.calibration, trial.truth, trial.acquisition.detection_errors()
     return {
         "seed": trial.seed,

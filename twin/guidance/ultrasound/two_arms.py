@@ -1,8 +1,8 @@
-"""The room: an arm with a probe and an arm with a needle about a block of tissue, and whether anything touches.
+"""The ultrasound workcell: an arm with a probe and an arm with a needle about a block of tissue, and their contacts.
 
 Each arm alone is checked as everywhere (:class:`planning.collision.fast_checker.FastChecker`: itself, the table, the
 phantom); here the probe's head and the two arms against each other are added, with the same convex bodies and FCL.
-Everything stands where the *drawing* has it; the clearance covers what the truth differs by.
+Everything is placed where the *drawing* has it; the clearance covers what the truth differs by.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ STUB_MM = 1.0
 """A tool ends in a needle; the probe's handle ends in one so short that it is none."""
 
 FAR_LINKS = 5
-"""The probe's head may meet the links from the base to wrist 1; the later ones turn behind it."""
+"""The probe's head may touch the links from the base to wrist 1; the later ones turn behind it."""
 
 
 class Touching(StrEnum):
-    """Why a pair of configurations is refused."""
+    """Contact because of which a pair of configurations is refused."""
 
     PROBE_ARM = "probe_arm_collision"
     NEEDLE_ARM = "needle_arm_collision"
@@ -68,20 +68,20 @@ class BetweenArms:
             body.place(poses)
 
     def apart(self, q_probe: Floats, q_needle: Floats) -> bool:
-        """Whether they keep their clearance."""
+        """Whether the two arms keep their clearance."""
         self.place_probe(q_probe)
         moved = self.T_base1_base2 @ link_poses(self._models[1], q_needle)
         for body in self.needle_bodies:
             body.place(moved)
-        ends_first = product(reversed(self.probe_bodies), reversed(self.needle_bodies))  # they meet soonest
-        return not any(_meet(first, second) for first, second in ends_first)
+        ends_first = product(reversed(self.probe_bodies), reversed(self.needle_bodies))  # they touch soonest
+        return not any(_touch(first, second) for first, second in ends_first)
 
 
 class TwoArms:
     """FCL's verdict on both arms. Not for several threads at once: FCL's objects are moved for each question.
 
     Args:
-        case: The room.
+        case: The self-calibration case.
     """
 
     def __init__(self, case: SelfcalCase) -> None:
@@ -110,7 +110,7 @@ class TwoArms:
         *links, head = self._between.probe_bodies
         if touch(head.bare.surface.made, self._phantom) or touch(head.full.surface.made, self._table):
             return False
-        return not any(_meet(head, link) for link in links[:FAR_LINKS])
+        return not any(_touch(head, link) for link in links[:FAR_LINKS])
 
     def needle_free(self, q: Floats) -> bool:
         """Whether the needle's arm touches neither itself, table nor, but for the needle, the phantom."""
@@ -121,7 +121,7 @@ class TwoArms:
         return self._between.apart(q_probe, q_needle)
 
     def verdict(self, q_probe: Floats, q_needle: Floats) -> Touching | None:
-        """What touches, or None."""
+        """The contact, or None."""
         if not self.probe_free(q_probe):
             return Touching.PROBE_ARM
         if not self.needle_free(q_needle):
@@ -129,8 +129,8 @@ class TwoArms:
         return None if self.apart(q_probe, q_needle) else Touching.BOTH
 
 
-def _meet(first: Body, second: Body) -> bool:
-    """Whether ``first``, with its clearance, touches ``second``; balls first."""
+def _touch(first: Body, second: Body) -> bool:
+    """Whether ``first``, with its clearance, touches ``second``; bounding spheres first."""
     apart = np.linalg.norm(first.full.surface.pose.getTranslation() - second.bare.surface.pose.getTranslation())
     reach = max(float(np.linalg.norm(hull, axis=1).max()) for hull in first.full.hulls)
     if apart > reach + second.radius_mm:

@@ -16,7 +16,7 @@ from markupsafe import Markup
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.batch.merge import NO_SAFE, NOT_RUN
 from puncture_twin.planning.search.candidates import ARM_CHECKED
-from puncture_twin.planning.search.doubt import chance_text
+from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import inputs_table, joined, table
 from puncture_twin.twin.report.page.template import Card, packed, script_json, write_html

@@ -22,8 +22,8 @@ from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.doubt import Doubt
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
 from puncture_twin.planning.search.windows import Window, find_windows, nearest_row
 from puncture_twin.twin.jobs.patient.answers import explain_choice
 from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
@@ -144,7 +144,7 @@ def _planned_side(context: CaseContext, candidates: Candidates, path: Path, plan
     """A plan that holds; its chances are those of the configuration in which it ends."""
     check_plan(plan, context, path, seed=context.case.rehearsal.seed)
     explained = context.explain(plan.theta, plan.beta)
-    explained = replace(explained, doubt=context.doubt_at(plan.outward_ct, plan.insertion.q[-1]))
+    explained = replace(explained, breakdown=context.breakdown_at(plan.outward_ct, plan.insertion.q[-1]))
     grid = _on_grid(candidates, plan.outward_ct, safe=True)
     return replace(_stated_side(path, plan), explained=explained, grid=grid)
 
@@ -343,10 +343,10 @@ def _percent(chance: float) -> str:
     return f"{100 * chance:.2f}" if chance >= LEAST_CHANCE else "below 0.01"
 
 
-def _of_doubt(values: Callable[[Doubt], str]) -> Callable[[Side], str]:
+def _of_breakdown(values: Callable[[UncertaintyBreakdown], str]) -> Callable[[Side], str]:
     def shown(side: Side) -> str:
-        doubt = None if side.explained is None else side.explained.doubt
-        return NOTHING if doubt is None else values(doubt)
+        breakdown = None if side.explained is None else side.explained.breakdown
+        return NOTHING if breakdown is None else values(breakdown)
 
     return shown
 
@@ -388,8 +388,8 @@ def _reach(side: Side) -> str:
     return {-1: "not computed", 0: "no", 1: f"yes, margin {arm.margin[0]:.2f}"}[int(arm.reachable[0])]
 
 
-def _likeliest(doubt: Doubt) -> str:
-    name, chance = doubt.likeliest
+def _likeliest(breakdown: UncertaintyBreakdown) -> str:
+    name, chance = breakdown.likeliest
     return f"{_percent(chance)}, {name}" if name else NOTHING
 
 
@@ -405,10 +405,10 @@ _ROWS: tuple[tuple[str, Callable[[Side], str]], ...] = (
         "safe cone, deg",
         lambda side: NOTHING if side.grid is None else _shown(np.degrees(side.grid.safe_cone), "{:.1f}"),
     ),
-    ("chance to hit, %", _of_doubt(lambda doubt: _percent(doubt.p_hit))),
-    ("chance to touch anything, %", _of_doubt(lambda doubt: _percent(doubt.p_touch_any))),
-    ("likeliest to be touched, %", _of_doubt(_likeliest)),
-    ("expected tip error (rms), mm", _of_doubt(lambda doubt: f"{doubt.budget.rms_mm:.2f}")),
+    ("chance to hit, %", _of_breakdown(lambda breakdown: _percent(breakdown.p_hit))),
+    ("chance to touch anything, %", _of_breakdown(lambda breakdown: _percent(breakdown.p_touch_any))),
+    ("likeliest to be touched, %", _of_breakdown(_likeliest)),
+    ("expected tip error (rms), mm", _of_breakdown(lambda breakdown: f"{breakdown.budget.rms_mm:.2f}")),
     ("path length, mm", _checked(lambda one: one.candidates.path.length[0], "{:.1f}")),
     ("skin angle, deg", _checked(lambda one: np.degrees(one.candidates.path.skin_angle[0]), "{:.1f}")),
     ("tissue crossed, mm", _checked(lambda one: one.candidates.path.tissue[0], "{:.1f}")),

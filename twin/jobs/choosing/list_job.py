@@ -234,7 +234,7 @@ def _document(context: CaseContext, row: Listed, found: Outcome) -> dict[str, An
 def _explained(explained: Explanation) -> dict[str, Any]:
     one = explained.candidates
     entry = to_lps(one.path.entry_ct, explained.case.space)[0]
-    place, doubt = explained.facts.place, explained.doubt
+    place, breakdown = explained.facts.place, explained.breakdown
     return {
         **one.at(0),
         "reason": str(one.verdict.reason[0]),
@@ -247,8 +247,8 @@ def _explained(explained: Explanation) -> dict[str, Any]:
         "min_clearance_mm": finite(one.least_clearance[0]),
         "nearest": explained.nearest_demanding(),
         "reachable": None if one.arm.reachable[0] < 0 else bool(one.arm.reachable[0]),
-        "p_hit": None if doubt is None else doubt.p_hit,
-        "p_touch_any": None if doubt is None else doubt.p_touch_any,
+        "p_hit": None if breakdown is None else breakdown.p_hit,
+        "p_touch_any": None if breakdown is None else breakdown.p_touch_any,
     }
 
 

@@ -10,14 +10,14 @@ from typing import Any, get_args
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.manifest import FORMAT
 from puncture_twin.planning.formats.meshes.ply import ply_bytes
-from puncture_twin.twin.plant.outside_objects import Arms, Bed, Beside, Part
+from puncture_twin.twin.plant.outside_objects import Arms, Bed, OutsideObjects, Part
 
 FOLDER = "beside"
 LIST = "manifest.json"
 """`init` passes a folder whose list says that this program wrote it: the truth is no segmentation."""
 
 
-def parse_beside(arms: str, bed: str, lines: int) -> Beside | None:
+def parse_beside(arms: str, bed: str, lines: int) -> OutsideObjects | None:
     """What shall lie beside the patient; None for nothing.
 
     Args:
@@ -31,8 +31,10 @@ def parse_beside(arms: str, bed: str, lines: int) -> Beside | None:
     for option, word, known in (("--arms", arms, get_args(Arms)), ("--bed", bed, get_args(Bed))):
         if word not in known:
             raise InputError(f"'{word[:40]}' is not known", where=option, allowed=", ".join(known))
-    wanted = Beside(next(k for k in get_args(Arms) if k == arms), next(k for k in get_args(Bed) if k == bed), lines)
-    return None if wanted == Beside() else wanted
+    wanted = OutsideObjects(
+        next(k for k in get_args(Arms) if k == arms), next(k for k in get_args(Bed) if k == bed), lines
+    )
+    return None if wanted == OutsideObjects() else wanted
 
 
 def beside_summary(parts: Sequence[Part]) -> list[dict[str, Any]]:

@@ -29,7 +29,7 @@ from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, need
 from puncture_twin.twin.jobs.experiment.result_file import write_result
 from puncture_twin.twin.jobs.experiment.scan_beside import beside_summary, write_beside
 from puncture_twin.twin.jobs.experiment.scan_picture import Shown, draw_scan
-from puncture_twin.twin.plant.outside_objects import Beside
+from puncture_twin.twin.plant.outside_objects import OutsideObjects
 from puncture_twin.twin.plant.scanner.case_scene import (
     CaseScene,
     MarkerKind,
@@ -64,7 +64,7 @@ class ScanRequest(NamedTuple):
     settings: ScanSettings
     marker: MarkerKind = "disc"
     rehearsal: Path | None = None
-    beside: Beside | None = None
+    beside: OutsideObjects | None = None
 
 
 def parse_marker(text: str) -> MarkerKind:
@@ -124,7 +124,7 @@ class ScanRun:
             "markers": list(self._markers()),
             "lesion": {"true_mm": true.tolist(), "found_mm": found.tolist(), "error_mm": (found - true).tolist()},
             "needle": None if self.control is None else control_summary(self.control),
-            "beside": beside_summary(self.scene.beside),
+            "beside": beside_summary(self.scene.outside_objects),
             "thin_voxels": dict(self.image.thin),
             "inputs": inputs_document(self.inputs),
             "files": [str(path) for path in self.files],
@@ -198,7 +198,9 @@ def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
     _refuse_two_beds(context, request)
     needle, read = _rehearsed(request.rehearsal)
     rod = None if needle is None else needle[0]
-    scene = case_scene(case, context.anatomy, settings, rng, marker=request.marker, needle=rod, beside=request.beside)
+    scene = case_scene(
+        case, context.anatomy, settings, rng, marker=request.marker, needle=rod, outside_objects=request.beside
+    )
     image = scan_solids(scene.solids, scan_grid(scene, settings, rng), settings, rng)
     volume = Volume(image.hu, image.grid.T_ct_index, case.path)
     markers = None if scene.listed is None else find_markers(volume, scene.listed)
@@ -266,7 +268,7 @@ def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
     if run.markers is not None:
         write_points(folder / FOUND, run.markers.fine)
         yield folder / FOUND
-    yield from write_beside(run.scene.beside, folder)
+    yield from write_beside(run.scene.outside_objects, folder)
     found = None if run.markers is None else run.markers.fine
     needle = None if run.control is None else run.control.found
     yield draw_scan(image, Shown(run.scene.target, found, needle, case.needle.shaft_mm), folder / PICTURE)

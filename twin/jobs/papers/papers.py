@@ -16,9 +16,9 @@ from puncture_twin.twin.experiment.chen2019 import (
     AS_FOUND,
     AS_STATED,
     REJECTED,
+    DrawnRank,
     Experiment,
     SkewFinding,
-    Standing,
     find_skew,
     paper_strains,
     run_draws,
@@ -133,11 +133,11 @@ def _declared(one: Experiment) -> str:
     return f"{d.name}: {', '.join(part for part in parts if part)}"
 
 
-def _row(stated: Standing, found: Standing) -> str:
+def _row(stated: DrawnRank, found: DrawnRank) -> str:
     return f"{stated.name:40s} {stated.paper:7.2f} {'':19s} {stated.percentile:8.1f} {found.percentile:8.1f}"
 
 
-def _joint_row(stated: Standing, found: Standing) -> str:
+def _joint_row(stated: DrawnRank, found: DrawnRank) -> str:
     """The statistic's size depends on the declaration for chi-squared alone."""
     paper = f"{stated.paper:.1f}" if stated.paper == found.paper else f"{stated.paper:.0f} and {found.paper:.1f}"
     return f"{stated.name:40s} {paper:>12s} {'':14s} {stated.percentile:8.1f} {found.percentile:8.1f}"

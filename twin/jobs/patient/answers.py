@@ -38,7 +38,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, choose, chosen_angles, refuse_other_entry, with_file_read
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.planning.uncertainty.hit import radius_that_holds
+from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.twin.jobs.patient.budget import budget_facts, correction_facts
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 
@@ -150,7 +150,7 @@ def one_insertion(registration: Registration, target_ct: Floats, read_cov_ct: Fl
     if read_cov_ct is not None:
         scale = 1.0 if registration.uncertainty is None else registration.uncertainty.test.scale
         read, how = scale**2 * R @ read_cov_ct @ R.T, "as declared (target_mm)"
-    limit = radius_that_holds(cov + read, INTERVAL, registration.freedom)
+    limit = radius_for_chance(cov + read, INTERVAL, registration.freedom)
     return {"one_insertion_95_mm": limit, "target_read": how}
 
 

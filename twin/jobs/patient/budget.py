@@ -23,7 +23,7 @@ from puncture_twin.planning.registration.aim import reached_insertion
 from puncture_twin.planning.registration.placement import default_method
 from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.registration.residual_test import INTERVAL
-from puncture_twin.planning.uncertainty.hit import radius_that_holds
+from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm, pose_error
 from puncture_twin.planning.uncertainty.sources import SOURCES, not_modelled
 
@@ -63,7 +63,7 @@ def budget_facts(
     return {
         **needle_angles(case, registration, q),
         "expected_mm": chain.expected_mm(),
-        "limit_95_mm": radius_that_holds(chain.tip_mean_square(), INTERVAL, registration.freedom),
+        "limit_95_mm": radius_for_chance(chain.tip_mean_square(), INTERVAL, registration.freedom),
         **_across_and_along(chain),
         "sources": [
             {"text": SOURCES[one.source].text, "alone_mm": one.alone_mm, "without_mm": one.without_mm}

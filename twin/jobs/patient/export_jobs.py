@@ -15,7 +15,7 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.export.exporter import Exported
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
-from puncture_twin.planning.export.slicer import NAMES, SLICER, Drawn, entry_area, slicer_files
+from puncture_twin.planning.export.slicer import NAMES, SLICER, SceneContent, entry_area, slicer_files
 from puncture_twin.planning.plan.plan_check import with_case_arm
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.recheck import check_plan, with_case_warnings
@@ -125,7 +125,7 @@ def export_to_slicer(context: CaseContext, out: Path, choice: Choice) -> SlicerE
         row = int(chosen.rows[0])
         at = chosen.candidates.at(row)
         name = f"path theta {at['theta_deg']:.6g} beta {at['beta_deg']:.6g}"
-        drawn = Drawn(name, chosen.candidates.path.entry_ct[row], entry_area(found), context.placement)
+        drawn = SceneContent(name, chosen.candidates.path.entry_ct[row], entry_area(found), context.placement)
         made = slicer_files(case, drawn)
         for file, text in made.texts.items():
             (draft.folder / file).write_text(text, encoding="utf-8")

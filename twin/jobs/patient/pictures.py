@@ -153,12 +153,12 @@ def _uncertainty(run: Run) -> Uncertainty | None:
     rooms = None if run.distribution is None else run.distribution.summary()
     if run.plan is not None:
         q = run.plan.insertion.q[-1]
-        return Uncertainty(context.doubt_at(run.plan.outward_ct, q), rooms, picture, _budget(context, q))
+        return Uncertainty(context.breakdown_at(run.plan.outward_ct, q), rooms, picture, _budget(context, q))
     if not len(found.ranked):
         return Uncertainty(None, rooms, picture)
     row = found.ranked[0]
-    doubt = context.explain(found.theta[row], found.beta[row]).doubt
-    return Uncertainty(doubt, rooms, picture, _budget(context, found.arm.q_insertion[row]))
+    breakdown = context.explain(found.theta[row], found.beta[row]).breakdown
+    return Uncertainty(breakdown, rooms, picture, _budget(context, found.arm.q_insertion[row]))
 
 
 def _budget(context: CaseContext, q_insertion: Floats) -> Mapping[str, Any] | None:

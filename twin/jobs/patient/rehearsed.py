@@ -15,8 +15,8 @@ from puncture_twin.twin.jobs.patient.run import FILM, ROOMS, RoomCount, Run
 from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
 from puncture_twin.twin.jobs.rehearser import Rehearser
 from puncture_twin.twin.jobs.second_process import Asked, Beside
-from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_rooms
-from puncture_twin.twin.rehearsal.plan_truth import median_truth, plan_truth, standing_scale
+from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
+from puncture_twin.twin.rehearsal.plan_truth import error_scale, median_truth, plan_truth
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def begin_rehearsal(run: Run, out: Path, rooms: RoomCount | None, beside: Beside
     run = run if rooms is None else replace(run, distribution=_distribution(run, rooms))
     found = run.distribution
     truth = plan_truth(context, plan) if found is None else median_truth(found)
-    scale = standing_scale(context, plan.insertion.q[-1], found)
+    scale = error_scale(context, plan.insertion.q[-1], found)
     executed = beside.ask(Rehearser.rehearse, plan, truth, scale)
     return Begun(run, executed, beside.ask(Rehearser.film, out / FILM))
 
@@ -95,14 +95,14 @@ def _distribution(run: Run, count: RoomCount) -> Distribution:
     context = run.context
     with context.stages.time("rooms"):
         q = run.plan.insertion.q[-1]
-        found = rehearse_rooms(context, run.plan.outward_ct, q, count.rooms, context.case.rehearsal.seed)
+        found = rehearse_trials(context, run.plan.outward_ct, q, count.rooms, context.case.rehearsal.seed)
     if not (count.physics and len(found)):
         return found
-    from puncture_twin.twin.rehearsal.plan_truth import physics_rooms
+    from puncture_twin.twin.rehearsal.plan_truth import physics_trials
 
     with context.stages.time("physics"):
         again = partial(context.watcher.count, "rooms in the simulator")
-        return replace(found, physics=physics_rooms(context, run.plan, found, count.physics, again))
+        return replace(found, physics=physics_trials(context, run.plan, found, count.physics, again))
 
 
 def _write_json(summary: dict[str, Any], path: Path) -> Path:

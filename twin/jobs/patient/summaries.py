@@ -119,7 +119,7 @@ def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
         "least_clearance_mm": {name: float(np.min(values)) for name, values in rehearsal.clearance_mm.items()},
         "control": rehearsal.control,
         "off_path_mm": rehearsal.off_path_mm,
-        "tissue_n": None if rehearsal.felt is None else rehearsal.felt._asdict(),
+        "tissue_n": None if rehearsal.tissue_force is None else rehearsal.tissue_force._asdict(),
         "needle_end": _needle_end(rehearsal),
         "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
         "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),

@@ -20,7 +20,7 @@ from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeShot
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleInImage
-from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, puncture_picture
+from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, puncture_image
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.summaries import SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import head_pose, needle_tool, phantom_mesh, probe_tool, table_box
@@ -90,7 +90,7 @@ def _recorded_panels(trial: SelfcalTrial) -> list[Panel]:
     panels = [_shot_panel(taken, int(i), f"{what}: tip {errors[i]:.2f} mm off") for i, what in chosen]
     if taken.missed_shots:
         shot = taken.missed_shots[0]
-        panels.append(Panel(shot.picture, "not used", str(shot.found), None, shot.true_needle))
+        panels.append(Panel(shot.image, "not used", str(shot.found), None, shot.true_needle))
     return panels
 
 
@@ -99,14 +99,14 @@ def _shot_panel(taken: Acquisition, index: int, title: str) -> Panel:
     assert isinstance(shot.found, Detection)  # only those are kept as shots
     steep = np.degrees(np.arcsin(abs(shot.true_needle.direction_image[1])))
     text = f"insertion {steep:.0f}°, off the plane {shot.true_needle.tip_image[2]:+.2f} mm"
-    return Panel(shot.picture, title, text.replace("-", "−"), shot.found, shot.true_needle)
+    return Panel(shot.image, title, text.replace("-", "−"), shot.found, shot.true_needle)
 
 
 def _puncture_panels(case: SelfcalCase, trial: SelfcalTrial, rng: np.random.Generator) -> list[Panel]:
     def panel(one: Puncture) -> Panel:
         title = f"puncture: {one.error_mm:.2f} mm from the target"
         text = f"lateral {one.lateral_mm:.2f} mm, depth {one.depth_mm:+.2f} mm".replace("-", "−")
-        return Panel(puncture_picture(case, one, rng), title, text, None, one.needle, one.target_image)
+        return Panel(puncture_image(case, one, rng), title, text, None, one.needle, one.target_image)
 
     order = sorted(trial.punctures, key=lambda one: one.error_mm)
     wanted = 2 if trial.acquisition.missed_shots else 3

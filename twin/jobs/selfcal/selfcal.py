@@ -106,7 +106,7 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
         candidates,
         choice,
         stages,
-        warnings=first.calibration.doubts(),
+        warnings=first.calibration.warnings(),
     )
 
 
@@ -125,7 +125,7 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     with stages.time("calibrate"):
         calibration = checked_calibration(recording, case, file)
     inputs = (content_input("recording", file.name, content), *(() if case is None else case.inputs))
-    warnings = (*unfinished_warnings(content, file.name), *calibration.doubts())
+    warnings = (*unfinished_warnings(content, file.name), *calibration.warnings())
     if case is not None and calibration.arms is None:
         warnings += (NO_JOINTS.format(file=file.name),)
     return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings)

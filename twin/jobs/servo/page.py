@@ -8,7 +8,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from puncture_twin.planning.search.doubt import chance_text
+from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.jobs.servo.facts import NO_TOUCH, Facts, our_errors
 from puncture_twin.twin.jobs.servo.text import DOUBTED, NOT_MODELLED, PHASE_TEXT

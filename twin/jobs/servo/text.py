@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.search.doubt import chance_text
+from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.jobs.servo.facts import NO_TOUCH, Facts, our_errors
 
 NEEDLE_HEAD = "needle expected  95 % half axes      lateral  depth  direction  realised   (mm, deg; after the servo)"

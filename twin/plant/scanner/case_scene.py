@@ -1,6 +1,6 @@
 """A case as a scene in the scanner: its structures with Hounsfield units, markers of metal, the table, a needle.
 
-Which voxels a scan has: the whole body, or as much of it as the field of view shows.
+`scan_grid` gives the voxels of a scan: the whole body, or as much of it as the field of view shows.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.checks.markers import skin_fit
-from puncture_twin.twin.plant.outside_objects import Beside, Part, lay_beside
+from puncture_twin.twin.plant.outside_objects import OutsideObjects, Part, place_outside_objects
 from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, box, check_closed, rod
 
 METAL_HU = 8000.0
@@ -33,7 +33,7 @@ METAL_HU = 8000.0
 SOFT_TISSUE_HU = 20.0
 """What fills the skin between the structures: fat and muscle, mixed; ours. Also of a name that no line knows."""
 SHELL_HU, FOAM_HU, SHELL_MM = 60.0, -930.0, 3.0
-"""Of a table, and of every obstacle in the CT's frame: a shell so thick about foam; ours."""
+"""Material of a table, and of every obstacle in the CT's frame: a shell so thick about foam; ours."""
 
 HU_OF_GROUP = MappingProxyType(
     {
@@ -97,7 +97,7 @@ MarkerKind = Literal["disc", "ball", "none"]
 
 @dataclass(frozen=True, eq=False)
 class TrueRod:
-    """A needle where it truly is, in the CT's frame of the case: tip (3,), mm, and direction to the tip (3,), unit."""
+    """A true needle in the CT's frame of the case: tip (3,), mm, and direction to the tip (3,), unit."""
 
     tip_ct: Floats
     forward_ct: Floats
@@ -105,7 +105,7 @@ class TrueRod:
 
 @dataclass(frozen=True, eq=False)
 class CaseScene:
-    """What lies in the scanner, in its frame (LPS of the scan, mm).
+    """Content of the scanner, in its frame (LPS of the scan, mm).
 
     Attributes:
         solids: In the order in which they fill each other's place.
@@ -113,7 +113,7 @@ class CaseScene:
         skin: The body's surface.
         cut: Shape (3, 2): at which ends the body goes on beyond its surface.
         tables: Shape (2, 3): the box about what the patient lies on; infinite without any.
-        beside: What was laid beside the patient.
+        outside_objects: The objects outside of the patient.
         markers: True positions, or None.
         listed: The case's own readings of them.
         target: Shape (3,).
@@ -124,7 +124,7 @@ class CaseScene:
     skin: TriangleMesh
     cut: Bools
     tables: Floats
-    beside: tuple[Part, ...]
+    outside_objects: tuple[Part, ...]
     markers: NamedPoints | None
     listed: NamedPoints | None
     target: Floats
@@ -138,18 +138,18 @@ def case_scene(
     *,
     marker: MarkerKind = "disc",
     needle: TrueRod | None = None,
-    beside: Beside | None = None,
+    outside_objects: OutsideObjects | None = None,
 ) -> CaseScene:
-    """Lay a case into the scanner.
+    """Place a case in the scanner.
 
     Args:
         case: The case.
         anatomy: Its structures.
-        settings: By how much the patient is turned; the cells of readings where the case declares none.
-        rng: Draws where in its cell each marker truly is.
+        settings: By how much the patient is rotated; the cells of readings where the case declares none.
+        rng: Draws each true marker in its cell.
         marker: What stands at each marker's place.
         needle: Drawn of metal, its usable length.
-        beside: Arms, bed and lines to lay beside the patient.
+        outside_objects: Arms, bed and lines outside of the patient.
 
     Raises:
         InputError: A structure's surface is open.
@@ -159,7 +159,7 @@ def case_scene(
     true = None if listed is None else _drawn_in_cells(case, listed, settings, rng)
     skin = anatomy.skin.mesh.transformed(T)
     target = apply(T, case.target_ct)
-    laid = () if beside is None else lay_beside(skin, float(target[2]), beside, rng)
+    laid = () if outside_objects is None else place_outside_objects(skin, float(target[2]), outside_objects, rng)
     solids = _body(case, anatomy)
     if true is not None:
         solids += _markers(true, skin_fit(true.points, anatomy.skin).normals_ct, marker)
@@ -175,7 +175,7 @@ def case_scene(
         skin=skin,
         cut=np.zeros((3, 2), np.bool_) if view is None else view.cut,
         tables=_bounds([one.mesh for one in (*tables, *beneath)]),
-        beside=laid,
+        outside_objects=laid,
         markers=_moved(true, T),
         listed=_moved(listed, T),
         target=target,
@@ -257,7 +257,7 @@ def _tables(case: Case) -> list[Solid]:
 
 
 def _laid(parts: Sequence[Part], place: str) -> list[Solid]:
-    """What lies in one place; no segmentation names it."""
+    """Solids of the outside objects; no segmentation names them."""
     return [Solid(one.name, one.mesh, one.hu) for one in parts if one.place == place]
 
 
@@ -301,7 +301,7 @@ def _moved(points: NamedPoints | None, T_scan_ct: Floats) -> NamedPoints | None:
 
 
 def _bounds(meshes: Sequence[TriangleMesh]) -> Floats:
-    """Lowest and highest corner of all, shape (2, 3), mm."""
+    """Lowest and highest corner of all solids, shape (2, 3), mm."""
     if not meshes:
         return np.array([np.full(3, np.inf), np.full(3, -np.inf)])
     bounds = np.stack([mesh.bounds for mesh in meshes])
@@ -311,11 +311,11 @@ def _bounds(meshes: Sequence[TriangleMesh]) -> Floats:
 AIR_MM = 15.0
 """Air around the body, and about arms and lines: a needle's entry is not at the image's edge."""
 TABLE_MM = 100.0
-"""Beside and behind the body, so much of a table is shown: where the image cuts it, what is beyond is not known."""
+"""Next to and behind the body, so much of a table is shown: where the image cuts it, what is beyond is not known."""
 MOST_VOXELS = 200_000_000
 """A whole trunk at 0.8 x 0.8 x 0.6 mm; each voxel takes some ten bytes while it is made."""
 DECIMALS = 4
-"""Of positions in mm, so that DICOM's decimal strings hold them whole."""
+"""Decimals of positions in mm, so that DICOM's decimal strings hold them whole."""
 
 
 def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator) -> VolumeGrid:
@@ -349,7 +349,7 @@ def _shown(scene: CaseScene, settings: ScanSettings) -> tuple[Floats, Floats]:
     low, high = scene.skin.bounds
     low = low - np.where(scene.cut[:, 0], 0.0, AIR_MM)
     high = high + np.where(scene.cut[:, 1], 0.0, AIR_MM)
-    for one in scene.beside:
+    for one in scene.outside_objects:
         if one.place == "upon":
             low[:2] = np.minimum(low[:2], one.mesh.bounds[0, :2] - AIR_MM)
             high[:2] = np.maximum(high[:2], one.mesh.bounds[1, :2] + AIR_MM)

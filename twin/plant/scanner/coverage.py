@@ -1,4 +1,4 @@
-"""What fills each voxel: solids cut by many lines along the voxels' rows, and each line's pieces measured exactly.
+"""Partial volumes: solids cut by many lines along the voxels' rows, and each line's pieces measured exactly.
 
 Every slice is cut by some planes and every row by some lines. A plane cuts a closed surface in closed chains of
 segments, and a line cuts these in crossings; both by half-open intervals, of which neighbours share the end, so that
@@ -23,7 +23,7 @@ LEAST_LINES = 3
 
 
 class Cut(NamedTuple):
-    """What the lines have met.
+    """Mean value and label of each voxel by the lines through it.
 
     Attributes:
         values: Shape (nx, ny, nz), float32, the mean over each voxel.
@@ -67,7 +67,7 @@ def cut_solids(
 
 
 def _odd(spacing_mm: float) -> int:
-    return max(LEAST_LINES, 2 * int(np.ceil(spacing_mm / LINE_MM / 2)) + 1)
+    return max(LEAST_LINES, 2 * int(np.ceil(spacing_mm / LINE_MM / 2)) + 1)  # odd
 
 
 def _of_slices(corners: Floats, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -76,7 +76,7 @@ def _of_slices(corners: Floats, count: int) -> tuple[NDArray[np.int64], NDArray[
     high = np.clip(np.floor(corners[:, :, 2].max(axis=1) + 0.5).astype(np.int64), -1, count - 1)
     spans = np.maximum(0, high - low + 1)
     triangle = np.repeat(np.arange(len(corners)), spans)
-    slices = np.arange(len(triangle)) - np.repeat(np.cumsum(spans) - spans, spans) + low[triangle]
+    slices = np.arange(len(triangle)) - np.repeat(np.cumsum(spans) - spans, spans) + low[triangle]  # low, low + 1 ...
     order = np.argsort(slices, kind="stable")
     return np.searchsorted(slices[order], np.arange(count + 1)), triangle[order]
 
@@ -93,7 +93,7 @@ def _slice(corners, owners, fills, labels, cuts, empty, values, marks):  # type:
     for plane in range(planes):
         z = k + (plane + 0.5) / planes - 0.5
         count = _segments(corners, owners, z, segments, whose)
-        within = (plane + 0.5) / planes  # lines of one plane lie between those of another: a face along them is met
+        within = (plane + 0.5) / planes  # lines of one plane lie between those of another: a face along them is hit
         starts, xs, turns = _crossings(segments[:count], whose[:count], ny, subs, within)
         for line in range(ny * subs):
             first, last = starts[line], starts[line + 1]
@@ -114,7 +114,7 @@ def _slice(corners, owners, fills, labels, cuts, empty, values, marks):  # type:
 
 @nb.njit(cache=True, nogil=True)
 def _segments(corners, owners, z, segments, whose):  # type: ignore[no-untyped-def]
-    """Where a plane cuts triangles: (x, y) from the edge that rises through it to the edge that falls."""
+    """Cuts of a plane with triangles: (x, y) from the edge that rises through it to the edge that falls."""
     count = 0
     for t in range(len(corners)):
         below = 0
@@ -139,7 +139,7 @@ def _segments(corners, owners, z, segments, whose):  # type: ignore[no-untyped-d
 
 @nb.njit(cache=True, nogil=True)
 def _crossings(segments, whose, ny, subs, within):  # type: ignore[no-untyped-def]
-    """Where the lines of a plane cross its segments, line by line; a turn is the solid's number + 1, with its sign."""
+    """Crossings of a plane's lines with its segments, line by line; a turn is the solid's number + 1, with its sign."""
     lines = ny * subs
     starts = np.zeros(lines + 2, np.int64)
     for s in range(len(segments)):

@@ -1,6 +1,6 @@
-"""A scan of a scene: exact partial volume, blur in the plane, noise, and the range that a scanner stores.
+"""A CT image of solids: exact partial volume, blur in the plane, noise, and the range that a scanner stores.
 
-What lies in a scanner: closed surfaces with Hounsfield units, and the simple bodies of devices.
+A `Solid` is a closed surface with Hounsfield units; balls, rods and boxes are the simple bodies of devices.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ BLUR_ENDS = 3.0
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """How a scan is made.
+    """Settings of a scan.
 
     Attributes:
         spacing_mm: Of the slices, which are as thick.
@@ -42,7 +42,7 @@ class ScanSettings:
         seed: Of the noise and of where the grid falls.
         fov_mm: Side of the square image; None shows the whole body.
         length_mm: Along the bed; None scans the whole body.
-        turn: By which the patient is turned about the bed's direction, rad.
+        turn: By which the patient is rotated about the bed's direction, rad.
     """
 
     spacing_mm: float = 2.5
@@ -57,7 +57,7 @@ class ScanSettings:
 
 @dataclass(frozen=True, eq=False)
 class CtImage:
-    """A scan, and the truth beside it.
+    """A scan, with its ground truth.
 
     Attributes:
         hu: Shape (nx, ny, nz), int16.
@@ -124,7 +124,7 @@ def _stored(
 ) -> NDArray[np.int16]:
     """Blurred slice by slice, with noise, rounded and clipped, shape as ``values``."""
     stored = np.empty(values.shape, np.int16, order="F")
-    sigma = settings.blur_mm / FWHM_PER_SIGMA / spacing_mm[:2]
+    sigma = settings.blur_mm / FWHM_PER_SIGMA / spacing_mm[:2]  # in voxels
     for k in range(values.shape[2]):
         image = ndimage.gaussian_filter(values[:, :, k].T, sigma[::-1], mode="nearest", truncate=BLUR_ENDS)
         image += np.float32(settings.noise_hu) * rng.standard_normal(image.shape, dtype=np.float32)
@@ -135,7 +135,7 @@ def _stored(
 SAMPLE_VOXELS = 0.4
 """At most so far apart are samples of a surface."""
 MOST_SAMPLES = 1_000_000
-"""Of triangles that are sampled together."""
+"""Samples of triangles that are taken together."""
 
 
 def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
@@ -147,14 +147,14 @@ def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
     """
     found = [np.empty(0, np.int64)]
     for points in _samples(corners):
-        index = np.floor(points + 0.5).astype(np.int64)
+        index = np.floor(points + 0.5).astype(np.int64)  # a voxel reaches half a voxel to each side
         inside = np.all((index >= 0) & (index < shape), axis=1)
         found.append(np.unique(np.ravel_multi_index(tuple(index[inside].T), shape)))
     return np.stack(np.unravel_index(np.unique(np.concatenate(found)), shape), axis=1)
 
 
 def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bools) -> Ints:
-    """The voxels that a structure passes while neither they nor those beside have its label, shape (m, 3).
+    """Voxels that a structure passes while neither they nor their neighbours have its label, shape (m, 3).
 
     Args:
         labels: Shape (nx, ny, nz), what is labelled at each centre.
@@ -168,15 +168,15 @@ def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bool
         return at
     low, high = np.maximum(at.min(axis=0) - 1, 0), at.max(axis=0) + 2
     box = labels[low[0] : high[0], low[1] : high[1], low[2] : high[2]]
-    beside = ndimage.binary_dilation(box == label, np.ones((3, 3, 3), bool))
+    near_label = ndimage.binary_dilation(box == label, np.ones((3, 3, 3), bool))
     x, y, z = (at - low).T
-    return at[~beside[x, y, z] & ~later[box[x, y, z]]]
+    return at[~near_label[x, y, z] & ~later[box[x, y, z]]]
 
 
 def _samples(corners: Floats) -> Iterator[Floats]:
     """Points of triangles, at most `SAMPLE_VOXELS` apart, shape (m, 3) at a time."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    counts = np.maximum(1, np.ceil(edges / SAMPLE_VOXELS).astype(np.int64))
+    counts = np.maximum(1, np.ceil(edges / SAMPLE_VOXELS).astype(np.int64))  # pieces of the longest edge
     for count in np.unique(counts).tolist():
         i, j = np.array([(i, j) for i in range(count + 1) for j in range(count + 1 - i)]).T / count
         weights = np.stack([1 - i - j, i, j])
@@ -187,7 +187,7 @@ def _samples(corners: Floats) -> Iterator[Floats]:
 
 
 SIDES = 64
-"""Of a round body: its volume is that of the circle to 1.6e-3."""
+"""Sides of a round body: its volume is that of the circle to 1.6e-3."""
 
 
 class Solid(NamedTuple):
@@ -211,7 +211,7 @@ class Solid(NamedTuple):
 
 
 def check_closed(solid: Solid, where: str) -> Solid:
-    """The solid, if it has an inside.
+    """The solid; one without an inside is refused.
 
     Raises:
         InputError: Its surface is open.

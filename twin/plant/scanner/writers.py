@@ -1,6 +1,6 @@
-"""A scan as a DICOM series: CT Image Storage, one file a slice (DICOM PS3.3, A.3 and C.8.2).
+"""Writers of a scan: a DICOM series, CT Image Storage, one file a slice (PS3.3, A.3 and C.8.2), and NIfTI-1.
 
-A volume as NIfTI-1 (nifti1.h, DFWG 2003): one file, its place as sform in RAS, gzip without a time.
+NIfTI (nifti1.h, DFWG 2003): one file, its place as sform in RAS, gzip without a time.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ MM = 2
 SCANNER = 1
 """``sform_code``: the scanner's own coordinates."""
 FAST = 1
-"""Of gzip: noise does not get smaller by trying harder."""
+"""Level of gzip: noise does not get smaller by trying harder."""
 
 
 def write_nifti(path: Path, values: NDArray[Any], T_ct_index: Floats) -> Path:

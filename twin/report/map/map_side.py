@@ -10,7 +10,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, Reason, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
-from puncture_twin.planning.search.doubt import chance_text
+from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.report.canvas import Anchor, Canvas, Face, Words, rounded
 from puncture_twin.twin.report.map.chance_layer import chance_legend, mark_dot, mark_ring, mark_star
 from puncture_twin.twin.report.map.map_raster import (

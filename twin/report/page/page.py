@@ -25,7 +25,7 @@ from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
-from puncture_twin.planning.search.doubt import Doubt
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.map_view import step_of
@@ -61,13 +61,13 @@ class Uncertainty(NamedTuple):
     """What a page says of chances.
 
     Attributes:
-        doubt: Of the chosen direction, or None where it has no chances.
+        breakdown: Of the chosen direction, or None where it has no chances.
         rooms: A `Distribution` as plain values, or None.
         picture: ``rooms.png``, or None.
         budget: Of the chosen direction, as ``register --json`` has it, or None.
     """
 
-    doubt: Doubt | None
+    breakdown: UncertaintyBreakdown | None
     rooms: Mapping[str, Any] | None = None
     picture: Path | None = None
     budget: Mapping[str, Any] | None = None
@@ -109,7 +109,7 @@ def write_page(
         raster: The map's pixels where somebody has them already.
     """
     pick = pick or best_pick(candidates)
-    doubt = None if uncertainty is None else uncertainty.doubt
+    breakdown = None if uncertainty is None else uncertainty.breakdown
     seed = case.rehearsal.seed if plan is None else plan.seed
     write_html(
         "report.html",
@@ -123,7 +123,7 @@ def write_page(
         methods=methods_text(case, anatomy, candidates),
         notice=TRUTH_IS_BELIEF if rehearsal is not None and rehearsal.truth_is_belief else "",
         refused=_refused(candidates),
-        cards=_cards(candidates, pick, plan, rehearsal, doubt, refusal),
+        cards=_cards(candidates, pick, plan, rehearsal, breakdown, refusal),
         counts=tables.counts_table(candidates),
         best=tables.best_table(candidates),
         plan=tables.plan_section(
@@ -166,7 +166,7 @@ def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[s
     if uncertainty is None:
         return {"chances": None, "budget": None, "rooms": None}
     return {
-        "chances": chances_section(uncertainty.doubt, registration),
+        "chances": chances_section(uncertainty.breakdown, registration),
         "budget": None if uncertainty.budget is None else budget_section(uncertainty.budget),
         "rooms": rooms_section(uncertainty.rooms, uncertainty.picture),
     }
@@ -185,13 +185,13 @@ def _cards(
     pick: Pick | None,
     plan: Any | None,
     rehearsal: Any | None,
-    doubt: Doubt | None,
+    breakdown: UncertaintyBreakdown | None,
     refusal: str,
 ) -> list[Card]:
     safe = int(candidates.safe.sum())
     if safe == 0:
         return []
-    cards = [] if doubt is None else [chance_card(doubt)]
+    cards = [] if breakdown is None else [chance_card(breakdown)]
     cards.append(_window_card(candidates))
     if pick is not None:
         cards.append(_direction_card(*pick, best=pick == best_pick(candidates)))

@@ -8,7 +8,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from puncture_twin.planning.search.doubt import Doubt, chance_text
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, chance_text
 from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.report.numbers import number
 from puncture_twin.twin.report.page.page_tables import faint, listed, pairs, table, two
@@ -20,39 +20,39 @@ LEAST_SHOWN = 5e-5
 NO_CHANCES = "No chances: they need markers, the arm, and a direction that organs and arm allow."
 
 
-def chance_card(doubt: Doubt) -> Card:
+def chance_card(breakdown: UncertaintyBreakdown) -> Card:
     """Both chances and the expected error, for the top of the page."""
     detail = (
-        f"touches anything forbidden {chance_text(doubt.p_touch_any)}; expected tip error "
-        f"{number(doubt.budget.rms_mm, 2, 'mm')} (rms); not modelled: {doubt.not_modelled}"
+        f"touches anything forbidden {chance_text(breakdown.p_touch_any)}; expected tip error "
+        f"{number(breakdown.budget.rms_mm, 2, 'mm')} (rms); not modelled: {breakdown.not_modelled}"
     )
-    return Card("chance to hit", chance_text(doubt.p_hit), detail)
+    return Card("chance to hit", chance_text(breakdown.p_hit), detail)
 
 
-def chances_section(doubt: Doubt | None, registration: Mapping[str, Any] | None) -> Markup:
+def chances_section(breakdown: UncertaintyBreakdown | None, registration: Mapping[str, Any] | None) -> Markup:
     """Chances, expected error and its sources, the declaration's test, and what would have to be better.
 
     Args:
-        doubt: Of the chosen direction, or None where it has no chances.
+        breakdown: Of the chosen direction, or None where it has no chances.
         registration: As plain values, for the FLE and its interval.
     """
-    if doubt is None:
+    if breakdown is None:
         return Markup("<p>{}</p>").format(NO_CHANCES)
-    budget, (name, chance) = doubt.budget, doubt.likeliest
+    budget, (name, chance) = breakdown.budget, breakdown.likeliest
     rows = [
-        ("chance to hit the target", Markup("<b>{}</b>").format(chance_text(doubt.p_hit))),
-        ("chance to touch anything forbidden, at most", chance_text(doubt.p_touch_any)),
+        ("chance to hit the target", Markup("<b>{}</b>").format(chance_text(breakdown.p_hit))),
+        ("chance to touch anything forbidden, at most", chance_text(breakdown.p_touch_any)),
         *([("most likely touched", f"{name.replace('_', ' ')}, {chance_text(chance)}")] if name else []),
         ("expected tip error (rms), this insertion", number(budget.rms_mm, 2, "mm")),
         ("across the needle (rms)", number(budget.lateral_mm, 2, "mm")),
         ("along the needle (rms)", number(budget.depth_mm, 2, "mm")),
         ("half axes of the 95 % ellipsoid", ", ".join(number(float(mm), 2) for mm in budget.half_axes_mm) + " mm"),
         *_fle(registration),
-        ("the declared errors", doubt.declaration),
-        ("not modelled", doubt.not_modelled),
+        ("the declared errors", breakdown.declaration),
+        ("not modelled", breakdown.not_modelled),
     ]
-    shares = [(SOURCES[source].text, f"{100 * fraction:.1f} %") for source, fraction in doubt.sources()]
-    goals = [goal.text() for goal in doubt.goals]
+    shares = [(SOURCES[source].text, f"{100 * fraction:.1f} %") for source, fraction in breakdown.sources()]
+    goals = [goal.text() for goal in breakdown.goals]
     wanting = listed(goals) if goals else Markup("")
     return wanting + two(pairs(rows), table(("source", "of the error's variance"), shares, kind="numbers"))
 

@@ -1,1 +1,1 @@
-"""The ball on the tool in a picture: rendered, found, and measured to a hundredth of a pixel."""
+"""The ball on the tool in an image: rendered, found, and measured to a hundredth of a pixel."""

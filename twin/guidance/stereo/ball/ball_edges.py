@@ -1,16 +1,15 @@
-"""Where the ball's outline crosses spokes around its centre, to a small part of a pixel.
+"""The outline of a ball in an image: edges along spokes to a small part of a pixel, and the circle through them.
 
-A spoke runs over the sphere of viewing directions, from inside the outline to outside, and is laid on the picture by
-the camera: so the lens and the ellipse are in the spoke and the outline is at the same angle on each. The grey along it
-is read with cubic splines. The edge is where the grey changes fastest after a Gaussian's derivative (Canny 1986), the
-peak refined by a parabola.
+A spoke runs over the sphere of viewing directions, from inside the outline to outside, and is projected into the image
+by the camera: so lens and ellipse are in the spoke, and the outline is at the same angle on each. The grey along it is
+read with cubic splines. The edge is where the grey changes fastest after a Gaussian's derivative (Canny 1986), the peak
+refined by a parabola.
 
-The outline of a ball as a circle: exactly one on the sphere of viewing directions, whatever the lens.
-
-A ball fills a cone of rays around the direction of its centre. So the circle is fitted there and not in the picture:
-its centre is the projection of the ball's centre itself, while the outline's ellipse has its centre elsewhere. Points
-near a direction d0 are given by polar coordinates (angle from d0, direction around it) or, for circles, by the
-stereographic plane touching at d0, which takes circles to circles (Snyder 1987, Map Projections, chapter 21).
+A ball fills a cone of rays around the direction of its centre, a circle on that sphere whatever the lens. So the circle
+is fitted there and not in the image: its centre is the projection of the ball's centre itself, while the outline's
+ellipse has its centre elsewhere. Points near a direction d0 are given by polar coordinates (angle from d0, direction
+around it) or, for circles, by the stereographic plane touching at d0, which takes circles to circles (Snyder 1987, Map
+Projections, chapter 21).
 """
 
 from __future__ import annotations
@@ -27,18 +26,18 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_ax
 STEP_PX = 0.25
 """Between two readings on a spoke: a quarter of the narrowest edge."""
 SMOOTHING_PX = 0.8
-"""Of the derivative: as wide as the edge itself is the best against noise; wider sees the ball's shading."""
+"""Width of the derivative: as wide as the edge itself is the best against noise; wider sees the ball's shading."""
 EDGE_WIDTH_PX = 0.8
 """Blur and pixel together; turns the steepest slope into the step's height."""
 
 SAME_GREY = 0.4
-"""In parts of the contrast: a lamp's share of 0.4 shades the ball by less, what hides it differs by more."""
+"""In parts of the contrast: a light of fraction 0.4 shades the ball by less, what hides it differs by more."""
 DISC_RINGS = 0.85 * np.sqrt((np.arange(6) + 0.5) / 6)
 """Radii at which the disc is read, in parts of the outline's: each ring stands for the same area."""
 
 
 class Grey(NamedTuple):
-    """A part of a picture, ready to be read between its pixels."""
+    """A part of an image, ready to be read between its pixels."""
 
     pixels: NDArray[np.uint8]
     spline: Floats
@@ -59,26 +58,26 @@ class Edges(NamedTuple):
     contrast: Floats
     """Grey levels, inside minus outside."""
     inside: NDArray[np.bool_]
-    """False where the steepest place lies at the end of the spoke or outside the picture: no edge."""
+    """False where the steepest place lies at the end of the spoke or outside the image: no edge."""
 
 
 class Spokes(NamedTuple):
-    """Where to look: all round a direction, about a half angle."""
+    """Spokes all around a direction, about a half angle."""
 
     direction: Floats
     """Shape (3,), unit."""
     half_angle: float
-    """Of the outline, rad."""
+    """Half angle of the outline, rad."""
     number: int
     reach_px: float
     """How far to both sides of the outline."""
 
 
 def grey_part(pixels: NDArray[np.uint8], offset: Floats) -> Grey:
-    """Prepare a part of a picture; its noise is the median of second differences, which edges hardly touch."""
+    """Prepare a part of an image; its noise is the median of second differences, which edges hardly touch."""
     grey = pixels.astype(np.float64)
     second = grey[:, :-2] - 2 * grey[:, 1:-1] + grey[:, 2:]
-    noise = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6.0) if second.size else 0.0
+    noise = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6.0) if second.size else 0.0  # 1 + 4 + 1
     return Grey(pixels, np.asarray(spline_filter(grey, 3)), offset, noise)
 
 
@@ -99,7 +98,7 @@ def find_edges(grey: Grey, camera: Camera, spokes: Spokes) -> Edges:
     peak, height, inside = _peaks(slope)
     edge = spokes.half_angle + (peak * STEP_PX - half) / scales
     width = np.hypot(SMOOTHING_PX, EDGE_WIDTH_PX)
-    points = 2 * np.tan(edge / 2)[:, None] * across.T
+    points = 2 * np.tan(edge / 2)[:, None] * across.T  # stereographic
     return Edges(points, scales, -height * width * np.sqrt(2 * np.pi), inside & seen.all(axis=1))
 
 
@@ -109,7 +108,7 @@ def visible_fraction(
     """Fraction of the disc that looks like the ball: as bright as next to its edges, within a part of its contrast.
 
     Args:
-        grey: The picture.
+        grey: The image.
         camera: The camera.
         spokes: Around the measured ball.
         on_circle: Shape (n,): the spokes whose edge lies on the circle.
@@ -138,7 +137,7 @@ def _peaks(slope: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     middle = np.clip(best, 1, slope.shape[1] - 2)
     before, here, after = (np.abs(slope[rows, middle + side]) for side in (-1, 0, 1))
     bend = before - 2 * here + after
-    shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+    shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)  # a parabola's peak
     return middle + np.clip(shift, -1, 1), slope[rows, middle], best == middle
 
 
@@ -191,7 +190,7 @@ def consensus(points: Floats, valid: NDArray[np.bool_], scales: Floats, toleranc
     misses = np.abs(distances - radii[:, None]) * scales
     misses[:, ~valid] = np.inf
     misses[~np.isfinite(radii)] = np.inf
-    score = np.sum(1 - np.clip(misses / tolerance_px, 0, 1) ** 2, axis=1)
+    score = np.sum(1 - np.clip(misses / tolerance_px, 0, 1) ** 2, axis=1)  # MSAC: near edges count more
     best = int(np.argmax(score))
     return Circle(centers[best], float(radii[best])) if np.isfinite(radii[best]) else None
 
@@ -225,7 +224,7 @@ def refit(points: Floats, scales: Floats, start: Circle, tolerance_px: float) ->
         distance = np.linalg.norm(outward, axis=1)
         miss = (distance - radius) * scales
         ratio = np.clip(np.abs(miss) / (TUKEY * spread), 0, 1)
-        root_weight = 1 - ratio**2
+        root_weight = 1 - ratio**2  # Tukey's weight is its square
         J = np.column_stack([outward / distance[:, None], np.ones(len(points))]) * scales[:, None]
         step = np.linalg.lstsq(J * root_weight[:, None], miss * root_weight, rcond=None)[0]
         center, radius = center + step[:2], radius + step[2]

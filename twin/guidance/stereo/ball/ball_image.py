@@ -1,10 +1,10 @@
-"""A picture of the ball on its rod, computed rather than drawn: where accuracy is measured, the picture must be truer.
+"""Image of the ball on its rod, computed per pixel instead of rasterised, so that it is truer than what measures it.
 
-Each pixel is cut into 4 x 4 cells. A cell's ray is met with ball, rod and occluder in closed form: the outline is that
-of the sphere itself (an ellipse, bent by the lens), not of a disc. Along an outline a cell is covered by the share that
-a straight edge at the outline's distance would cover. The ball's centre errs by less than 1e-3 px and a pixel by less
-than one grey level of 140, which the tests hold against 40 x 40 plain rays per pixel. Then the lens's blur (a
-Gaussian), the sensor's noise (normal) and rounding to 8 bits follow.
+Each pixel is cut into 4 x 4 cells. A cell's ray is intersected with ball, rod and occluder in closed form: the outline
+is that of the sphere itself (an ellipse, bent by the lens), not of a disc. Along an outline a cell is covered by the
+fraction that a straight edge at the outline's distance would cover. The ball's centre errs by less than 1e-3 px and a
+pixel by less than one grey level of 140, which the tests compare with 40 x 40 plain rays per pixel. Then the lens's
+blur (a Gaussian), the sensor's noise (normal) and rounding to 8 bits follow.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ OCCLUDER_SIZE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class BallScene:
-    """What a camera may see of the tool. Directions need not be of unit length; greys are levels from 0 to 255.
+    """A ball on its rod as a camera may see it. Directions need not be unit; greys are levels from 0 to 255.
 
     Attributes:
         center_c: The ball's centre, shape (3,), mm, frame C.
@@ -39,9 +39,9 @@ class BallScene:
         rod_c: Shape (3,): from the ball along the rod to the flange.
         rod_radius_mm: The rod is a cylinder with round ends.
         rod_length_mm: From the ball's centre.
-        light_c: Shape (3,): toward the lamp.
-        diffuse: Fraction of the light that comes from everywhere, 0 to 1; the lamp's share obeys Lambert's law.
-        ball_grey: Of the ball where the lamp shines straight on it.
+        light_c: Shape (3,): toward the light.
+        diffuse: Fraction of the light that comes from everywhere, 0 to 1; directed light obeys Lambert's law.
+        ball_grey: Of the ball where the light shines straight on it.
         rod_grey: The rod's.
         background_grey: What is behind.
         texture_grey: Standard deviation of the background's pattern.
@@ -72,13 +72,13 @@ class BallScene:
     rod: bool = True
 
 
-class Picture(NamedTuple):
-    """A grey picture, or a part of one."""
+class GreyImage(NamedTuple):
+    """A grey image, or a part of one."""
 
     grey: NDArray[np.uint8]
     """Shape (h, w)."""
     offset: tuple[int, int] = (0, 0)
-    """Column and row, in the camera's picture, of the part's first pixel."""
+    """Column and row, in the camera's image, of the part's first pixel."""
 
 
 class _Layer(NamedTuple):
@@ -99,8 +99,8 @@ def render(
     noise: float = 2.0,
     blur_px: float = 0.7,
     half_px: int | None = None,
-) -> Picture:
-    """What the camera takes of a scene.
+) -> GreyImage:
+    """The camera's image of a scene.
 
     Args:
         camera: The true camera.
@@ -108,7 +108,7 @@ def render(
         rng: Draws the noise and the pattern of the background.
         noise: Standard deviation of the sensor's noise, grey levels.
         blur_px: Standard deviation of the lens's blur.
-        half_px: None takes the whole picture; a number only the window that far around the ball's centre.
+        half_px: None takes the whole image; a number only the window that far around the ball's centre.
     """
     low, high = _window(camera, scene, half_px)
     shape = (max(high[1] - low[1], 0), max(high[0] - low[0], 0))
@@ -118,7 +118,7 @@ def render(
         grey += pattern * (scene.texture_grey / max(float(pattern.std()), 1e-12))
     _paint(grey, low, camera, scene, blur_px)
     grey += rng.normal(0.0, noise, shape)
-    return Picture(np.clip(np.round(grey), 0, 255).astype(np.uint8), (int(low[0]), int(low[1])))
+    return GreyImage(np.clip(np.round(grey), 0, 255).astype(np.uint8), (int(low[0]), int(low[1])))
 
 
 def _window(camera: Camera, scene: BallScene, half_px: int | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -133,7 +133,7 @@ def _window(camera: Camera, scene: BallScene, half_px: int | None) -> tuple[NDAr
 
 
 def _paint(grey: Floats, low: NDArray[np.int64], camera: Camera, scene: BallScene, blur_px: float) -> None:
-    """Lay the bodies over a part of the picture that starts at ``low``; changes ``grey``."""
+    """Add the bodies to a part of the image that starts at ``low``; changes ``grey``."""
     pad = int(np.ceil(BLUR_REACH * blur_px)) + 1
     size = np.array(grey.shape[::-1])
     box_low, box_high = (box - low for box in _bounds(camera, scene, pad))
@@ -233,7 +233,7 @@ def _rod(rays: Floats, start: Floats, rod: Floats, scene: BallScene, light: Floa
 
 
 def _occluder(rays: Floats, center: Floats, camera: Camera, scene: BallScene) -> _Layer:
-    """A flat disc just before the ball, so far over it that it hides the share wanted."""
+    """A flat disc just before the ball, so far over it that it hides the wanted fraction."""
     distance = float(np.linalg.norm(center))
     axes = tangent_axes(center / distance)
     flat = (rays @ axes) / (rays @ (center / distance))[..., None]
@@ -257,7 +257,7 @@ def disc_distance(fraction: float) -> float:
 
 
 def _cover(gap: Floats) -> Floats:
-    """Covered share of each cell from a function that is above 0 inside a body and 0 on its outline."""
+    """Covered fraction of each cell by a function that is above 0 inside a body and 0 on its outline."""
     down, right = np.gradient(gap)
     cells = gap / np.clip(np.hypot(down, right), 1e-30, None)
     return np.clip(cells + 0.5, 0.0, 1.0)
@@ -289,7 +289,7 @@ def _to_pixels(cells: Floats) -> Floats:
 
 
 def _length(vectors: Floats) -> Floats:
-    """Of vectors (..., 3), shape (...); three times as fast as numpy's norm over a short axis."""
+    """Lengths of vectors (..., 3), shape (...); three times as fast as numpy's norm over a short axis."""
     return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))
 
 

@@ -1,9 +1,8 @@
-"""Find the ball in a picture near where the robot's kinematics predict it, and measure its centre.
+"""The ball found in an image near where the robot's kinematics predict it, and its centre measured.
 
 Hough's transform finds circles; edges on spokes measure them; three edges propose a circle, the others vote, and a
 robust fit refines it. What is measured is the projection of the ball's **centre**, as the circle is fitted on the
-sphere of viewing directions (see circle). A ball that is not there, mostly hidden or too faint is a ``LostBall``, not a
-number.
+sphere of viewing directions. A ball that is absent, mostly hidden or too faint is a ``LostBall``, not a number.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from puncture_twin.twin.guidance.stereo.ball.ball_edges import (
     refit,
     visible_fraction,
 )
-from puncture_twin.twin.guidance.stereo.ball.ball_image import Picture
+from puncture_twin.twin.guidance.stereo.ball.ball_image import GreyImage
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
 
 Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low_contrast"]
@@ -36,7 +35,7 @@ Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low
 MARGIN_PX = 8.0
 """Beyond search region and ball: what edges and their smoothing need."""
 HOUGH_SIGMA_PX = 0.4
-"""Of a centre by Hough alone, per axis (measured: benchmarks/detectors.py)."""
+"""Deviation of a centre by Hough alone, per axis (measured: benchmarks/detectors.py)."""
 CLOSER = 2
 """Times that the edges are read again around the measured circle: the second moves it by less than 0.001 px."""
 KEPT_AWAY = 2
@@ -45,7 +44,7 @@ KEPT_AWAY = 2
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """How the ball is measured and when it is believed.
+    """Settings of the ball's measurement, and of when it is believed.
 
     Attributes:
         spokes: Edges wanted, evenly around the outline.
@@ -56,8 +55,8 @@ class TrackerSettings:
         min_visible: Fraction of the disc that must look like the ball.
         radius_share: How far the radius may be from the predicted one.
         min_contrast: Grey levels between ball and surroundings that make an edge.
-        noise_factor: The same in parts of the picture's own noise; the larger counts.
-        model_px: Standard deviation, per axis, of what lamp, blur and rod do to the centre and the edges do not tell.
+        noise_factor: The same in parts of the image's own noise; the larger counts.
+        model_px: Standard deviation, per axis, of what light, blur and rod do to the centre and the edges do not show.
     """
 
     spokes: int = 72
@@ -91,15 +90,15 @@ class DetectedBall(NamedTuple):
 
 
 class LostBall(NamedTuple):
-    """No ball that can be believed."""
+    """A failed search for the ball, with its reason."""
 
     reason: Reason
     inliers: int = 0
-    """Of the best circle."""
+    """Edges on the best circle."""
 
 
 def find_ball(
-    image: Picture | NDArray[np.uint8],
+    image: GreyImage | NDArray[np.uint8],
     camera: Camera,
     predicted_c: Floats,
     radius_mm: float,
@@ -110,19 +109,19 @@ def find_ball(
     """Find and measure the ball.
 
     Args:
-        image: A whole picture, shape (height, width), or a part of one with its offset.
+        image: A whole image, shape (height, width), or a part of one with its offset.
         camera: As calibrated.
         predicted_c: Shape (3,), mm: the ball's centre by the robot's kinematics. Its depth predicts the radius.
         radius_mm: The ball's.
         search_px: How far from the prediction the centre may be.
-        hough_only: The paper's way: the centre of the best circle that Hough finds, neither measured nor gated.
+        hough_only: The paper's method: the centre of the best circle that Hough finds, neither measured nor gated.
     """
-    picture = image if isinstance(image, Picture) else Picture(image)
+    whole = image if isinstance(image, GreyImage) else GreyImage(image)
     predicted = camera.project(predicted_c)
     if not camera.sees(predicted):
         return LostBall("not_in_view")
     radius = camera.ball_radius_px(predicted_c, radius_mm)
-    part = _cut(picture, predicted, search_px + 2 * radius + MARGIN_PX)
+    part = _cut(whole, predicted, search_px + 2 * radius + MARGIN_PX)
     if min(part.grey.shape) < 2 * radius:
         return LostBall("not_in_view")
     grey = grey_part(part.grey, np.array(part.offset, dtype=np.float64))
@@ -139,13 +138,13 @@ def find_ball(
     return _best(grey, camera, FoundCircle(centers[near], found.radii[near]), radius, DEFAULT)
 
 
-def _cut(picture: Picture, center: Floats, half: float) -> Picture:
-    """The part of a picture around a pixel, as far as there is one."""
-    size = np.array(picture.grey.shape[::-1])
-    low = np.clip(np.floor(center - half).astype(int) - picture.offset, 0, size)
-    high = np.clip(np.ceil(center + half).astype(int) + 1 - picture.offset, 0, size)
-    part = np.ascontiguousarray(picture.grey[low[1] : high[1], low[0] : high[0]])
-    return Picture(part, (int(low[0]) + picture.offset[0], int(low[1]) + picture.offset[1]))
+def _cut(whole: GreyImage, center: Floats, half: float) -> GreyImage:
+    """The part of an image around a pixel, as far as there is one."""
+    size = np.array(whole.grey.shape[::-1])
+    low = np.clip(np.floor(center - half).astype(int) - whole.offset, 0, size)
+    high = np.clip(np.ceil(center + half).astype(int) + 1 - whole.offset, 0, size)
+    part = np.ascontiguousarray(whole.grey[low[1] : high[1], low[0] : high[0]])
+    return GreyImage(part, (int(low[0]) + whole.offset[0], int(low[1]) + whole.offset[1]))
 
 
 def _contrast(grey: NDArray[np.uint8]) -> float:
@@ -159,7 +158,7 @@ def _threshold(grey: Grey, settings: TrackerSettings) -> float:
 def _best(
     grey: Grey, camera: Camera, found: FoundCircle, radius: float, settings: TrackerSettings
 ) -> DetectedBall | LostBall:
-    """The first circle that stands the test, or why the one with most inliers did not."""
+    """The first circle that passes the test, or the reason of the one with most inliers."""
     lost = []
     for center in found.centers:
         ball = _measure(grey, camera, center, radius, settings)
@@ -243,7 +242,7 @@ def _away_from_others(on_circle: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _believable(edges: Edges, threshold: float) -> tuple[NDArray[np.bool_], bool]:
-    """Edges that are steep enough and go the way most do, and whether most are too faint."""
+    """Edges that are steep enough and of the usual sign, and whether most are too faint."""
     steep = edges.inside & (np.abs(edges.contrast) >= threshold)
     majority = np.sign(np.sum(np.sign(edges.contrast[steep]))) or 1.0
     return steep & (edges.contrast * majority > 0), bool(np.mean(np.abs(edges.contrast) < threshold) > 0.5)
@@ -264,7 +263,7 @@ RADIUS_RANGE = (0.7, 1.4)
 VOTES = 8
 """Edge pixels that must agree on a centre: few, since every circle is measured afterwards."""
 EDGE_FRACTION = 0.5
-"""Canny's upper threshold in parts of the strongest slope in the picture."""
+"""Canny's upper threshold in parts of the strongest slope in the image."""
 SOBEL_GAIN = 4.0
 """Height of Sobel's answer to a step of one grey level."""
 MOST = 8
@@ -275,7 +274,7 @@ class FoundCircle(NamedTuple):
     """Circles, best first."""
 
     centers: Floats
-    """Shape (n, 2), px, in the picture given."""
+    """Shape (n, 2), px, in the image given."""
     radii: Floats
     """Shape (n,), px."""
 

@@ -1,9 +1,9 @@
 """Bundle adjustment: cameras, poses of rigid bodies and points of those bodies that reproject best, all at once.
 
 A point k of body j is seen by camera i at  pixel = camera_i(T_c_body_j point_k).  Every parameter has a standard
-deviation around its start: 0 holds it, infinity frees it, a number between is a normal prior. So one function is a
-camera's refinement from known points (body held, points held), a chessboard calibration (bodies free, points held), and
-the joint optimum of cameras, held points and frames with all their known errors.
+deviation around its start: 0 fixes it, infinity frees it, a number between is a normal prior. So one function is a
+camera's refinement from known points (body and points fixed), a chessboard calibration (bodies free, points fixed), and
+the joint optimum of cameras, fixed points and frames with all their known errors.
 
 Rotations and translations move as  p -> Exp(w) p + t, in the frame that the map leads to. The solver is
 Levenberg-Marquardt (MINPACK, Moré 1978) with a dense analytic Jacobian: fit for thousands of observations and hundreds
@@ -32,7 +32,7 @@ TOLERANCE = 1e-12
 
 
 class Observations(NamedTuple):
-    """What was seen, a row each."""
+    """Observed pixels, a row each."""
 
     camera: Ints
     """Shape (n,): which camera."""
@@ -47,7 +47,7 @@ class Observations(NamedTuple):
 
 
 class PixelSpreads(NamedTuple):
-    """Standard deviations of the parameters around their start: 0 holds, infinity frees."""
+    """Standard deviations of the parameters around their start: 0 fixes, infinity frees."""
 
     cameras: Floats
     """Shape (cameras, 14), in the order of ``CAMERA_PARAMETERS``."""
@@ -59,7 +59,7 @@ class PixelSpreads(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """The optimum.
+    """The optimum of a bundle adjustment.
 
     Attributes:
         cameras: Refined.
@@ -67,7 +67,7 @@ class Bundle:
         points: Shape (points, 3), in the bodies' frame.
         residuals_px: Shape (n, 2), seen minus predicted.
         cost: Sum of the squared, whitened residuals, priors included.
-        free: Which of all parameters (cameras, bodies, points, in this order) were not held.
+        free: Which of all parameters (cameras, bodies, points, in this order) were not fixed.
         covariance: Shape (all, all), of all parameters, zero where held; from the covariances given, not rescaled.
     """
 
@@ -85,7 +85,7 @@ class Bundle:
         return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
 
     def camera_covariance(self, camera: int) -> Floats:
-        """Of one camera's 14 parameters, shape (14, 14)."""
+        """Covariance of one camera's 14 parameters, shape (14, 14)."""
         rows = slice(14 * camera, 14 * camera + 14)
         return self.covariance[rows, rows]
 
@@ -93,7 +93,7 @@ class Bundle:
 def adjust(
     cameras: Sequence[Camera], T_c_bodies: Floats, points: Floats, seen: Observations, spreads: PixelSpreads
 ) -> Bundle:
-    """Adjust everything that is not held.
+    """Adjust everything that is not fixed.
 
     Args:
         cameras: Where to start.
@@ -133,7 +133,7 @@ def _inverse(information: Floats) -> Floats:
 
 
 class _Iterate(NamedTuple):
-    """Cameras, bodies and points somewhere on the way."""
+    """Cameras, bodies and points at one iteration."""
 
     cameras: tuple[Camera, ...]
     T_c_bodies: Floats
@@ -160,8 +160,8 @@ class _Problem:
         self.start = _Iterate(cameras, T_c_bodies, points)
         self.seen = seen
         self.sigma = np.concatenate([np.ravel(part) for part in spreads])
-        self.free = self.sigma > 0
-        self.prior = np.isfinite(self.sigma[self.free])
+        self.free = self.sigma > 0  # a deviation of 0 fixes
+        self.prior = np.isfinite(self.sigma[self.free])  # an infinite one has no prior row
         each = np.broadcast_to(seen.covariance, (len(seen.pixels), 2, 2))
         self.whitening = np.linalg.inv(np.linalg.cholesky(each))
         self.first_body = 14 * len(cameras)
@@ -191,7 +191,7 @@ class _Problem:
     def errors(self, x: Floats) -> Floats:
         miss = self.at(x).predicted(self.seen) - self.seen.pixels
         white = np.einsum("nij,nj->ni", self.whitening, miss)
-        return np.concatenate([white.ravel(), (x / self.sigma[self.free])[self.prior]])
+        return np.concatenate([white.ravel(), (x / self.sigma[self.free])[self.prior]])  # pixels, then priors
 
     def jacobian(self, x: Floats) -> Floats:
         every, state, seen = self._all(x), self.at(x), self.seen

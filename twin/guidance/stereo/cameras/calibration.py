@@ -1,7 +1,7 @@
 """A camera from known points: direct linear transform, then the least reprojection error with the lens's distortion.
 
-**What twelve points tell about the lens.** In a picture that spans 28 degrees the grid of the robot's points fills a
-radius of a tenth of the focal length. There k1 = -0.1 bends by a quarter of a pixel: a ball found to 0.02 px tells k1
+**What twelve points tell about the lens.** In an image that spans 28 degrees the grid of the robot's points fills a
+radius of a tenth of the focal length. There k1 = -0.1 bends by a quarter of a pixel: a ball found to 0.02 px gives k1
 to about 0.01. But k2 = 0.1 bends by 0.003 px and cannot be found; p1, p2 can, though mostly together with the principal
 point. So each coefficient has a prior (normal, mean 0): what the points cannot show stays near 0 and keeps the prior's
 variance, and ``identified`` names the coefficients whose standard deviation the points at least halved.
@@ -37,7 +37,7 @@ CRITICAL = 1e6
 LENS_PRIOR = (0.3, 0.3, 0.002, 0.002)
 """Standard deviations of k1, k2, p1, p2: lenses of industrial cameras rarely have more."""
 IDENTIFIED = 0.5
-"""Posterior over prior standard deviation up to which a coefficient counts as told by the points."""
+"""Posterior over prior standard deviation up to which a coefficient counts as identified by the points."""
 MAX_RESIDUAL_PX = 15.0
 """A point that misses by more was swapped with another or found wrongly: Hough alone misses by about one pixel."""
 SMALLEST_SIGMA_PX = 1e-3
@@ -54,7 +54,7 @@ class CameraCalibration:
         camera: Refined.
         residuals_px: Shape (n, 2), found minus predicted.
         rms_px: Root mean square distance of the residuals.
-        covariance: Shape (14, 14) in the order of ``bundle.CAMERA_PARAMETERS``; zero where held.
+        covariance: Shape (14, 14) in the order of ``bundle.CAMERA_PARAMETERS``; zero where fixed.
         sigma_px: Standard deviation per axis of a pixel: given, or estimated from the residuals.
         identified: The distortion coefficients that the points tell.
     """
@@ -82,7 +82,7 @@ def calibrate(
     Args:
         points_c: Shape (n, 3), mm, n >= 6, not in a plane.
         pixels: Shape (n, 2), where the points were found; NaN for a ball that was not found.
-        size: Width and height of the picture, px.
+        size: Width and height of the image, px.
         names: What errors call the points; None numbers them from 1.
         distortion: False holds the lens perfect, as the paper does.
         sigma_px: Standard deviation of a pixel coordinate; None estimates it from the residuals.

@@ -1,13 +1,8 @@
-"""A calibrated camera: where a point of the calibration frame C appears, and which ray belongs to a pixel.
+"""Camera model: the pixel of a point of the calibration frame C, the ray of a pixel, and the lens's distortion.
 
-Pixel (u, v) is column and row; **pixel centres are at integers**, so the picture spans -0.5 .. width - 0.5. The
-camera's frame is the field's: x right, y down, z forward. Distortion is Brown's k1, k2, p1, p2 as OpenCV has it
-(see lens).
-
-What a lens does to a pinhole's picture: radial and tangential distortion, its slope, and its inverse.
-
-All points here are normalised: x/z and y/z in the camera's frame, without unit, shape (..., 2). The coefficients are
-k1, k2, p1, p2 of Brown's model, in the order and with the signs of OpenCV:
+Pixel (u, v) is column and row; **pixel centres are at integers**, so the image spans -0.5 .. width - 0.5. The
+camera's frame is the field's: x right, y down, z forward. Distortion is Brown's k1, k2, p1, p2, in the order and with
+the signs of OpenCV, of normalised points x/z and y/z in the camera's frame, without unit, shape (..., 2):
 
     x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y_d = y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -32,7 +27,7 @@ ROTATION_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One camera.
+    """A calibrated camera in the calibration frame C.
 
     Attributes:
         width: Pixels.
@@ -108,7 +103,7 @@ class Camera:
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
     def sees(self, pixels: Floats, margin_px: float = 0.0) -> NDArray[np.bool_]:
-        """Whether pixels (..., 2) lie in the picture, at least a margin from its border; NaN does not."""
+        """Whether pixels (..., 2) lie in the image, at least a margin from its border; NaN does not."""
         low = margin_px - 0.5
         high = np.array([self.width, self.height]) - 0.5 - margin_px
         with np.errstate(invalid="ignore"):
@@ -132,18 +127,18 @@ class Camera:
         return float(np.sqrt(abs(np.linalg.det(self.angle_slope(direction_c)))))
 
     def angle_slope(self, direction_c: Floats) -> Floats:
-        """Derivative of the pixel by a turn of the ray about a unit direction, shape (2, 2), px/rad.
+        """Derivative of the pixel by a rotation of the ray about a unit direction, shape (2, 2), px/rad.
 
         Its columns belong to the two axes of ``tangent_axes``.
         """
         return np.asarray(self.jacobian(self.center_c + direction_c) @ tangent_axes(direction_c))
 
     def moved(self, T_c_other: Floats) -> Camera:
-        """The same camera known in another frame: ``T_camera_other = T_camera_c T_c_other``."""
+        """The camera in another frame: ``T_camera_other = T_camera_c T_c_other``."""
         return replace(self, T_camera_c=self.T_camera_c @ T_c_other)
 
     def pinhole(self) -> Camera:
-        """The same camera with a perfect lens."""
+        """The camera with a perfect lens."""
         return replace(self, distortion=np.zeros(4))
 
 
@@ -153,30 +148,30 @@ def tangent_axes(direction: Floats) -> Floats:
 
 
 DOWN_C = (0.0, 1.0, 0.0)
-"""What is down in a picture: y of C."""
+"""What is down in an image: y of C."""
 
 
 def looking_at(
-    eye_c: Floats,
+    centre_c: Floats,
     target_c: Floats,
     size: tuple[int, int],
     focal_px: float,
     *,
     distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> Camera:
-    """A camera at a place in C that has a point in the middle of its picture.
+    """A camera at a place in C with a point in the middle of its image.
 
     Args:
-        eye_c: Shape (3,), mm.
+        centre_c: Shape (3,), mm.
         target_c: Shape (3,), mm.
         size: Width and height, px.
         focal_px: Focal length, px.
         distortion: k1, k2, p1, p2.
     """
-    z = np.asarray(target_c, dtype=np.float64) - eye_c
+    z = np.asarray(target_c, dtype=np.float64) - centre_c
     z = z / np.linalg.norm(z)
     R = np.ascontiguousarray(frame_along(z, np.array(DOWN_C)).T)
-    T = pose(R, -R @ np.asarray(eye_c, dtype=np.float64))
+    T = pose(R, -R @ np.asarray(centre_c, dtype=np.float64))
     width, height = size
     middle = (width - 1) / 2, (height - 1) / 2
     return Camera(width, height, focal_px, focal_px, *middle, np.asarray(distortion, dtype=np.float64), T)
@@ -190,7 +185,7 @@ def stereo_pair(
     distance_mm: float,
     distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> tuple[Camera, Camera]:
-    """Left and right camera, side by side, both looking at the room's centre.
+    """Left and right camera, side by side, both looking at the workcell's centre.
 
     The centre is C's origin; x runs from the left camera to the right one, y down, z away from them. The cameras stand
     at (-+ baseline / 2, 0, -distance). Use ``Camera.moved`` to know them in a frame that lies otherwise.
@@ -200,7 +195,7 @@ def stereo_pair(
         height: Pixels.
         focal_px: Pixels; 2560 shows 500 mm at 1 m on 1280 px.
         baseline_mm: Between the two centres.
-        distance_mm: From the middle of the baseline to the room's centre.
+        distance_mm: From the middle of the baseline to the workcell's centre.
         distortion: k1, k2, p1, p2 of both.
 
     Raises:
@@ -211,7 +206,9 @@ def stereo_pair(
             f"baseline {baseline_mm:g} mm, distance {distance_mm:g} mm", where="stereo pair", allowed="above 0"
         )
     positions = [np.array([side * baseline_mm / 2, 0.0, -distance_mm]) for side in (-1, 1)]
-    left, right = (looking_at(eye, np.zeros(3), (width, height), focal_px, distortion=distortion) for eye in positions)
+    left, right = (
+        looking_at(centre, np.zeros(3), (width, height), focal_px, distortion=distortion) for centre in positions
+    )
     return left, right
 
 
@@ -222,7 +219,7 @@ MAX_STEPS = 30
 
 
 def distort(points: Floats, coefficients: Floats) -> Floats:
-    """Where the lens puts normalised points, shape (..., 2)."""
+    """Distorted normalised points, shape (..., 2)."""
     k1, k2, p1, p2 = coefficients
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
@@ -270,7 +267,7 @@ def undistort(points: Floats, coefficients: Floats) -> Floats:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             step[..., 0] = (slope[..., 1, 1] * miss[..., 0] - slope[..., 0, 1] * miss[..., 1]) / determinant
             step[..., 1] = (slope[..., 0, 0] * miss[..., 1] - slope[..., 0, 1] * miss[..., 0]) / determinant
-            found += step
+            found += step  # a 2 x 2 system by Cramer's rule
         if not np.any(np.abs(step) > CONVERGED):
             break
     r2 = np.sum(found**2, axis=-1)
@@ -280,7 +277,7 @@ def undistort(points: Floats, coefficients: Floats) -> Floats:
 
 
 def fold(coefficients: Floats) -> float:
-    """Radius (a tangent) at which the picture turns back on itself: beyond it the model means nothing.
+    """Radius (a tangent) at which the image folds back on itself: beyond it the model is meaningless.
 
     It is the first zero of d(r + k1 r^3 + k2 r^5)/dr; infinite where there is none.
     """
@@ -288,7 +285,7 @@ def fold(coefficients: Floats) -> float:
     square = 9 * k1 * k1 - 20 * k2
     if square < 0:
         return float("inf")
-    q = -(3 * k1 + math.copysign(math.sqrt(square), k1)) / 2
+    q = -(3 * k1 + math.copysign(math.sqrt(square), k1)) / 2  # without cancellation
     roots = [1 / q if q else 0.0, q / (5 * k2) if k2 else 0.0]
     squares = [root for root in roots if root > 0]
     return float(np.sqrt(min(squares))) if squares else float("inf")

@@ -1,6 +1,6 @@
-"""Where in C the cameras' pixels meet: a linear start, then the least reprojection error.
+"""Points in C from pixels of several cameras: a linear start, then the least reprojection error.
 
-The direct linear transform: a camera's 3x4 matrix M from known points, and points from several matrices.
+The direct linear transform gives a camera's 3x4 matrix M from known points (`fit_matrix`), and points from matrices:
 
     z [u v 1]^T = M [x y z 1]^T                                                         (Liu 2007, Eq. 1)
 

@@ -1,19 +1,15 @@
-"""Everything that was measured in a session, as one least-squares problem: the bundle adjustment over all images.
+"""The joint estimate of a stereo session: one least-squares problem over all images, and the bound of any estimate.
 
-Unknown are both cameras, where C lies in the base, the errors of arm and rod, where the head stands, its markers, and
-the ball at every stay. Known are the ball and marker pixels, the measuring arm's readings, the markers in the image,
-what the arm was commanded, and how far each of these may be off, as the case declares it. Each residual is divided by
-its standard deviation, so the normal matrix is Fisher's information and its inverse the Cramer-Rao bound (van Trees'
-for what has a declared deviation). That is counted in deviations, so that one of 0 fixes it.
-
-The statistically best estimate of ball and target, and the bound that no estimate can beat.
+Unknown are both cameras, where C lies in the base, the errors of arm and rod (26, `rod_poses`), the head's pose, its
+markers, and the ball at every stay. Known are the ball and marker pixels, the measuring arm's readings, the markers in
+the image, what the arm was commanded, and how far each of these may be off, as the case declares it. Each residual is
+divided by its standard deviation, so the normal matrix is Fisher's information and its inverse the Cramer-Rao bound
+(van Trees' for what has a declared deviation). That is counted in deviations, so that one of 0 fixes it.
 
 The chain of the paper calibrates, triangulates and maps one after the other, and each step forgets what the others
-know: the servo's own images also see the cameras, the arm's commands also see the ball. Here everything that was
-measured is adjusted together (`joint_model`). With normal errors and small curvature that attains the
-Cramer-Rao bound, which is the same normal matrix taken at the truth.
-
-How an arm that errs holds its rod: ball and flange, and how each of 26 errors moves them.
+know: the servo's own images also see the cameras, the arm's commands also see the ball. Here all of it is adjusted
+together. With normal errors and small curvature that attains the Cramer-Rao bound, which is the same normal matrix
+taken at the truth.
 """
 
 from __future__ import annotations
@@ -37,12 +33,12 @@ PER_CAMERA = 13
 """Focal length, principal point, four of the lens, turn, shift: square pixels are known."""
 
 FLOOR_MM = 1e-3
-"""Nothing is known better than this."""
+"""mm: no standard deviation is taken to be less."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What was measured; n markers, s stays of the arm of which the first k were also measured by the measuring arm.
+    """Measurements; n markers, s stays of the arm of which the first k were also read by the measuring arm.
 
     Attributes:
         planned: The cameras as they were planned.
@@ -70,7 +66,7 @@ class Observed:
 
 
 class Guess(NamedTuple):
-    """Where the adjustment starts; C, mm."""
+    """Start of the adjustment; C, mm."""
 
     T_c_base: Floats
     """Shape (4, 4): counted from here."""
@@ -97,24 +93,24 @@ class Unknowns(NamedTuple):
     """Shape (s, 3), mm."""
 
     def vector(self) -> Floats:
-        """All of them, shape (N,)."""
+        """All unknowns as one vector, shape (N,)."""
         return np.concatenate([np.ravel(part) for part in self])
 
     def moved(self, step: Floats) -> Unknowns:
-        """With a step (N,) added."""
+        """The unknowns with a step (N,) added."""
         ends = np.cumsum([part.size for part in self])[:-1]
         parts = np.split(self.vector() + step, ends)
         return Unknowns(*(new.reshape(old.shape) for new, old in zip(parts, self, strict=True)))
 
     def span(self, name: str) -> slice:
-        """Where a part stands in the vector."""
+        """Slice of a part in the vector."""
         sizes = [part.size for part in self]
         at = self._fields.index(name)
         return slice(sum(sizes[:at]), sum(sizes[: at + 1]))
 
 
 def first_unknowns(observed: Observed, guess: Guess) -> Unknowns:
-    """All errors 0."""
+    """The unknowns with all errors 0."""
     cameras = np.zeros((len(observed.planned), PER_CAMERA))
     return Unknowns(cameras, np.zeros(6), np.zeros(N_ROD), np.zeros(6), observed.markers_m.copy(), guess.balls_c.copy())
 
@@ -180,7 +176,7 @@ class JointModel:
         return System(np.concatenate([r for r, _ in rows]), np.concatenate([J for _, J in rows]))
 
     def _seen(self, x: Unknowns) -> list[tuple[Floats, Floats]]:
-        """Ball and marker pixels of each camera."""
+        """Rows of the ball and marker pixels of each camera."""
         o, T_c_m = self.observed, self.pose_of_head(x)
         markers_c = apply(T_c_m, x.markers_m)
         points = np.concatenate([x.balls_c, markers_c])
@@ -195,14 +191,14 @@ class JointModel:
             J[:, :, start : start + PER_CAMERA] = _camera_slopes(planned, camera, errors, points) * deviations
             by_point = camera.jacobian(points)
             _diagonal(J, 0, x.span("balls_c").start, by_point[:n_balls])
-            J[n_balls:, :, x.span("head")] = by_point[n_balls:] @ self.head_slopes(x, markers_c)
+            J[n_balls:, :, x.span("head")] = by_point[n_balls:] @ self.head_slopes(x, markers_c)  # chain rule
             _diagonal(J, n_balls, x.span("markers_m").start, by_point[n_balls:] @ T_c_m[:3, :3])
             missed = camera.project(points) - pixels[index]
             rows.append(_whitened(missed, J, roots[index]))
         return rows
 
     def _measured(self, x: Unknowns) -> tuple[Floats, Floats]:
-        """The measuring arm's readings."""
+        """Rows of the measuring arm's readings."""
         k, sigma = len(self.observed.measured_c), max(self.observed.errors.measuring_mm, FLOOR_MM)
         J = np.zeros((k, 3, x.vector().size))
         _diagonal(J, 0, x.span("balls_c").start, np.tile(np.eye(3), (k, 1, 1)))
@@ -210,20 +206,20 @@ class JointModel:
         return _whitened(x.balls_c[:k] - self.observed.measured_c, J, roots)
 
     def _commanded(self, x: Unknowns) -> tuple[Floats, Floats]:
-        """Where the arm, with its errors, should have the ball; its play and repeatability let it stray."""
+        """The commanded ball: the arm, with its errors, play and repeatability, against the ball's place."""
         q = self.observed.q_command
-        strays, J = self.strays(x, np.arange(len(q)))
-        return _whitened(strays, J, self._offset_roots)
+        missed, J = self.ball_deviations(x, np.arange(len(q)))
+        return _whitened(missed, J, self._offset_roots)
 
-    def strays(self, x: Unknowns, stays: Ints) -> tuple[Floats, Floats]:
-        """How far the ball is from where its arm should have it at k stays: (k, 3), mm, C, and slopes (k, 3, N)."""
+    def ball_deviations(self, x: Unknowns, stays: Ints) -> tuple[Floats, Floats]:
+        """Deviation of the ball from its arm's prediction at k stays: (k, 3), mm, C, and slopes (k, 3, N)."""
         T, rod = self.pose_of_base(x), self.rod_at(x, self.observed.q_command[stays])
         measured = apply(T, rod.ball)
         J = np.zeros((len(measured), 3, x.vector().size))
         for row, stay in enumerate(stays):
             start = x.span("balls_c").start + 3 * int(stay)
             J[row, :, start : start + 3] = np.eye(3)
-        J[:, :, x.span("base")] = -self.base_slopes(x, measured)
+        J[:, :, x.span("base")] = -self.base_slopes(x, measured)  # ball minus where base and arm have it
         J[:, :, x.span("arm")] = -T[:3, :3] @ rod.slopes[:, :3] * self.observed.errors.arm_deviations()
         return x.balls_c[stays] - measured, J
 
@@ -235,17 +231,17 @@ class JointModel:
         return _roots(o.errors.arrival**2 * slopes @ slopes.transpose(0, 2, 1) + FLOOR_MM**2 * np.eye(3))
 
     def _imaged(self, x: Unknowns) -> tuple[Floats, Floats]:
-        """The markers in the image."""
+        """Rows of the markers in the image."""
         n, sigma = len(x.markers_m), max(self.observed.errors.marker_mm, FLOOR_MM)
         J = np.zeros((n, 3, x.vector().size))
         _diagonal(J, 0, x.span("markers_m").start, np.tile(np.eye(3), (n, 1, 1)))
         return _whitened(x.markers_m - self.observed.markers_m, J, np.tile(np.eye(3) / sigma, (n, 1, 1)))
 
     def _drawn(self, x: Unknowns) -> tuple[Floats, Floats]:
-        """What has a declared deviation from its nominal value."""
+        """Rows of the unknowns with a declared deviation from their nominal value."""
         J = np.eye(x.vector().size)
         drawn = np.r_[x.span("cameras"), x.span("arm")]
-        return x.vector()[drawn], J[drawn]
+        return x.vector()[drawn], J[drawn]  # counted in deviations: the prior's residual is the unknown itself
 
 
 def _camera_slopes(planned: Camera, camera: Camera, errors: Floats, points: Floats) -> Floats:
@@ -263,7 +259,7 @@ def _camera_slopes(planned: Camera, camera: Camera, errors: Floats, points: Floa
 
 
 def _pose_slopes(points: Floats, center: Floats, turn: Floats, shift: Floats) -> Floats:
-    """Derivative (n, 3, 6) of moved points (n, 3) by the turn about a centre and the shift of ``turned``."""
+    """Derivative (n, 3, 6) of moved points (n, 3) by the rotation about a centre and the shift."""
     slopes = turn_and_shift_slopes(points - center - shift)
     x, y, z = turn
     left = np.eye(3) + 0.5 * np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # to second order in the turn
@@ -374,7 +370,7 @@ def adjust(observed: Observed, guess: Guess, start: Unknowns | None = None) -> A
     if not (fit.settled and fit.determined):
         raise NoAnswerError(UNSETTLED)
     covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
-    chi2 = float(np.sum((fit.system.residuals + fit.system.slopes @ fit.step) ** 2))
+    chi2 = float(np.sum((fit.system.residuals + fit.system.slopes @ fit.step) ** 2))  # after the last step
     return Adjusted(model, fit.estimate, covariance, chi2, _freedom(fit.system), fit.iterations)
 
 
@@ -403,14 +399,14 @@ def bound(observed: Observed, guess: Guess, truth: Unknowns) -> Adjusted:
 
 
 FLANGE_ERRORS = PARAMETERS["joint"].stop
-"""Of these move the flange: 23."""
+"""How many of these move the flange: 23."""
 
 N_ROD = PARAMETERS["tip_offset"].stop
 """a1..a6, d1, d3..d6, alpha1..alpha6, six zeros of the joints, the ball on the flange: what moves the ball."""
 
 
 class RodPoses(NamedTuple):
-    """How an arm that errs holds its rod, base frame."""
+    """Ball and flange of an arm that errs, base frame."""
 
     ball: Floats
     """Shape (s, 3), mm."""
@@ -429,7 +425,7 @@ def rod_poses(rod: CarriedRod, eta: Floats, q: Floats) -> RodPoses:
     origins, axes = poses[..., :3, 3], poses[..., :3, :3]
     R = axes[:, 6]
     ball = origins[:, 6] + R @ (eta[FLANGE_ERRORS:] + np.array([0.0, 0.0, rod.rod_mm]))
-    x, z = axes[:, 1:, :, 0], axes[:, :-1, :, 2]
+    x, z = axes[:, 1:, :, 0], axes[:, :-1, :, 2]  # x behind each joint, z before it
     twist = np.cross(x, ball[:, None] - origins[:, 1:])
     zero = np.cross(z, ball[:, None] - origins[:, :-1])
     slopes = np.zeros((len(q), 6, N_ROD))

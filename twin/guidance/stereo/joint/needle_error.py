@@ -1,4 +1,4 @@
-"""The needle's pose against the anatomy, and its covariance: by the arm and the mapping alone, and after the servo.
+"""Covariance of the needle's pose against the anatomy: by arm and mapping alone, and after the servo.
 
 With F the information matrix of the joint model, d the tip minus the target and phi the needle's rotation, both in the
 image's axes at the target, every row of E says what an unknown does to them:
@@ -6,12 +6,12 @@ image's axes at the target, every row of E says what an unknown does to them:
     Sigma6 = E F^-1 E' + arrival + R_m_flange diag(tip_offset^2, needle_direction^2) R' + what the head moved since
 
 Before the servo the ball's rows are those of base and arm, and the arrival is new: J Jq Sigma_q Jq' J'. After it they
-are those of the ball at the last look, so that the arm drops out of d; phi stays the arm's, but for what the last look
-says of this arrival: with r the ball's stray from where the arm should have it, the joints missed by
+are those of the ball at the last image, so that the arm drops out of d; phi stays the arm's, but for what the last
+image says of this arrival: with r the ball's deviation from where the arm should have it, the joints missed by
 
     eps | r ~ N(K r, Sigma_q - K Jq Sigma_q),   K = Sigma_q Jq' (Jq Sigma_q Jq')^-1
 
-A needle as it was predicted beside the needle as it came to stand, as plain values.
+`needle_outcome` compares the predicted needle with the true one, as plain values.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from puncture_twin.twin.guidance.stereo.joint.joint_model import FLOOR_MM, Adjus
 from puncture_twin.twin.guidance.stereo.servo_law import turn_and_shift_slopes
 
 REGION = 0.95
-"""Chance of the ellipsoid that is told."""
+"""Chance of the reported ellipsoid."""
 
 
 @dataclass(frozen=True, eq=False)
 class NeedleError:
-    """What is believed of a needle that stands, image axes.
+    """Predicted error of a needle in place, image axes.
 
     Attributes:
         offset_m: Shape (3,), mm: the tip as believed, minus the target: what a tolerance or a wrong arm leaves.
@@ -55,12 +55,12 @@ class NeedleError:
 
     @property
     def tip_covariance(self) -> Floats:
-        """Of the tip against the point that was meant, its reading included, shape (3, 3), mm^2."""
+        """Covariance of the tip about the intended point, its reading included, shape (3, 3), mm^2."""
         return np.asarray(self.covariance[:3, :3] + self.target_covariance)
 
     @property
     def rms_mm(self) -> float:
-        """Expected (rms) distance of the tip from the point that was meant."""
+        """Expected (rms) distance of the tip from the intended point, mm."""
         return float(np.sqrt(self.offset_m @ self.offset_m + np.trace(self.tip_covariance)))
 
     @property
@@ -71,7 +71,7 @@ class NeedleError:
 
     @property
     def half_axes_mm(self) -> Floats:
-        """Of the tip's 95 % ellipsoid about `offset_m`, shape (3,), mm, longest first."""
+        """Half axes of the tip's 95 % ellipsoid about `offset_m`, shape (3,), mm, longest first."""
         return np.asarray(np.sqrt(chdtri(3, 1 - REGION) * np.linalg.eigvalsh(self.tip_covariance)[::-1]))
 
     @property
@@ -90,7 +90,7 @@ class NeedleError:
 
 
 def servoed_error(found: Adjusted, stay: int, target_m: Floats) -> NeedleError:
-    """The needle after a look at the ball.
+    """The needle's error after an image of the ball.
 
     Args:
         found: The joint estimate.
@@ -99,22 +99,22 @@ def servoed_error(found: Adjusted, stay: int, target_m: Floats) -> NeedleError:
     """
     model, x = found.model, found.unknowns
     stay = stay % len(x.balls_c)
-    miss, slopes = model.strays(x, np.array([stay]))
+    miss, slopes = model.ball_deviations(x, np.array([stay]))
     rod, frame = _Flange.of(found, model.observed.q_command[stay]), _Anatomy.of(found, target_m)
     variance, Jq = model.observed.errors.arrival**2, rod.arrival_slopes
     K = variance * Jq[:3].T @ np.linalg.inv(variance * Jq[:3] @ Jq[:3].T + FLOOR_MM**2 * np.eye(3))
     rows = np.zeros((6, len(found.covariance)))
     start = x.span("balls_c").start + 3 * stay
-    rows[:3, start : start + 3] = np.eye(3)
+    rows[:3, start : start + 3] = np.eye(3)  # the tip follows the ball that was seen
     rows[3:] = rod.rows[3:] + Jq[3:] @ K @ slopes[0]
     again = np.zeros((6, 6))
-    again[3:, 3:] = Jq[3:] @ (variance * (np.eye(6) - K @ Jq[:3])) @ Jq[3:].T
-    R_c_flange = exp_rotation(Jq[3:] @ K @ miss[0]) @ rod.R_c_flange
+    again[3:, 3:] = Jq[3:] @ (variance * (np.eye(6) - K @ Jq[:3])) @ Jq[3:].T  # of this arrival, given r
+    R_c_flange = exp_rotation(Jq[3:] @ K @ miss[0]) @ rod.R_c_flange  # by its mean, K r
     return frame.needle(found, x.balls_c[stay], R_c_flange, rows, again)
 
 
 def open_loop_error(found: Adjusted, q_command: Floats, target_m: Floats) -> NeedleError:
-    """The needle where the arm is sent without a look.
+    """The needle's error where the arm is sent without an image.
 
     Args:
         found: The joint estimate of what was measured before.
@@ -129,7 +129,7 @@ def open_loop_error(found: Adjusted, q_command: Floats, target_m: Floats) -> Nee
 
 @dataclass(frozen=True, eq=False)
 class _Flange:
-    """Ball and flange where the arm should have them, C.
+    """Predicted ball and flange of the arm, C.
 
     Attributes:
         ball_c: Shape (3,), mm.
@@ -159,7 +159,7 @@ class _Flange:
 
 @dataclass(frozen=True, eq=False)
 class _Anatomy:
-    """The target where the head is believed to stand.
+    """The target at the head's estimated pose.
 
     Attributes:
         target_m: Shape (3,), mm.
@@ -181,11 +181,11 @@ class _Anatomy:
         return cls(target_m, T_c_m, rows)
 
     def needle(self, found: Adjusted, ball_c: Floats, R_c_flange: Floats, rows: Floats, again: Floats) -> NeedleError:
-        """The needle against this target; ``again`` (6, 6), C, is what errs beside the unknowns."""
+        """The needle against this target; ``again`` (6, 6), C, is what errs besides the unknowns."""
         errors, R = found.model.observed.errors, self.T_c_m[:3, :3]
-        rows = rows - self.rows
+        rows = rows - self.rows  # tip minus target
         rotated = np.kron(np.eye(2), R_c_flange)
-        tool = np.repeat([errors.tip_offset_mm, errors.needle_direction, 0.0], [3, 2, 1]) ** 2
+        tool = np.repeat([errors.tip_offset_mm, errors.needle_direction, 0.0], [3, 2, 1]) ** 2  # no roll
         cov_c = rows @ found.covariance @ rows.T + again + (rotated * tool) @ rotated.T
         turn = np.kron(np.eye(2), R)
         covariance = turn.T @ cov_c @ turn + self._moved(found)
@@ -193,7 +193,7 @@ class _Anatomy:
         return NeedleError(offset, R.T @ R_c_flange, covariance, errors.target_mm**2 * np.eye(3))
 
     def _moved(self, found: Adjusted) -> Floats:
-        """What the head moved after its markers were seen, shape (6, 6), image axes; they turn about their middle."""
+        """Covariance of the head's motion after its markers were seen, (6, 6), image axes, about their middle."""
         errors, lever = found.model.observed.errors, self.target_m - found.unknowns.markers_m.mean(axis=0)
         slopes = np.zeros((6, 6))
         slopes[:3], slopes[3:, :3] = turn_and_shift_slopes(lever[None])[0], np.eye(3)
@@ -201,7 +201,7 @@ class _Anatomy:
 
 
 def _turn_rows(change: Floats) -> Floats:
-    """Rotation of a pose by the turn and shift (6,) of `rotated_about`, shape (3, 6)."""
+    """Rotation of a pose by the rotation and shift (6,) of `rotated_about`, shape (3, 6)."""
     return np.concatenate([left_jacobian(change[:3]), np.zeros((3, 3))], axis=1)
 
 
@@ -210,7 +210,7 @@ LEAST_VARIANCE = 1e-12
 
 
 class TrueNeedle(NamedTuple):
-    """Where a needle truly is against the anatomy, image axes."""
+    """The true needle against the anatomy, image axes."""
 
     error_m: Floats
     """Shape (3,), mm: true tip minus true target."""
@@ -219,14 +219,14 @@ class TrueNeedle(NamedTuple):
 
 
 class NeedleOutcome(NamedTuple):
-    """One needle; mm and degrees."""
+    """Prediction and truth of one needle; mm and degrees."""
 
     predicted_rms_mm: float
     """Expected (rms) distance of tip and target."""
     offset_mm: float
     """The part of it that is known: the tip believed, to the target."""
     half_axes_mm: tuple[float, float, float]
-    """Of the 95 % ellipsoid about the tip believed, longest first."""
+    """Half axes of the 95 % ellipsoid about the tip believed, longest first."""
     lateral_mm: float
     """Deviation across the needle."""
     depth_mm: float
@@ -239,9 +239,9 @@ class NeedleOutcome(NamedTuple):
     """True tip to true target."""
     realised_direction_deg: float
     square: float
-    """Of the tip's error about what is believed, in deviations: chi-squared of 3."""
+    """Squared size of the tip's error about what is believed, in deviations: chi-squared of 3."""
     square_of_pose: float
-    """Likewise of tip and rotation together: chi-squared of 6."""
+    """Squared size of the error of tip and rotation together: chi-squared of 6."""
     hit: bool | None
     """Whether the tip is within the radius."""
 
@@ -252,7 +252,7 @@ class NeedleOutcome(NamedTuple):
 
 
 def needle_outcome(believed: NeedleError, true: TrueNeedle, radius_mm: float | None) -> NeedleOutcome:
-    """Compare.
+    """Compare a predicted needle with the true one.
 
     Args:
         believed: As predicted.

@@ -1,16 +1,16 @@
-"""Errors of both arms that repeat from pose to pose: wrong lengths, twists and joint zeros, and what differs each time.
+"""Errors of both arms: lengths, twists and joint zeros that repeat from pose to pose, and what differs each time.
 
-An arm's flange stands where its nominal numbers say, moved by J eta (Mooring, Roth, Driels 1991): eta are the errors of
-its 23 parameters, which stay, and J follows from the joints. A calibration does not ask for eta. It takes eta as normal
-with the declared deviations, and lets what the recording says of it correct the aim. Beside eta the joints stop a
+An arm's true flange is its nominal one moved by J eta (Mooring, Roth, Driels 1991): eta are the errors of its 23
+parameters, which stay, and J follows from the joints. A calibration does not solve for eta. It takes eta as normal
+with the declared deviations, and lets what the recording says of it correct the aim. In addition the joints stop a
 little differently at each arrival: repeatability.
 
-Play leaves a joint half of its width b short of where it was sent. Which way the joint turned says the sign (the play
+Play leaves a joint half of its width b short of where it was sent. Which way the joint rotated says the sign (the play
 operator: Visintin, Differential Models of Hysteresis, 1994, chapter III):
 
     q = q_sent - s b (1 + c z) / 2,   s = 1 or -1,   z normal, c = PLAY_KNOWN.
 
-b / 2 moves the recorded flanges beforehand, and c z is one more error per joint that stays. Where nobody knows s, play
+b / 2 moves the recorded flanges beforehand, and c z is one more error per joint that stays. Where s is unknown, play
 is an arrival's noise of variance (b / 2)^2.
 """
 
@@ -40,18 +40,18 @@ class DeclaredArm(NamedTuple):
 
     model: UrModel
     link_mm: float
-    """Of every Denavit-Hartenberg length."""
+    """Deviation of every Denavit-Hartenberg length."""
     twist_rad: float
-    """Of every twist."""
+    """Deviation of every twist."""
     joint_rad: float
-    """Of every joint's zero."""
+    """Deviation of every joint's zero."""
     arrival_rad: float
-    """Of every joint, anew at each arrival."""
+    """Deviation of every joint, anew at each arrival."""
     play_rad: float = 0.0
     """Half the width of every joint's play: how far it stops short of where it was sent; no deviation."""
 
     def deviations(self) -> Floats:
-        """Of the 23 parameters, shape (23,)."""
+        """Deviations of the 23 parameters, shape (23,), mm and rad."""
         sigma = np.zeros(N_ARM)
         for kind, value in (("link", self.link_mm), ("twist", self.twist_rad), ("joint", self.joint_rad)):
             sigma[PARAMETERS[kind]] = value
@@ -64,7 +64,7 @@ class DeclaredArm(NamedTuple):
 
         Args:
             q: Joints, shape (n, 6), rad.
-            turn: Which way each last turned, shape (n, 6): 1, -1, or 0 where nobody knows.
+            turn: Direction in which each last rotated, shape (n, 6): 1, -1, or 0 where unknown.
         """
         slopes = error_jacobian(self.model, q, 0.0)[..., :N_ARM] * self.deviations()
         if self.play_rad:
@@ -76,19 +76,19 @@ class DeclaredArm(NamedTuple):
         return np.asarray(self._play_slopes(q, turn).sum(axis=2))
 
     def _play_slopes(self, q: Floats, turn: Floats) -> Floats:
-        """Of each joint: its play leaves it short of where it was sent, -half the width times the way it turned."""
+        """Slopes of each joint's play: -half the width times the direction in which it rotated."""
         J = error_jacobian(self.model, q, 0.0)[..., PARAMETERS["joint"]]
         return np.asarray(-self.play_rad * J * turn[:, None, :])
 
     def arrival_covariance(self, q: Floats, turn: Floats) -> Floats:
-        """Of the flange's shift and turn between arrivals at one pose, shape (n, 6, 6); arguments as above."""
+        """Covariance of the flange between arrivals at one pose, shape (n, 6, 6), mm and rad; arguments as above."""
         J = error_jacobian(self.model, q, 0.0)[..., PARAMETERS["joint"]]
-        variance = self.arrival_rad**2 + self.play_rad**2 * (turn == 0.0)
+        variance = self.arrival_rad**2 + self.play_rad**2 * (turn == 0.0)  # play is noise where its sign is unknown
         return np.asarray((J * variance[:, None, :]) @ np.swapaxes(J, -1, -2))
 
 
 class DeclaredArms(NamedTuple):
-    """Both arms."""
+    """Both declared arms."""
 
     probe: DeclaredArm
     needle: DeclaredArm

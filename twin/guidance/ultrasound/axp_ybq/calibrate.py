@@ -113,7 +113,7 @@ def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: E
 def _solve(
     problem: Problem, start: Estimate, *, robust: bool, direction: bool
 ) -> tuple[Problem, RobustFit, Observability, SeenDirection]:
-    """The tips' fit, then that with the directions and the noise that was found, where they take part.
+    """The tips' fit, then that with the directions and the estimated noise, where they take part.
 
     Raises:
         InputError: Most poses disagree, or the directions contradict them.

@@ -1,4 +1,4 @@
-"""What a self-calibration found, and how well it is known."""
+"""The result of a self-calibration, with its covariance."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Calibration:
         arm_errors: Posterior mean of their parameters, in declared standard deviations; shape (46,), or (52,) and
             (58,) with the play of one arm and of both; (0,) without.
         joint_covariance: Of parameters and arms' errors together, shape (p + m, p + m); ``covariance`` without.
-        small_sample: What the doubt of a noise that was found makes of the region, where arms are declared.
+        small_sample: Region with the uncertainty of an estimated noise, where arms are declared.
     """
 
     X: Floats
@@ -112,26 +112,26 @@ class Calibration:
         """How often a right declaration has residuals as large as these."""
         return float(chi2.sf(self.chi_squared_ratio * self.freedom, self.freedom))
 
-    def doubts(self) -> tuple[str, ...]:
-        """A sentence a warning, and one where the residuals are larger than the stated noise and arms let expect."""
-        said = tuple(one.sentence for one in self.findings if one.severity is Severity.WARNING)
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings, and one where the residuals exceed what the stated noise and arms lead to expect."""
+        warnings = tuple(one.sentence for one in self.findings if one.severity is Severity.WARNING)
         ratio = self.chi_squared_ratio
         if not isinstance(self.noise, Noise) or ratio <= LARGEST_RATIO:
-            return said
+            return warnings
         chance = 100.0 * self.chi_squared_chance()
         return (
-            *said,
+            *warnings,
             f"chi-squared of the residuals is {ratio:.2f} times their freedom ({self.freedom}): noise or arms are "
             f"probably declared too small, and the stated errors with them; a right one gives this in {chance:.2g} %",
         )
 
     @property
     def covariance_counts(self) -> Floats:
-        """What a region is drawn with: the covariance, with the doubt of a noise that was found in it."""
+        """Covariance of the regions, with the uncertainty of an estimated noise in it."""
         return self.covariance if self.small_sample is None else self.small_sample.covariance
 
     def corrected(self, poses: Recording) -> tuple[Floats, Floats]:
-        """Both flanges as the arms' errors that were found move them: A and B, each (n, 4, 4), mm.
+        """Both flanges moved by the estimated errors of the arms: A and B, each (n, 4, 4), mm.
 
         Args:
             poses: Nominal flanges, with joints where arms are declared.
@@ -209,7 +209,7 @@ class Calibration:
 
     @property
     def estimate(self) -> Estimate:
-        """The same values, as the solvers take them."""
+        """The values as an `Estimate` for the solvers."""
         X, Y = self.X, self.Y
         tip, V = self.tip_end2, self.needle_direction_end2
         return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], tip, self.scale, V)
@@ -252,7 +252,7 @@ def calibration_of(
     cannot_show: tuple[str, ...],
     arms: DeclaredArms | None,
 ) -> Calibration:
-    """What is known at a fit, under the noise that was found or declared; its arrays are read-only.
+    """The calibration at a fit, under the estimated or declared noise; its arrays are read-only.
 
     Args:
         problem: As it was solved.
@@ -265,7 +265,7 @@ def calibration_of(
     at_fit, estimate, kept, p = weighed(problem, fit), fit.estimate, fit.tip_kept, len(problem.active)
     freedom = 3 * int(kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction - p
     residuals, names = at_fit.residuals[:, :3], problem.recording.names
-    image, told = image_errors(problem, fit), direction_findings(names, kept & ~fit.direction_kept, seen)
+    image, directions = image_errors(problem, fit), direction_findings(names, kept & ~fit.direction_kept, seen)
     return Calibration(
         X=read_only(pose(estimate.R_X, estimate.t_X)),
         Y=read_only(pose(estimate.R_Y, estimate.t_Y)),
@@ -277,7 +277,7 @@ def calibration_of(
         weights=read_only(1.0 * kept),
         outliers=tuple(name for name, used in zip(names, kept, strict=True) if not used),
         image=image,
-        findings=told if image is None or not image.doubted else (*told, image.finding()),
+        findings=directions if image is None or not image.doubted else (*directions, image.finding()),
         iterations=fit.iterations,
         condition=observability.ratio,
         covariance=read_only(at_fit.covariance[:p, :p]),

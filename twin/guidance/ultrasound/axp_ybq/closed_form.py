@@ -1,8 +1,7 @@
-"""The unknowns of A X P = Y B Q: their names, which are free, one value of each, and how a small step changes it.
+"""The unknowns of A X P = Y B Q (names, free ones, estimate, small steps), and their linear solution as a start.
 
-The linear solution of A X P = Y B Q (spec 3, section 1): no start value needed, exact without noise.
-
-Every pose gives three rows, R_A R_X p + R_A t_X + t_A = R_Y R_B t_Q + R_Y t_B + t_Y, linear in
+The linear solution (spec 3, section 1) needs no start value and is exact without noise. Every pose gives three rows,
+R_A R_X p + R_A t_X + t_A = R_Y R_B t_Q + R_Y t_B + t_Y, linear in
 z = [x1; x2; t_X; vec(t_Q^T (x) R_Y); vec(R_Y); t_Y] (48 unknowns), or, with a known tip, in
 z = [x1; x2; t_X; vec(R_Y); t_Y] (21 unknowns). x1, x2 are the first two columns of R_X times mm per unit of P: the
 image is a plane, so that its third column is never excited and is left out.
@@ -43,14 +42,14 @@ LENGTH_MM = 100.0
 
 
 def active_columns(*, tip: bool, scale: bool, direction: bool) -> NDArray[np.int_]:
-    """Which of the 19 parameters are estimated."""
+    """Columns of the 19 parameters that are estimated."""
     wanted = np.ones(N_PARAMETERS, dtype=bool)
     wanted[T_Q], wanted[SCALE], wanted[DIRECTION] = tip, scale, direction
     return np.flatnonzero(wanted)
 
 
 def parameter_units(active: NDArray[np.int_], scale: Floats) -> Floats:
-    """How large a step of each free parameter is "one": 1 rad, 100 mm, the scale itself."""
+    """Unit of each free parameter: 1 rad, 100 mm, the scale itself."""
     units = np.ones(N_PARAMETERS)
     for part in (T_X, T_Y, T_Q):
         units[part] = LENGTH_MM
@@ -90,7 +89,7 @@ class Estimate(NamedTuple):
         )
 
     def moved_by(self, active: NDArray[np.int_], step: Floats) -> Estimate:
-        """After a step (p,) of the free parameters, in `parameter_units`."""
+        """The estimate after a step (p,) of the free parameters, in `parameter_units`."""
         full = np.zeros(N_PARAMETERS)
         full[active] = parameter_units(active, self.scale) * step
         return self.moved(full)
@@ -98,7 +97,7 @@ class Estimate(NamedTuple):
 
 def tangent_basis(direction: Floats) -> Floats:
     """Two unit vectors across a direction (3,) and each other, as columns, shape (3, 2)."""
-    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]  # farthest from parallel
     first = skew(direction) @ helper
     first /= np.linalg.norm(first)
     return np.column_stack([first, skew(direction) @ first])
@@ -120,11 +119,11 @@ def closed_form(recording: Recording, *, known_tip: Floats | None = None, scale:
         scale: Whether mm per unit of P is unknown.
     """
     A, B = recording.A, recording.B
-    p = recording.P / (np.abs(recording.P).max() if scale else LENGTH_MM)
+    p = recording.P / (np.abs(recording.P).max() if scale else LENGTH_MM)  # columns of one size
     system, t_A = _probe_columns(A, p), A[:, :3, 3] / LENGTH_MM
     if known_tip is None:
         z = _solve(np.concatenate([system, _needle_columns(B)], axis=2), t_A)
-        R_Y = nearest_rotation(z[36:45].reshape(3, 3).T)
+        R_Y = nearest_rotation(z[36:45].reshape(3, 3).T)  # column-major vec
     else:
         z = _solve(np.concatenate([system, _tip_columns(B, known_tip)], axis=2), t_A)
         R_Y = nearest_rotation(z[9:18].reshape(3, 3).T)
@@ -180,6 +179,6 @@ def _translations(
     right = B[:, :3, 3] @ R_Y.T - np.einsum("nij,nj->ni", R_A @ R_X[:, :2], recording.P * unit) - A[:, :3, 3]
     system = np.concatenate([R_A, np.tile(-np.eye(3), (n, 1, 1)), -R_YB], axis=2)
     if known_tip is not None:
-        right, system = right + R_YB @ known_tip, system[:, :, :6]
+        right, system = right + R_YB @ known_tip, system[:, :, :6]  # its columns are known
     z = _solve(system, right)
     return z[:3], z[3:6], z[6:9] if known_tip is None else np.array(known_tip, dtype=np.float64)

@@ -1,6 +1,6 @@
-"""The needle's direction V in its flange frame, from the directions seen in the image or from the image plane alone.
+"""The needle's direction V in its flange frame, and the residuals of tip and direction with their Jacobians.
 
-What every pose says of tip and direction: residuals of A X P = Y B Q and their Jacobians.
+`needle_direction` takes V from the directions seen in the image, or from the image plane alone.
 
 F = R_Y (R_B t_Q + t_B) + t_Y - R_A (R_X S p + t_X) - t_A (mm, base1), S = diag(scale).
 With R <- R exp([w]x) its derivatives by w_X, t_X, w_Y, t_Y, t_Q, scale are
@@ -57,11 +57,11 @@ BETTER = 1 / 3
 """Another reading whose median angle is below this part of the given one's is the right one."""
 
 ALONG = 0.5
-"""Cosine between the needle's axis and the way from its flange to its tip from which on that way says where the tip
+"""Cosine between the needle's axis and the direction from flange to tip from which on the latter says where the tip
 is: a straight needle on a flange has .9 and more, one that a holder turns aside by 60 deg has this."""
 
 FEW = 0.1
-"""Share of the directions that may be set aside without a warning: single ones are, in one true recording in twenty."""
+"""Fraction of the directions that may be set aside without a warning: single ones are, in one true recording of 20."""
 
 REVERSED = "v points from the tip to the hub"
 
@@ -91,7 +91,7 @@ class SeenDirection(NamedTuple):
     reversed: Bools
     """Shape (n,): the measured direction points from the tip to the hub."""
     sign_known: bool
-    """Whether the way from flange to tip says which end of the needle the tip is."""
+    """Whether the direction from flange to tip says which end of the needle the tip is."""
 
 
 def needle_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.bool_]) -> SeenDirection:
@@ -160,27 +160,27 @@ def agreed_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.
 
 def _common_axis(seen: Floats, kept: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """The axis (3,) nearest to most of the directions (n, 3), whatever their sign, and each one's angle to it (n,)."""
-    longest = np.linalg.eigh(seen[kept].T @ seen[kept])[1][:, -1]
+    longest = np.linalg.eigh(seen[kept].T @ seen[kept])[1][:, -1]  # signs do not matter to it
     middle = np.median((seen * np.where(seen @ longest < 0.0, -1.0, 1.0)[:, None])[kept], axis=0)
     axis = middle / np.linalg.norm(middle)
     return np.asarray(axis), np.arccos(np.clip(np.abs(seen @ axis), 0.0, 1.0))
 
 
 def _refuse_scattered(estimate: Estimate, recording: Recording, kept: NDArray[np.bool_], middle: float) -> None:
-    """Say that the directions have no common axis, and by which slip they would have one."""
+    """Refuse directions without a common axis, naming the slip with which they would have one."""
     assert recording.v is not None
-    said = f"the directions have no common axis in the needle's flange: they scatter by {np.degrees(middle):.0f} deg"
+    what = f"the directions have no common axis in the needle's flange: they scatter by {np.degrees(middle):.0f} deg"
     for slip, undo in SLIPS.items():
         v = np.array(recording.v)
         v[:, :2] = v[:, :2] @ undo.T
         other = float(np.median(_common_axis(directions_end2(estimate, replace(recording, v=v)), kept)[1][kept]))
         if other < min(BETTER * middle, SCATTERED_RAD):
-            said += f"; they would agree ({np.degrees(other):.1f} deg) if {slip}"
-    raise InputError(said, where="recording", allowed=ALLOWED, code="directions_scattered")
+            what += f"; they would agree ({np.degrees(other):.1f} deg) if {slip}"
+    raise InputError(what, where="recording", allowed=ALLOWED, code="directions_scattered")
 
 
 def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection) -> tuple[Finding, ...]:
-    """Which directions were set aside (n,), which of them are reversed, and whether their sign is anyone's word.
+    """Directions set aside (n,), those of them that are reversed, and whether their sign is known.
 
     Args:
         names: Of the poses.
@@ -188,13 +188,13 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
         seen: The needle's direction.
     """
     found = []
-    for code, rows, said, most in (
+    for code, rows, problem, most in (
         ("directions_reversed", seen.reversed, REVERSED, 0.0),
         ("directions_aside", aside & ~seen.reversed, "v disagrees with the other poses", FEW),
     ):
         if rows.any():
             severity = Severity.WARNING if rows.mean() > most else Severity.NOTE
-            text = f"{_counted(names, rows, said)}; these directions were set aside"
+            text = f"{_counted(names, rows, problem)}; these directions were set aside"
             found.append(Finding(code, severity, text, {"count": float(rows.sum())}))
     if not seen.sign_known:
         text = (
@@ -205,18 +205,18 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
     return tuple(found)
 
 
-def _counted(names: tuple[str, ...], rows: Bools, said: str) -> str:
+def _counted(names: tuple[str, ...], rows: Bools, problem: str) -> str:
     which = "" if rows.all() else f": {', '.join(np.array(names)[rows].tolist())}"
-    return f"{said} in {int(rows.sum())} of {len(names)} poses{which}"
+    return f"{problem} in {int(rows.sum())} of {len(names)} poses{which}"
 
 
 def direction_from_plane(estimate: Estimate, recording: Recording) -> Floats:
     """V from nothing but the fact that the needle lies in the image: z.M_i V = 0 for every pose. Its sign is not known.
 
-    Needs poses between which the needle turned about itself; otherwise V is not unique.
+    Needs poses between which the needle rotated about itself; otherwise V is not unique.
     """
     across_image = needle_in_image(estimate, recording)[:, 2, :]
-    return np.asarray(np.linalg.svd(across_image)[2][-1])
+    return np.asarray(np.linalg.svd(across_image)[2][-1])  # null vector: z.M_i V = 0
 
 
 class Linearised(NamedTuple):
@@ -271,7 +271,7 @@ def linearised_direction(estimate: Estimate, recording: Recording, v_image: Floa
     rows = across(v_image)
     R_AXY = (recording.A[:, :3, :3] @ estimate.R_X).transpose(0, 2, 1) @ estimate.R_Y
     J = np.zeros((len(recording), 2, N_PARAMETERS))
-    J[:, :, W_X] = rows @ skew(m)
+    J[:, :, W_X] = rows @ skew(m)  # dm = [m]x w_X
     J[:, :, W_Y] = -rows @ R_AXY @ skew(recording.B[:, :3, :3] @ estimate.V)
     J[:, :, DIRECTION] = rows @ M @ tangent_basis(estimate.V)
     return Linearised((rows @ m[:, :, None])[:, :, 0], J)
@@ -319,6 +319,6 @@ def across(v: Floats) -> Floats:
 
 
 def facing(estimate: Estimate, recording: Recording) -> Bools:
-    """Whether a pose's measured direction points the way of V at all, shape (n,): one turned round has no residual."""
+    """Whether a pose's measured direction points along V at all, shape (n,): a reversed one has no residual."""
     m = needle_in_image(estimate, recording) @ estimate.V
     return np.asarray(np.einsum("ni,ni->n", m, directions_image(recording, estimate)) > 0)

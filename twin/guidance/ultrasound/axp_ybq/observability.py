@@ -1,15 +1,15 @@
-"""What a set of poses cannot show (spec 3, section 3): the motions of the unknowns that hardly change any residual.
+"""Observability: motions of the unknowns that a set of poses hardly shows (spec 3, section 3), and poses to add.
 
-Columns are counted in rad and 100 mm, and base 2 turns about the middle of all tips rather than about its own origin:
+Columns are counted in rad and 100 mm, and base 2 rotates about the middle of all tips rather than about its own origin:
 wherever that origin lies, the same poses show the same. A recording is refused where the least singular value of the
-Jacobian over the largest falls below ``LEAST_RATIO``. The weak motion is then named: each of four families of motions
-has a known cause, and a family (or a line or plane of it) is weak when the Jacobian, restricted to it, is.
+Jacobian over the largest falls below ``LEAST_RATIO``. The ill-conditioned motion is then named: each of four families
+of motions has a known cause, and a family (or a line or plane of it) is ill-conditioned when the Jacobian, restricted
+to it, is.
 
-Which further poses would make a refused recording usable: what to turn, and by how much.
-
-Simple changes of one recorded pose are tried by computation: the probe turned about an axis of the image through the
-tip, the tip brought elsewhere in the image, the insertion angle changed, the needle turned about itself. Those that add
-most information where there is least are proposed, until the recording would be accepted with room to spare.
+`propose` suggests further poses: simple changes of one recorded pose are tried by computation (the probe rotated about
+an axis of the image through the tip, the tip brought elsewhere in the image, the insertion angle changed, the needle
+rotated about itself). Those that add most information where there is least are proposed, until the recording would be
+accepted with a margin.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ LEAST_RATIO = 9e-3
 45 +- 2 deg up to 8.8e-3; usual poses 3.6e-2 and more."""
 
 IN_PLANE = 0.9
-"""Fraction of a weak direction that must lie in the image (or across it) to be called so."""
+"""Fraction of an ill-conditioned direction that must lie in the image (or across it) to be called so."""
 
 NAMED_WITHIN = 1.5
-"""A family whose own ratio is up to this much larger than the limit still is the name of a weak motion."""
+"""A family whose own ratio is up to this much larger than the limit still names an ill-conditioned motion."""
 
 
-class WeakMotion(NamedTuple):
-    """One motion that the poses do not show."""
+class IllConditionedMotion(NamedTuple):
+    """One ill-conditioned motion of the unknowns."""
 
     cause: str
     """Short key, such as ``probe_orientation``, ``tip_position``, ``insertion_angle`` or ``needle_roll``."""
@@ -61,13 +61,13 @@ class WeakMotion(NamedTuple):
 
 
 class Observability(NamedTuple):
-    """How well the poses show the unknowns."""
+    """Conditioning of the unknowns by the poses."""
 
     ratio: float
     """Least over largest singular value."""
     dimensions: int
     """How many singular values are below the limit."""
-    weak: tuple[WeakMotion, ...]
+    ill_conditioned: tuple[IllConditionedMotion, ...]
     """Named; empty where the ratio is large enough."""
 
 
@@ -97,7 +97,7 @@ def tips_centre(estimate: Estimate, recording: Recording) -> Floats:
 
 
 def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Observability:
-    """Say what the poses show, and what not.
+    """The conditioning of a set of poses, with its ill-conditioned motions named.
 
     Args:
         estimate: Where the Jacobian is taken; any solution will do, also one of many.
@@ -113,19 +113,21 @@ def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
     found = [*_orientation(estimate, recording, J, active, limit), *_tip(estimate, recording, J, active, limit)]
     found += _relative(estimate, recording, J, active, limit)
     text = "the poses leave a combination of the unknowns free that has no simple name: vary everything more"
-    return Observability(ratio, int((values < limit).sum()), tuple(found) or (WeakMotion("unnamed", 1, text),))
+    return Observability(
+        ratio, int((values < limit).sum()), tuple(found) or (IllConditionedMotion("unnamed", 1, text),)
+    )
 
 
 class _Family(NamedTuple):
-    """The weak part of a three-dimensional family of motions."""
+    """The ill-conditioned part of a three-dimensional family of motions."""
 
-    weak: int
-    """How many of its three directions are weak."""
+    ill_conditioned: int
+    """How many of its three directions are ill-conditioned."""
     weakest: Floats
     """Unit vector (3,) in the family's own coordinates."""
 
 
-def _weak_part(J: Floats, active: NDArray[np.int_], motions: Floats, limit: float) -> _Family:
+def _ill_conditioned_part(J: Floats, active: NDArray[np.int_], motions: Floats, limit: float) -> _Family:
     """Restrict the Jacobian to the span of three motions (17, 3)."""
     if not set(np.flatnonzero(np.abs(motions).max(axis=1) > 0)) <= set(active.tolist()):
         return _Family(0, np.zeros(3))  # a parameter of this motion is known
@@ -138,7 +140,7 @@ def _weak_part(J: Floats, active: NDArray[np.int_], motions: Floats, limit: floa
 
 def _orientation(
     estimate: Estimate, recording: Recording, J: Floats, active: NDArray[np.int_], limit: float
-) -> list[WeakMotion]:
+) -> list[IllConditionedMotion]:
     """t_X += k, t_Y += R_A k; and t_Q += k, t_Y -= R_Y R_B k."""
     probe, needle = np.zeros((2, 17, 3))
     probe[T_X], probe[T_Y] = np.eye(3), nearest_rotation(recording.A[:, :3, :3].mean(axis=0))
@@ -148,58 +150,60 @@ def _orientation(
         ("probe", probe, "the image's place on the probe and the distance between the bases"),
         ("needle", needle, "the tip's place on the needle and the distance between the bases"),
     ):
-        weak, _ = _weak_part(J, active, family, limit)
-        if weak == 3:
-            found.append(WeakMotion(f"{arm}_orientation", 3, f"the {arm} hardly turns: {slides} can slide together"))
-        elif weak:
+        ill_conditioned, _ = _ill_conditioned_part(J, active, family, limit)
+        if ill_conditioned == 3:
+            found.append(
+                IllConditionedMotion(f"{arm}_orientation", 3, f"the {arm} hardly turns: {slides} can slide together")
+            )
+        elif ill_conditioned:
             text = f"the {arm} turns about one axis only: {slides} can slide together along it"
-            found.append(WeakMotion(f"{arm}_axis", weak, text))
+            found.append(IllConditionedMotion(f"{arm}_axis", ill_conditioned, text))
     return found
 
 
 def _tip(
     estimate: Estimate, recording: Recording, J: Floats, active: NDArray[np.int_], limit: float
-) -> list[WeakMotion]:
+) -> list[IllConditionedMotion]:
     """w_X = k with t_X so that the mean tip stays: the image turns about the tip, or about the line of all tips."""
     family = np.zeros((17, 3))
     p = np.append((recording.P * estimate.scale).mean(axis=0), 0.0) / LENGTH_MM
     family[W_X], family[T_X] = np.eye(3), estimate.R_X @ skew(p)
-    weak, _ = _weak_part(J, active, family, limit)
-    if weak == 3:
+    ill_conditioned, _ = _ill_conditioned_part(J, active, family, limit)
+    if ill_conditioned == 3:
         text = "the tip hardly moves in the image: the image can turn about it on the probe"
-        return [WeakMotion("tip_position", 3, text)]
-    if weak:
+        return [IllConditionedMotion("tip_position", 3, text)]
+    if ill_conditioned:
         text = "the tip moves along one line of the image only: the image can turn about that line on the probe"
-        return [WeakMotion("tip_line", weak, text)]
+        return [IllConditionedMotion("tip_line", ill_conditioned, text)]
     return []
 
 
 def _relative(
     estimate: Estimate, recording: Recording, J: Floats, active: NDArray[np.int_], limit: float
-) -> list[WeakMotion]:
-    """t_X += R_X a, t_Q += b with M_i b = a for every pose: what does not turn between needle and image."""
+) -> list[IllConditionedMotion]:
+    """t_X += R_X a, t_Q += b with M_i b = a for every pose: a shift that does not rotate between needle and image."""
     family = np.zeros((17, 3))
     family[T_X], family[T_Q] = estimate.R_X, nearest_rotation(needle_in_image(estimate, recording).mean(axis=0)).T
-    weak, a = _weak_part(J, active, family, limit)
-    if weak == 0:
+    ill_conditioned, a = _ill_conditioned_part(J, active, family, limit)
+    if ill_conditioned == 0:
         return []
-    if weak == 3:
+    if ill_conditioned == 3:
         text = "needle and image hardly turn against each other: image and tip can slide together in any direction"
-        return [WeakMotion("needle_in_image", 3, text)]
-    if weak == 1 and np.linalg.norm(a[:2]) >= IN_PLANE:
+        return [IllConditionedMotion("needle_in_image", 3, text)]
+    if ill_conditioned == 1 and np.linalg.norm(a[:2]) >= IN_PLANE:
         text = "the insertion angle in the image hardly varies: the tip can slide along the needle"
-        return [WeakMotion("insertion_angle", 1, text)]
-    if weak == 1 and abs(a[2]) >= IN_PLANE:
+        return [IllConditionedMotion("insertion_angle", 1, text)]
+    if ill_conditioned == 1 and abs(a[2]) >= IN_PLANE:
         text = "the needle hardly turns about itself: image and tip can slide together across the image"
-        return [WeakMotion("needle_roll", 1, text)]
+        return [IllConditionedMotion("needle_roll", 1, text)]
     text = "the needle turns against the image about one axis only: image and tip can slide together along it"
-    return [WeakMotion("needle_in_image_axis", weak, text)]
+    return [IllConditionedMotion("needle_in_image_axis", ill_conditioned, text)]
 
 
 TURN_RAD = float(np.radians(25.0))
-"""How far the probe is turned, and the insertion angle changed."""
+"""How far the probe is rotated, and the insertion angle changed."""
 ROLL_RAD = float(np.radians(90.0))
-"""How far the needle is turned about itself."""
+"""How far the needle is rotated about itself."""
 SHIFT_MM = 20.0
 """How far the tip is brought away in the image."""
 SLACK = 1.5
@@ -232,7 +236,7 @@ class PoseChange(NamedTuple):
 
 
 class SuggestedPoses(NamedTuple):
-    """Proposed poses."""
+    """Suggested poses, and the conditioning with them."""
 
     poses: tuple[PoseChange, ...]
     ratio_after: float
@@ -241,7 +245,7 @@ class SuggestedPoses(NamedTuple):
 
 
 class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
-    """The poses cannot show every unknown.
+    """Refusal: the poses cannot show every unknown.
 
     Attributes:
         motions: What can move without any residual showing it, in words and with its cause.
@@ -249,7 +253,7 @@ class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
     """
 
     def __init__(self, observability: Observability, suggestion: SuggestedPoses) -> None:
-        self.motions: tuple[WeakMotion, ...] = observability.weak
+        self.motions: tuple[IllConditionedMotion, ...] = observability.ill_conditioned
         self.ratio = observability.ratio
         self.suggestion = suggestion
         what = "; ".join(motion.text for motion in self.motions) + f" (singular value ratio {self.ratio:.1e})"
@@ -257,19 +261,19 @@ class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
 
 
 def require_observable(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Observability:
-    """How well the poses show the unknowns; the arguments are those of `observe`.
+    """The conditioning of the poses, or a refusal with suggested ones; the arguments are those of `observe`.
 
     Raises:
         Degenerate: They do not; with poses that would mend it.
     """
     found = observe(estimate, recording, active)
-    if found.weak:
+    if found.ill_conditioned:
         raise Degenerate(found, propose(estimate, recording, active))
     return found
 
 
 def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> SuggestedPoses:
-    """Poses that would cure a recording.
+    """Suggested poses that would make a recording observable.
 
     Args:
         estimate: A solution, unique or not.
@@ -278,13 +282,13 @@ def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
     """
     active = active[active < 17]
     reference = _central(recording)
-    cures = []
+    suggestions = []
     for moves in (_single_moves(), _all_moves()):
         changes = [_changed(estimate, recording, reference, move) for move in moves]
-        cures.append(_greedy(estimate, recording, active, changes))
-        if cures[-1].ratio_after >= SLACK * LEAST_RATIO:
+        suggestions.append(_greedy(estimate, recording, active, changes))
+        if suggestions[-1].ratio_after >= SLACK * LEAST_RATIO:
             break
-    return max(cures, key=lambda suggestion: suggestion.ratio_after)
+    return max(suggestions, key=lambda suggestion: suggestion.ratio_after)
 
 
 class _Move(NamedTuple):
@@ -303,21 +307,21 @@ def _shifts() -> list[tuple[float, float]]:
 
 
 def _single_moves() -> list[_Move]:
-    """One thing changed at a time."""
+    """Moves that change one thing at a time."""
     moves = [_Move(turn=turn) for turn in _turns()] + [_Move(shift=shift) for shift in _shifts()]
     moves += [_Move(insertion=sign * TURN_RAD) for sign in (1, -1)]
     return moves + [_Move(roll=sign * ROLL_RAD) for sign in (1, -1)]
 
 
 def _all_moves() -> list[_Move]:
-    """Everything with everything."""
+    """Moves that combine every change with every other."""
     none = (0.0, 0.0, 0.0)
     angles, rolls = (0.0, TURN_RAD, -TURN_RAD), (0.0, ROLL_RAD, -ROLL_RAD)
     return [_Move(*row) for row in product([none, *_turns()], [(0.0, 0.0), *_shifts()], angles, rolls)]
 
 
 def _central(recording: Recording) -> int:
-    """The pose whose tip lies nearest to the middle of all, among those whose probe is turned about as usual."""
+    """The pose whose tip lies nearest to the middle of all, among those whose probe is rotated about as usual."""
     turns = log_rotation(recording.A[0, :3, :3].T @ recording.A[:, :3, :3])
     sides = [recording.P - np.median(recording.P, axis=0), (turns - np.median(turns, axis=0)) * 100.0]
     return int(np.argmin(np.linalg.norm(np.column_stack(sides), axis=1)))
@@ -373,20 +377,20 @@ def _ratio(H: Floats) -> float:
 
 def _text(poses: tuple[PoseChange, ...]) -> str:
     counted = Counter(_one(pose) for pose in poses)
-    said = [f"{text} ({count} poses)" if count > 1 else text for text, count in counted.items()]
-    return f"add {len(poses)} poses, each from pose {poses[0].reference}: " + "; ".join(said)
+    changes = [f"{text} ({count} poses)" if count > 1 else text for text, count in counted.items()]
+    return f"add {len(poses)} poses, each from pose {poses[0].reference}: " + "; ".join(changes)
 
 
 def _one(pose: PoseChange) -> str:
-    said = []
+    changes = []
     for axis, angle in zip(IMAGE_AXES, pose.probe_turn_image, strict=True):
         if angle:
-            said.append(f"turn the probe by {np.degrees(angle):+.0f} deg about the {axis} through the tip")
+            changes.append(f"turn the probe by {np.degrees(angle):+.0f} deg about the {axis} through the tip")
     if pose.tip_shift_mm.any():
         u, v = pose.tip_shift_mm
-        said.append(f"bring the tip to another place of the image, u {u:+.0f} mm, v {v:+.0f} mm")
+        changes.append(f"bring the tip to another place of the image, u {u:+.0f} mm, v {v:+.0f} mm")
     if pose.insertion_change:
-        said.append(f"change the insertion angle in the image by {np.degrees(pose.insertion_change):+.0f} deg")
+        changes.append(f"change the insertion angle in the image by {np.degrees(pose.insertion_change):+.0f} deg")
     if pose.needle_roll:
-        said.append(f"turn the needle about itself by {np.degrees(pose.needle_roll):+.0f} deg")
-    return " and ".join(said)
+        changes.append(f"turn the needle about itself by {np.degrees(pose.needle_roll):+.0f} deg")
+    return " and ".join(changes)

@@ -25,81 +25,26 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit, refine, weighed
 
-FALSE_ALARMS = 0.01
-"""Chance that a recording without outliers loses a pose."""
 
-ROUNDING = 1e-6
-"""Mm, and rad: residuals of this size are rounding, and none of them stands out."""
-
-
-class Block(NamedTuple):
-    """One kind of residual."""
-
-    rows: slice
-    median: float
-    limit: float
-    """Of the squared studentised residual, for a recording of this size."""
-    least: float
-    """Variance over the expected one below which it is not believed: told noise is there; less than rounding is not."""
+def plain_fit(problem: Problem, start: Estimate) -> RobustFit:
+    """Least squares over all poses."""
+    ones = np.ones(len(problem.recording))
+    fit = refine(problem, start, ones, ones)
+    return RobustFit(fit.estimate, ones > 0, ones > 0, fit.iterations)
 
 
-def blocks(problem: Problem) -> list[Block]:
-    """The tip's three residuals, and the direction's one inside the image: across it little is claimed."""
-    quantile, noise = 1 - FALSE_ALARMS / len(problem.recording), problem.noise
-    least = least_turn = 1.0
-    if isinstance(noise, Spread):
-        least, least_turn = (ROUNDING / noise.inside_mm) ** 2, (ROUNDING / noise.direction_rad) ** 2
-    found = [Block(slice(0, 3), _chi_squared(0.5, 3), _chi_squared(quantile, 3), least)]
-    if problem.with_direction:
-        found.append(Block(slice(3, 4), _chi_squared(0.5, 1), _chi_squared(quantile, 1), least_turn))
-    return found
+def robust_fit(problem: Problem, start: Estimate) -> RobustFit:
+    """Least squares over the poses that agree.
 
-
-def _chi_squared(level: float, freedom: int) -> float:
-    """Quantile of the chi-squared distribution (scipy.stats takes a hundred times as long)."""
-    return float(2 * gammaincinv(freedom / 2, level))
-
-
-def scale(squared: Floats, block: Block, fraction: float = 1.0) -> float:
-    """Variance over the expected one, from the median."""
-    return max(fraction * float(np.median(squared)) / block.median, block.least)
-
-
-def squared_size(r: Floats, S: Floats) -> Floats:
-    """r^T S^-1 r of each pose, shape (n,), of residuals (n, k) whose covariance is S (n, k, k)."""
-    return np.asarray(np.einsum("ni,ni->n", r, np.linalg.solve(S, r[:, :, None])[:, :, 0]))
-
-
-def lifted(S: Floats, own: Floats) -> Floats:
-    """S with what rounding and a pose of nearly full leverage leave of it lifted to a thousandth of its own noise."""
-    least = 1e-3 * np.trace(own, axis1=1, axis2=2)[:, None, None] / own.shape[1] * np.eye(own.shape[1])
-    return np.asarray(S + least)
-
-
-ALARM_FRACTION = 0.6
-"""Fraction of the spread that is believed while outliers may be in it: a false alarm costs time, not accuracy."""
-
-
-def agreeing(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bools, Bools]:
-    """Which tips and which directions agree with the fit, given how far each one pulled it.
-
-    Args:
-        problem: What was fitted.
-        fit: The fit.
-        alarm: Only ask whether a closer look is due, after a fit of all poses, whose outliers widen the spread.
+    Raises:
+        InputError: More than half of the poses disagree.
     """
-    at_fit = weighed(problem, fit)
-    r, J, sigma, C = at_fit.residuals, at_fit.jacobian, at_fit.sigma, at_fit.covariance
-    pulled = J @ C @ J.transpose(0, 2, 1)
-    kept = []
-    for block, used in zip(blocks(problem), (fit.tip_kept, fit.direction_kept), strict=False):
-        own = sigma[:, block.rows, block.rows]
-        sign = np.where(used, -1.0, 1.0)[:, None, None]
-        S = own + sign * pulled[:, block.rows, block.rows]
-        size = squared_size(r[:, block.rows], lifted(S, own))
-        believed = scale(size[used], block, ALARM_FRACTION if alarm else 1.0)
-        kept.append(size <= block.limit * believed)
-    return kept[0], kept[1] & facing(fit.estimate, problem.recording) if problem.with_direction else fit.direction_kept
+    fit = plain_fit(problem, start)
+    if isinstance(problem.noise, Spread):
+        problem = problem._replace(noise=median_spread(problem, fit.estimate))
+    if all(part.all() for part in agreeing(problem, fit, alarm=True)):
+        return fit
+    return settled(problem, reweighted(problem, fit))
 
 
 LOOKS = 5
@@ -110,7 +55,7 @@ LEAST_KEPT = 0.5
 
 
 def settled(problem: Problem, fit: RobustFit, *, recheck: bool = True) -> RobustFit:
-    """Fit the poses that were kept, check all poses against it, and so on until none changes sides.
+    """Fit the poses that are used, check all poses against the fit, and repeat until none changes sides.
 
     Args:
         problem: It may have grown since the fit (directions, another spread).
@@ -150,27 +95,6 @@ STILL_USED = 0.05
 """Tukey's weight from which on a pose counts as one that agrees."""
 
 
-def plain_fit(problem: Problem, start: Estimate) -> RobustFit:
-    """Least squares over all poses."""
-    ones = np.ones(len(problem.recording))
-    fit = refine(problem, start, ones, ones)
-    return RobustFit(fit.estimate, ones > 0, ones > 0, fit.iterations)
-
-
-def robust_fit(problem: Problem, start: Estimate) -> RobustFit:
-    """Least squares over the poses that agree.
-
-    Raises:
-        InputError: More than half of the poses disagree.
-    """
-    fit = plain_fit(problem, start)
-    if isinstance(problem.noise, Spread):
-        problem = problem._replace(noise=median_spread(problem, fit.estimate))
-    if all(part.all() for part in agreeing(problem, fit, alarm=True)):
-        return fit
-    return settled(problem, reweighted(problem, fit))
-
-
 def reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
     """Huber, then Tukey; every pose still counts as used, with a weight below 1."""
     estimate, weights = fit.estimate, [np.ones(len(problem.recording))] * 2
@@ -192,3 +116,79 @@ def _spread_of_one(model: LinearModel) -> Floats:
     if model.shared is None:
         return model.sigma
     return np.asarray(model.sigma + model.shared @ model.shared.transpose(0, 2, 1))
+
+
+FALSE_ALARMS = 0.01
+"""Chance that a recording without outliers loses a pose."""
+
+ROUNDING = 1e-6
+"""Mm, and rad: residuals of this size are rounding, and none of them stands out."""
+
+ALARM_FRACTION = 0.6
+"""Fraction of the spread that is believed while outliers may be in it: a false alarm costs time, not accuracy."""
+
+
+def agreeing(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[Bools, Bools]:
+    """Tips and directions that agree with the fit, given how far each one pulled it.
+
+    Args:
+        problem: What was fitted.
+        fit: The fit.
+        alarm: Only ask whether a closer look is due, after a fit of all poses, whose outliers widen the spread.
+    """
+    at_fit = weighed(problem, fit)
+    r, J, sigma, C = at_fit.residuals, at_fit.jacobian, at_fit.sigma, at_fit.covariance
+    pulled = J @ C @ J.transpose(0, 2, 1)
+    kept = []
+    for block, used in zip(blocks(problem), (fit.tip_kept, fit.direction_kept), strict=False):
+        own = sigma[:, block.rows, block.rows]
+        sign = np.where(used, -1.0, 1.0)[:, None, None]
+        S = own + sign * pulled[:, block.rows, block.rows]
+        size = squared_size(r[:, block.rows], lifted(S, own))
+        believed = scale(size[used], block, ALARM_FRACTION if alarm else 1.0)
+        kept.append(size <= block.limit * believed)
+    return kept[0], kept[1] & facing(fit.estimate, problem.recording) if problem.with_direction else fit.direction_kept
+
+
+class Block(NamedTuple):
+    """One kind of residual."""
+
+    rows: slice
+    median: float
+    limit: float
+    """Limit of the squared studentised residual, for a recording of this size."""
+    least: float
+    """Variance over the expected one, at least: stated noise is present; less than rounding is not."""
+
+
+def blocks(problem: Problem) -> list[Block]:
+    """The tip's three residuals, and the direction's one inside the image: across it little is claimed."""
+    quantile, noise = 1 - FALSE_ALARMS / len(problem.recording), problem.noise
+    least = least_turn = 1.0
+    if isinstance(noise, Spread):
+        least, least_turn = (ROUNDING / noise.inside_mm) ** 2, (ROUNDING / noise.direction_rad) ** 2
+    found = [Block(slice(0, 3), _chi_squared(0.5, 3), _chi_squared(quantile, 3), least)]
+    if problem.with_direction:
+        found.append(Block(slice(3, 4), _chi_squared(0.5, 1), _chi_squared(quantile, 1), least_turn))
+    return found
+
+
+def _chi_squared(level: float, freedom: int) -> float:
+    """Quantile of the chi-squared distribution (scipy.stats takes a hundred times as long)."""
+    return float(2 * gammaincinv(freedom / 2, level))
+
+
+def scale(squared: Floats, block: Block, fraction: float = 1.0) -> float:
+    """Variance over the expected one, from the median of the squared sizes."""
+    return max(fraction * float(np.median(squared)) / block.median, block.least)
+
+
+def squared_size(r: Floats, S: Floats) -> Floats:
+    """r^T S^-1 r of each pose, shape (n,), of residuals (n, k) whose covariance is S (n, k, k)."""
+    return np.asarray(np.einsum("ni,ni->n", r, np.linalg.solve(S, r[:, :, None])[:, :, 0]))
+
+
+def lifted(S: Floats, own: Floats) -> Floats:
+    """S with what rounding and a pose of nearly full leverage leave of it lifted to a thousandth of its own noise."""
+    least = 1e-3 * np.trace(own, axis1=1, axis2=2)[:, None, None] / own.shape[1] * np.eye(own.shape[1])
+    return np.asarray(S + least)

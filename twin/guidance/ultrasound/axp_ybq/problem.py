@@ -1,6 +1,6 @@
-"""What is estimated from what, and what is expected of the residuals: their covariance, pose by pose and in common.
+"""The least-squares problem of a calibration: unknowns, data, the residuals' covariance by pose and in common.
 
-The residuals themselves, and the letters, are in `residuals`.
+The residuals themselves, and the letters, are in `direction`.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ LEAST_MM = 1e-9
 
 
 class Spread(NamedTuple):
-    """The same spread for every pose; with equal parts inside and across the image this is unweighted least squares."""
+    """One spread for every pose; with equal parts inside and across the image this is unweighted least squares."""
 
     inside_mm: float
-    """Of the tip's residual along each axis of the image."""
+    """Deviation of the tip's residual along each axis of the image."""
     across_mm: float
-    """Of the tip's residual across the image, where the image itself measures nothing."""
+    """Deviation of the tip's residual across the image, where the image itself measures nothing."""
     direction_rad: float
-    """Of the direction's residual inside the image."""
+    """Deviation of the direction's residual inside the image."""
 
 
 UNWEIGHTED = Spread(1.0, 1.0, 1.0)
@@ -50,7 +50,7 @@ UNWEIGHTED = Spread(1.0, 1.0, 1.0)
 
 
 class Problem(NamedTuple):
-    """What is to be estimated, from what."""
+    """A least-squares problem: a recording, its free unknowns, and its declared errors."""
 
     recording: Recording
     noise: Noise | Spread
@@ -74,7 +74,7 @@ def residual_weights(problem: Problem, tip_weights: Weights, direction_weights: 
 
 
 class LinearModel(NamedTuple):
-    """A problem at an estimate: residuals, derivatives, and what is expected of the residuals."""
+    """A problem at an estimate: residuals, derivatives, and expected covariance."""
 
     residuals: Floats
     """Shape (n, k), k = 3, or 5 with directions."""
@@ -87,7 +87,7 @@ class LinearModel(NamedTuple):
 
 
 def linear_model(problem: Problem, estimate: Estimate) -> LinearModel:
-    """Everything that a fit or a test of it needs to know of a problem at one estimate."""
+    """The linearised problem at one estimate, for a fit or a test of it."""
     sigma, shared = _pose_covariances(problem, estimate), _shared_slopes(problem, estimate)
     r, J = linearise(problem, estimate)
     return LinearModel(r, J, sigma, shared)

@@ -1,7 +1,7 @@
-"""What both arms and the image said, pose by pose: the input of the self-calibration.
+"""A recording of both arms and the image, pose by pose: the input of the self-calibration.
 
-Frames: ``base1`` and ``end1`` of the arm that holds the probe, ``image`` (mm, the slice is z = 0), ``base2`` and
-``end2`` of the arm that holds the needle.
+Frames: ``base1`` and ``end1`` of the arm with the probe, ``image`` (mm, the slice is z = 0), ``base2`` and
+``end2`` of the arm with the needle.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOL
 from puncture_twin.planning.formats.points import joint_readings
 
 OPTIONAL = ("v", "shaft_mm", "q_probe", "q_needle", "turn_probe", "turn_needle")
-"""What a recording may hold beside both flanges and the tip: arrays with one row per pose."""
+"""Optional arrays of a recording besides both flanges and the tip, with one row per pose."""
 
 SHAFT_POWER = 1.5
 """A line's angle errs with the power -3/2 of its length: the variance of a least squares slope through n evenly spaced
-points is 12 sigma^2 / (n length^2), n as the length. Detected in pictures: .17 deg at 10 mm, .11 at 15, .03 at 32."""
+points is 12 sigma^2 / (n length^2), n as the length. Detected in images: .17 deg at 10 mm, .11 at 15, .03 at 32."""
 
 LEAST_SHAFT_MM = 1.0
 """Nothing shorter shows a direction."""
 
 LEAST_IN_PLANE = 0.5
-"""Least share of a needle direction that must lie in the image: a needle that leans more does not show as a line."""
+"""Least fraction of a needle direction that must lie in the image: a needle that leans more does not show as a line."""
 
 
 class Noise(NamedTuple):
-    """Standard deviations per axis of what a recording holds, normal errors."""
+    """Standard deviations per axis of a recording's data, normal errors."""
 
     robot_mm: float
     """Position of each flange."""
@@ -62,10 +62,10 @@ class Recording:
         q_probe: Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; None where they were not
             recorded. Without them errors of the arms cannot be identified from noise.
         q_needle: Joints of the needle's arm, shape (n, 6), rad; given if and only if the probe's are.
-        turn_probe: Which way each joint of the probe's arm last turned before it stopped, shape (n, 6): 1, -1, or 0
+        turn_probe: Direction of each probe joint's last rotation before it stopped, shape (n, 6): 1, -1, or 0
             where nobody knows. None where it was not recorded: the play's sign is then unknown.
-        turn_needle: The same of the needle's arm; both only beside joints.
-        shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known. Only beside
+        turn_needle: The same of the needle's arm; both only with joints.
+        shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known. Only with
             directions; None where it was not measured: all directions then count the same.
 
     Raises:
@@ -131,7 +131,7 @@ class Recording:
         return len(self.names)
 
     def subset(self, rows: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Recording:
-        """The same recording with these poses only."""
+        """The recording with these poses only."""
         names = tuple(np.array(self.names)[rows].tolist())
         parts: dict[str, Any] = {
             key: None if getattr(self, key) is None else getattr(self, key)[rows] for key in OPTIONAL
@@ -139,7 +139,7 @@ class Recording:
         return Recording(self.A[rows], self.B[rows], self.P[rows], names=names, pixels=self.pixels, **parts)
 
     def joined(self, other: Recording) -> Recording:
-        """Both, one after the other, numbered anew.
+        """Two recordings, one after the other, numbered anew.
 
         Raises:
             InputError: One has directions or pixels and the other has not.

@@ -1,4 +1,4 @@
-"""Weighted least squares (Gauss-Newton on the rotations' tangent space), and what is known where it ended.
+"""Weighted least squares (Gauss-Newton on the rotations' tangent space), and the test for errors of the image.
 
 Each pose's own noise Omega_i is whitened alone. Errors that all poses share (N per standard deviation of each) couple
 the poses: the residuals' covariance is C = Omega + N N^T, and with S = Omega^-1/2 N
@@ -6,13 +6,6 @@ the poses: the residuals' covariance is C = Omega + N N^T, and with S = Omega^-1
     C^-1/2 = (I + S S^T)^-1/2 Omega^-1/2,   (I + S S^T)^-1/2 = I - S V diag(1 / (s (s + 1))) V^T S^T,   s^2 = 1 + d^2,
 
 where S^T S = V diag(d^2) V^T. The same estimate comes from taking the shared errors as unknowns with a prior.
-
-What the image may do to tip and direction that a calibration does not ask for: is it there, and what does it cost?
-
-A tip that is read as p lies at S p, S = [[1 + a, k], [0, 1 + b]]: mm per unit of P that are off, and axes that are not
-square. A direction read as v points along S v, turned by w. The residuals' derivatives by (a, b, k, w) stand beside the
-Jacobian, and the F-test of all of them together says whether residuals that are only noise would be so well explained:
-once in a hundred recordings. The calibration does not use them; what they leave at the tips counts in its error.
 """
 
 from __future__ import annotations
@@ -47,7 +40,7 @@ def whitener(sigma: Floats, weights: Floats) -> Floats:
         sigma: Shape (n, k, k).
         weights: Shape (n, k): one per residual; 0 sets it aside.
     """
-    spread = 1.0 / np.sqrt(np.maximum(weights, LEAST_WEIGHT))
+    spread = 1.0 / np.sqrt(np.maximum(weights, LEAST_WEIGHT))  # a weight divides the variance
     scaled = sigma * spread[:, :, None] * spread[:, None, :]
     return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)))
 
@@ -56,7 +49,7 @@ class Whitening(NamedTuple):
     """C^-1/2, applied to residuals and slopes."""
 
     own: Floats
-    """Of each pose alone, shape (n, k, k)."""
+    """Whitener of each pose alone, shape (n, k, k)."""
     shared: Floats | None
     """S, shape (n k, m); None where nothing is shared."""
     inner: Floats
@@ -76,15 +69,15 @@ class Whitening(NamedTuple):
             return cls(own, None, np.zeros((0, 0)))
         shared = (own @ slopes).reshape(-1, slopes.shape[2])
         squared, V = np.linalg.eigh(shared.T @ shared)
-        s = np.sqrt(1.0 + np.maximum(squared, 0.0))
+        s = np.sqrt(1.0 + np.maximum(squared, 0.0))  # s^2 = 1 + d^2
         return cls(own, shared, (V / (s * (s + 1.0))) @ V.T)
 
     def residuals(self, r: Floats) -> Floats:
-        """Of residuals (n, k): shape (n k,)."""
+        """Whitened residuals (n, k), shape (n k,)."""
         return self._coupled((self.own @ r[:, :, None]).reshape(-1))
 
     def slopes(self, J: Floats) -> Floats:
-        """Of slopes (n, k, p): shape (n k, p)."""
+        """Whitened slopes (n, k, p), shape (n k, p)."""
         return self._coupled((self.own @ J).reshape(-1, J.shape[2]))
 
     def _coupled(self, x: Floats) -> Floats:
@@ -94,7 +87,7 @@ class Whitening(NamedTuple):
 
 
 class RobustFit(NamedTuple):
-    """A fit, and which poses made it."""
+    """A fit, and the poses that it used."""
 
     estimate: Estimate
     tip_kept: Bools
@@ -116,11 +109,11 @@ class Fitted(NamedTuple):
     white: Floats
     """The residuals of the poses that were used, over their spread, shape (n, k)."""
     covariance: Floats
-    """Of the free parameters and the shared errors together, shape (p + m, p + m)."""
+    """Covariance of the free parameters and the shared errors together, shape (p + m, p + m)."""
     shared: Floats
     """The shared errors' posterior mean, in standard deviations, shape (m,)."""
     whitener: Floats
-    """Of each pose's own noise, shape (n, k, k)."""
+    """Whitener of each pose's own noise, shape (n, k, k)."""
 
     @property
     def chi_squared(self) -> float:
@@ -154,7 +147,7 @@ SMALL_STEP = 1e-7
 
 
 class Refined(NamedTuple):
-    """Where the refinement ended."""
+    """Result of the refinement."""
 
     estimate: Estimate
     iterations: int
@@ -198,44 +191,51 @@ def refine(
 DOUBTED = 0.01
 """A recording without such errors is said to have them once in a hundred."""
 CLEAR = 3.0
-"""An error so many standard deviations from zero is named beside the largest one."""
+"""An error so many standard deviations from zero is named with the largest one."""
 
 TEXT = ("mm per unit of P along u: {:.3f} times", "along v: {:.3f} times", "skew {:+.2f} deg", "v turned {:+.2f} deg")
 
 
 class ImageErrors(NamedTuple):
-    """The errors of the image that the residuals show."""
+    """The errors of the image that the residuals show.
+
+    A tip that is read as p lies at S p, S = [[1 + a, k], [0, 1 + b]]: mm per unit of P that are off, axes not square.
+    A direction read as v points along S v, rotated by w. The residuals' derivatives by (a, b, k, w) join the Jacobian,
+    and the F-test of all of them together says whether residuals that are only noise would be so well explained: once
+    in a hundred recordings. The calibration does not use them; what they leave at the tips
+    counts in its error.
+    """
 
     names: tuple[str, ...]
-    """Of those that were tested: ``scale_u``, ``scale_v``, ``skew``, ``turn``."""
+    """Names of those that were tested: ``scale_u``, ``scale_v``, ``skew``, ``turn``."""
     found: Floats
     """Shape (k,): a, b, k (per mm) and w (rad)."""
     sd: Floats
     probability: float
-    """Of residuals so well explained where there are none: F(k, freedom)."""
+    """Chance of residuals so well explained where there are none: F(k, freedom)."""
     rms_mm: float
     """What they leave at the recorded tips, whatever the calibration does to make up for them."""
 
     @property
     def doubted(self) -> bool:
-        """Whether the image is said to err."""
+        """Whether the test finds errors of the image."""
         return self.probability < DOUBTED
 
     def finding(self) -> Finding:
-        """Which errors, how large, how sure, and what they cost."""
+        """One sentence: which errors, how large, how sure, and their effect at the tips."""
         size = np.abs(self.found / self.sd)
         shown = [
             TEXT[NAMES.index(name)].format(1 + value if name in NAMES[:2] else np.degrees(value))
             for name, value, over in zip(self.names, self.found, size, strict=True)
             if over >= min(CLEAR, size.max())
         ]
-        said = (
+        text = (
             f"the residuals are not noise alone: they fit better with {', '.join(shown)} (F test of "
             f"{len(self.names)} errors of the image, p {self.probability:.2g}), which leaves {self.rms_mm:.2f} mm "
             "(rms) at the tips; the calibration does not use this: P_u_px, P_v_px as headers let it find mm per pixel"
         )
         numbers = dict(zip(self.names, self.found.tolist(), strict=True))
-        return Finding("image_errs", Severity.WARNING, said, {**numbers, "p": self.probability, "rms_mm": self.rms_mm})
+        return Finding("image_errs", Severity.WARNING, text, {**numbers, "p": self.probability, "rms_mm": self.rms_mm})
 
 
 NAMES = ("scale_u", "scale_v", "skew", "turn")

@@ -1,1 +1,1 @@
-"""B-mode pictures: speckle and needle as a probe shows them, and the needle detected in them."""
+"""B-mode images: speckle and needle as a probe shows them, and the needle detected in them."""

@@ -1,4 +1,4 @@
-"""The needle in a B-mode picture: its tip, its direction, and whether to believe either.
+"""Needle detection in a B-mode image: its tip, its direction, and whether to believe either.
 
 Every line of a grid of angles and offsets is sampled (a Radon transform that may begin and end anywhere); along it the
 segment with the largest sum is found in one pass (Kadane's maximum subarray, Bentley, Commun. ACM 27, 1984). What a
@@ -11,7 +11,7 @@ stays small where there is no needle.
 4. The tip: where the amplitude along the line falls half way from the shaft's level to the background's, for good.
 
 The needle goes down into the body, so the deeper end is the tip. What shows is where the needle leaves the *slice*: of
-a needle that is tilted against the image plane the end that shows need not be the tip, and no picture alone can tell.
+a needle that is tilted against the image plane the end that shows need not be the tip, and no image alone can tell.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager
 
 
 class Segment(NamedTuple):
-    """A straight segment, in pixels of the picture that was searched."""
+    """A straight segment, in pixels of the image that was searched."""
 
     start: Floats
     """(column, row) of the shallower end."""
@@ -80,10 +80,10 @@ def _search(field, inclinations):  # type: ignore[no-untyped-def]
 
 
 MEAN_OVER_MEDIAN = float(np.sqrt(np.pi / 2.0) / np.sqrt(2.0 * np.log(2.0)))
-"""Of a Rayleigh amplitude."""
+"""Mean over median of a Rayleigh amplitude."""
 
 COARSE = 2
-"""The background is taken, and the segment searched, in a picture this many times smaller."""
+"""The background is taken, and the segment searched, in an image this many times smaller."""
 
 ANGLE_STEP = float(np.radians(1.5))
 """Between the directions that are tried: 0.3 mm at the end of 20 mm, well inside the ridge."""
@@ -99,7 +99,7 @@ EXPECTED = 0.4
 """What a sample must exceed the background by to lengthen a segment."""
 
 STEP_MM = 0.1
-"""Of the samples along and across the line."""
+"""Step of the samples along and across the line."""
 
 ACROSS_MM = 2.0
 """How far across the line the ridge is looked for."""
@@ -108,13 +108,13 @@ WINDOWS_MM = (0.8, 0.5, 0.4, 0.4)
 """Standard deviations of the window about the line, one per iteration; the first holds the search's own error."""
 
 SHAFT_MM = 8.0
-"""Of shaft before the tip whose median is its level."""
+"""Length of shaft before the tip whose median is its level."""
 
 NEAR_TIP_MM = 1.0
-"""Of shaft that is left out of its level: the tip is brighter."""
+"""Length of shaft that is left out of its level: the tip is brighter."""
 
 TIP_ROUNDS = 3
-"""Of shaft's level and shaft's end in turn."""
+"""Rounds of the shaft's level and end in turn."""
 
 SEEK_MM = 3.0
 """How far from the shaft's coarse end the tip is looked for."""
@@ -126,11 +126,11 @@ RIDGE_MM = 0.8
 """Width of the ridge that a profile along the line averages."""
 
 SHAFT_PERCENTILE = 70.0
-"""Of the profile along a segment: the shaft's level, though a part of the segment may be no shaft."""
+"""Percentile of the profile along a segment: the shaft's level, though a part of the segment may be no shaft."""
 
 
 class Missed(StrEnum):
-    """Why there is no detection."""
+    """Reason why there is no detection."""
 
     NO_NEEDLE = "no line stands out from the speckle"
     TOO_SHORT = "too little of the needle shows"
@@ -140,12 +140,12 @@ class Missed(StrEnum):
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """What is believed, and the correction of the tip.
+    """Thresholds of the detection, and the correction of the tip.
 
     Attributes:
         least_score_mm: Sum along the segment, amplitude over background times mm, that makes a needle.
         least_length_mm: Of the segment.
-        edge_mm: The tip is no nearer to the picture's sides.
+        edge_mm: The tip is no nearer to the image's sides.
         least_step: Fall of the amplitude at the tip, over background, that makes an end.
         sure_step: Below it, the end is believed only where the search's own end agrees.
         tip_bias: How far the detected tip lies beyond the true one along the shaft, on average, over the standard
@@ -164,7 +164,7 @@ class DetectorSettings:
 
 
 class Detection(NamedTuple):
-    """A needle."""
+    """A detected needle."""
 
     tip_image: Floats
     """Shape (2,), mm: (u, v), corrected for the bias."""
@@ -175,25 +175,25 @@ class Detection(NamedTuple):
     contrast_db: float
     """Amplitude of the last piece of shaft over the background."""
     shaft_mm: float
-    """Of shaft that shows: the more, the better its direction is known."""
+    """Length of shaft that shows: the more, the better its direction is known."""
 
 
-def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
-    """Find the needle, or say why not.
+def detect(image: Pixels, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
+    """Detect the needle, or return why not.
 
     Args:
-        picture: Grey levels, shape (rows, columns).
+        image: Grey levels, shape (rows, columns).
         imager: Pixel, display range and point spread of the machine.
         settings: What is believed.
 
     Raises:
-        InputError: A picture of another size than the imager's.
+        InputError: An image of another size than the imager's.
     """
     settings = settings or DetectorSettings()
-    if picture.shape != (imager.rows, imager.columns):
+    if image.shape != (imager.rows, imager.columns):
         size = f"({imager.rows}, {imager.columns})"
-        raise InputError(f"picture of shape {picture.shape}", where="needle detector", allowed=f"{size}, the imager's")
-    relative = over_background(picture, imager)
+        raise InputError(f"picture of shape {image.shape}", where="needle detector", allowed=f"{size}, the imager's")
+    relative = over_background(image, imager)
     segment = _segment(relative, imager, settings)
     length = float(np.linalg.norm(segment.end - segment.start))
     if segment.score < settings.least_score_mm:
@@ -214,13 +214,13 @@ def detect(picture: Pixels, imager: Imager, settings: DetectorSettings | None = 
     return Detection(found, line.direction, segment.score, contrast, -line.start)
 
 
-def over_background(picture: Pixels, imager: Imager) -> Floats:
+def over_background(image: Pixels, imager: Imager) -> Floats:
     """Amplitude over the mean amplitude of the background around, shape (rows, columns)."""
     size = int(BACKGROUND_MM / imager.pixel_mm) // COARSE | 1
-    coarse = np.ascontiguousarray(picture[::COARSE, ::COARSE])
+    coarse = np.ascontiguousarray(image[::COARSE, ::COARSE])
     median = cv2.medianBlur(coarse, size).astype(np.float64)
-    grey = cv2.resize(cv2.GaussianBlur(median, (0, 0), size / 8.0), picture.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.asarray(imager.amplitude(picture) / (MEAN_OVER_MEDIAN * imager.amplitude(grey)))
+    grey = cv2.resize(cv2.GaussianBlur(median, (0, 0), size / 8.0), image.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(imager.amplitude(image) / (MEAN_OVER_MEDIAN * imager.amplitude(grey)))
 
 
 def _segment(relative: Floats, imager: Imager, settings: DetectorSettings) -> Segment:
@@ -235,7 +235,7 @@ def _segment(relative: Floats, imager: Imager, settings: DetectorSettings) -> Se
 
 
 class _Line(NamedTuple):
-    """A line in the picture, mm: s = 0 at its point, growing toward the tip."""
+    """A line in the image, mm: s = 0 at its point, growing toward the tip."""
 
     point: Floats
     direction: Floats
@@ -244,14 +244,14 @@ class _Line(NamedTuple):
 
 
 class _Tip(NamedTuple):
-    """Where the shaft ends on its line, and by how much the amplitude falls there."""
+    """End of the shaft on its line, and how much the amplitude falls there."""
 
     s: float
     step: float
 
 
 def _samples(relative: Floats, imager: Imager, line: _Line, s: Floats, t: Floats) -> Floats:
-    """Amplitude at s along and t across the line, shape (len(s), len(t)); 1 outside the picture."""
+    """Amplitude at s along and t across the line, shape (len(s), len(t)); 1 outside the image."""
     across = np.array([-line.direction[1], line.direction[0]])
     at = line.point + s[:, None, None] * line.direction + t[None, :, None] * across
     maps = (at / imager.pixel_mm).astype(np.float32)
@@ -291,7 +291,7 @@ def _profile(relative: Floats, imager: Imager, line: _Line, s: Floats) -> Floats
 
 
 def _shaft_only(relative: Floats, imager: Imager, line: _Line) -> _Line:
-    """The same line, cut to where it is brighter than half way between background and shaft.
+    """The line cut to where it is brighter than half way between background and shaft.
 
     The search lengthens a segment through any speckle that is a little bright; the shaft's own level tells better.
     """

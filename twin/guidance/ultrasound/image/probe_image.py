@@ -1,15 +1,13 @@
-"""Speckle: what a pulse makes of many small scatterers, and how the pulse spreads with depth.
+"""B-mode images of a needle in a speckle phantom, from the ground truth of needle and image plane.
+
+The frame ``image``: its origin is the middle of the upper left pixel, x (u) runs along the probe's face to the right,
+y (v) into the depth, z out of the plane; mm. A needle off the plane fades as the slice's Gaussian profile (spec 3,
+section 5). One image's speckle is independent of the next one's: two poses of a calibration show different cells.
 
 A beam-formed image before its envelope is taken is the tissue's reflectivity, blurred by the point spread. Many
 scatterers in one resolution cell add up to a complex Gaussian (Goodman, "Some fundamental properties of speckle",
 J. Opt. Soc. Am. 66, 1976), so its envelope is Rayleigh: mean over standard deviation sqrt(pi / (4 - pi)) = 1.913
 (Burckhardt, "Speckle in ultrasound B-mode scans", IEEE Trans. Sonics Ultrason. 25, 1978).
-
-A B-mode picture of a needle in a speckle phantom, from where needle and image plane really are.
-
-The frame ``image``: its origin is the middle of the upper left pixel, x (u) runs along the probe's face to the right,
-y (v) into the depth, z out of the plane; mm. A needle off the plane fades as the slice's Gaussian profile (spec 3,
-section 5). One picture's speckle is independent of the next one's: two poses of a calibration show different cells.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import InputError
 
 Complexes = NDArray[np.complexfloating]
-"""Single precision on the way: the display has 256 greys."""
+"""Single precision inside: the display has 256 greys."""
 
 FWHM_PER_SIGMA = float(2.0 * np.sqrt(2.0 * np.log(2.0)))
 """Full width at half maximum of a Gaussian, over its standard deviation."""
@@ -96,7 +94,7 @@ def _lateral_blur(field: Complexes, pixel_mm: float, sigma: Floats) -> Complexes
     """Each row blurred with its own width, by its transform; unit energy."""
     frequency = np.fft.fftfreq(field.shape[1], pixel_mm)
     transfer = np.exp(-2.0 * (np.pi * frequency[None, :] * sigma[:, None]) ** 2)
-    transfer /= np.sqrt(np.mean(transfer**2, axis=1, keepdims=True))
+    transfer /= np.sqrt(np.mean(transfer**2, axis=1, keepdims=True))  # unit energy (Parseval)
     return np.asarray(np.fft.ifft(np.fft.fft(field, axis=1) * transfer.astype(np.float32), axis=1))
 
 
@@ -145,7 +143,7 @@ class Imager:
         return self.slice_fwhm_mm / FWHM_PER_SIGMA
 
     def slice_gain(self, off_plane_mm: Floats) -> Floats:
-        """Amplitude of what lies off the plane, over the same in it; any shape."""
+        """Amplitude of an echo off the plane over that in it; any shape."""
         return np.asarray(np.exp(-0.5 * (off_plane_mm / self.slice_sigma) ** 2))
 
     def grey(self, amplitude: Floats) -> Pixels:
@@ -153,15 +151,15 @@ class Imager:
         level = 20.0 * np.log10(np.maximum(amplitude, 1e-12)) - self.speckle_db
         return np.clip(np.round(WHITE * (1.0 + level / self.range_db)), 0, WHITE).astype(np.uint8)
 
-    def amplitude(self, picture: NDArray[np.generic]) -> Floats:
-        """What :meth:`grey` was made from, where it was neither black nor white."""
-        level = self.range_db * (np.asarray(picture, dtype=np.float64) / WHITE - 1.0)
+    def amplitude(self, grey: NDArray[np.generic]) -> Floats:
+        """Amplitude from greys, the inverse of :meth:`grey` where a pixel is neither black nor white."""
+        level = self.range_db * (np.asarray(grey, dtype=np.float64) / WHITE - 1.0)
         return np.asarray(10.0 ** ((level + self.speckle_db) / 20.0))
 
 
 @dataclass(frozen=True)
 class NeedleEcho:
-    """What the needle's steel sends back. Amplitudes against mean speckle.
+    """Echo of the needle's steel. Amplitudes against mean speckle.
 
     Attributes:
         contrast_db: Of the shaft in the plane and parallel to the face, at the middle depth.
@@ -188,7 +186,7 @@ class NeedleEcho:
 
 
 class NeedleInImage(NamedTuple):
-    """Where the needle is, in the frame ``image``."""
+    """The needle in the frame ``image``."""
 
     tip_image: Floats
     """Shape (3,), mm; z is how far the tip is off the plane."""
@@ -214,7 +212,7 @@ def render(
     echo: NeedleEcho | None = None,
     lesion: Lesion | None = None,
 ) -> Pixels:
-    """One B-mode picture.
+    """One B-mode image.
 
     Args:
         imager: Probe and machine.
@@ -238,7 +236,7 @@ def render(
     signal = blurred_speckle(imager.rows, imager.columns, imager.pixel_mm, imager.spread, reflectivity, rng)
     if needle is not None:
         signal = signal + needle_signal(imager, needle, echo, rng)
-    hiss = 10.0 ** (-imager.noise_db / 20.0) / np.sqrt(2.0)
+    hiss = 10.0 ** (-imager.noise_db / 20.0) / np.sqrt(2.0)  # each of the two parts
     signal = signal + hiss * (rng.standard_normal(size) + 1j * rng.standard_normal(size))
     return imager.grey(np.abs(signal))
 
@@ -254,7 +252,7 @@ def needle_signal(imager: Imager, needle: NeedleInImage, echo: NeedleEcho, rng: 
     source = source * np.where(s < echo.tip_length_mm, echo.tip_gain, 1.0)
     source = source * _brightness(imager, needle, echo) * np.exp(2j * np.pi * rng.uniform())
     signal = np.zeros(size, dtype=np.complex128)
-    bounced = echo.reverberation_gain * float(1.0 - needle.direction_image[1] ** 2)
+    bounced = echo.reverberation_gain * float(1.0 - needle.direction_image[1] ** 2)  # squared cosine of the tilt
     for bounce in range(echo.reverberations + 1):
         below = points + [0.0, bounce * echo.reverberation_mm, 0.0]
         phase = np.exp(2j * np.pi * rng.uniform()) if bounce else 1.0
@@ -300,7 +298,7 @@ def _shaft(imager: Imager, needle: NeedleInImage) -> tuple[Floats, Floats]:
 
 
 def _shadow(imager: Imager, needle: NeedleInImage, echo: NeedleEcho) -> Floats:
-    """What the needle leaves of the sound, shape (rows, columns)."""
+    """Fraction of the sound that the needle lets pass, shape (rows, columns)."""
     points, _ = _shaft(imager, needle)
     left = np.ones((imager.rows, imager.columns))
     if len(points) < 2:

@@ -1,7 +1,7 @@
-"""How sure one candidate is, why not surer, and which single error would have to shrink, and to what.
+"""Uncertainty breakdown of one candidate: its chances, the sources of its error, and which one would have to shrink.
 
-An error's variance enters every covariance linearly, so that a source of f times its deviation leaves Sigma - (1 - f^2)
-part. The registration's weights are left as they are: with better ones the errors could be a little larger.
+An error's variance enters every covariance linearly: a source of f times its deviation leaves Sigma - (1 - f^2) part.
+The registration's weights stay as they are: with better ones the errors could be a little larger.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ WISHED_HIT = 0.99
 """Chance to hit that is wanted where the case demands none."""
 
 HALVINGS = 40
-"""Of the interval in which a source's factor lies: far below any digit that is printed."""
+"""Halvings of a factor's interval: its error is far below any digit that is printed."""
 
 LEAST_FRACTION = 0.005
-"""Of the variance: a smaller source is not named to people."""
+"""Fraction of the variance below which a source is not named to people."""
 
 
 class Remedy(NamedTuple):
-    """One source that alone would do: its declared deviation, and the greatest that suffices, in its key's unit."""
+    """One source that alone could satisfy a limit: its declared and its needed deviation, in its key's unit."""
 
     source: str
     declared: float
@@ -40,7 +40,7 @@ class Remedy(NamedTuple):
 
 @dataclass(frozen=True)
 class Goal:
-    """A limit that is not kept, and what would mend it.
+    """A limit that is not satisfied, and the errors that would have to shrink for it.
 
     Attributes:
         structure: What is touched too likely; "" where the target is hit too unlikely.
@@ -58,11 +58,11 @@ class Goal:
 
     @property
     def claim(self) -> str:
-        """What the limit demands."""
+        """The limit's demand as text."""
         return f"{self.limit:g} to {f'touch {self.structure}' if self.structure else 'hit'}"
 
     def text(self) -> str:
-        """What would have to shrink, in one sentence."""
+        """One sentence on the errors that would have to shrink."""
         if not self.remedies:
             if self.all_sources is None:
                 return f"{self.claim} cannot be had, however small the errors"
@@ -87,8 +87,8 @@ class Goal:
 
 
 @dataclass(frozen=True, eq=False)
-class Doubt:
-    """How sure one candidate is.
+class UncertaintyBreakdown:
+    """Chances, error budget and unmet limits of one candidate.
 
     Attributes:
         p_hit: Chance to hit.
@@ -96,7 +96,7 @@ class Doubt:
         p_touch_any: Of any, min(1, sum).
         budget: The tip's expected error and its sources.
         declaration: Whether the markers' residuals agree with the declared errors, in one sentence.
-        goals: What does not hold: the case's limits, or `WISHED_HIT` where it demands no chance to hit.
+        goals: Limits that are not satisfied: the case's, or `WISHED_HIT` where it demands no chance to hit.
         not_modelled: What these chances leave out.
     """
 
@@ -119,17 +119,18 @@ class Doubt:
         return [(source, fraction) for source, fraction in fractions if fraction >= LEAST_FRACTION]
 
     def sentence(self) -> str:
-        """The whole in one line."""
+        """Chances and the largest sources in one line."""
         name, chance = self.likeliest
         parts = [f"{chance_text(self.p_hit)} to hit"]
         parts += [f"{chance_text(chance)} to touch {name}"] if name else []
         parts += [
-            f"{100 * fraction:.0f} % of the doubt is {SOURCES[source].text}" for source, fraction in self.sources()[:1]
+            f"{100 * fraction:.0f} % of the uncertainty is {SOURCES[source].text}"
+            for source, fraction in self.sources()[:1]
         ]
         return "; ".join([*parts, *(goal.text() for goal in self.goals)])
 
     def lines(self) -> list[str]:
-        """For a person, below the sentence."""
+        """Further lines of text for a person, below the sentence."""
         budget, axes = self.budget, ", ".join(f"{mm:.2f}" for mm in self.budget.half_axes_mm)
         fractions = ", ".join(f"{SOURCES[source].text} {100 * fraction:.0f} %" for source, fraction in self.sources())
         return [
@@ -177,8 +178,8 @@ def chance_text(chance: float) -> str:
     return f"{chance:.{digits}f}"
 
 
-def doubt_of(model: ChanceModel, outward_ct: Floats, q: Floats) -> Doubt:
-    """The doubt of one candidate, its chances line-sampled as those of the table's best are.
+def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown:
+    """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are.
 
     Args:
         model: Of the case.
@@ -189,7 +190,7 @@ def doubt_of(model: ChanceModel, outward_ct: Floats, q: Floats) -> Doubt:
     chances = refined_chances(model, *needle, model.chances(*needle))
     touch = dict(zip(chances.structures, map(float, chances.touch[0]), strict=True))
     sources = shrinkable(model, model.needles(*needle), q)
-    return Doubt(
+    return UncertaintyBreakdown(
         float(chances.hit[0]),
         MappingProxyType(touch),
         float(chances.touch_any[0]),
@@ -201,14 +202,14 @@ def doubt_of(model: ChanceModel, outward_ct: Floats, q: Floats) -> Doubt:
 
 
 class _Part(NamedTuple):
-    """What one source adds: to Sigma6, shape (6, 6), CT axes; to the reading of the target, (3, 3)."""
+    """One source's part of Sigma6, shape (6, 6), CT axes, and of the target's reading, (3, 3)."""
 
     cov6: Floats
     target: Floats
 
 
 def _parts(model: ChanceModel, q: Floats) -> dict[str, _Part]:
-    """All sources of one configuration (6,); a target read in the markers' CT shrinks with them."""
+    """Parts of all sources at one configuration (6,); a target read in the markers' CT shrinks with them."""
     error, R = model.error, model.error.fit.R_base_ct
     turn, scale = np.kron(np.eye(2), R), error.fit.test.scale**2
     none = np.zeros((3, 3))
@@ -232,7 +233,7 @@ class ShrinkableNeedle(NamedTuple):
     parts: Mapping[str, _Part]
 
     def chance(self, structure: str, factors: Mapping[str, float]) -> float:
-        """To touch a structure, or where it is "" to hit, with some deviations times factors."""
+        """Chance to touch a structure, or to hit where it is "", with some deviations times factors."""
         squares = {source: factors.get(source, 1.0) ** 2 for source in self.parts}
         cov6 = np.asarray(sum(squares[source] * part.cov6 for source, part in self.parts.items()))
         surface_mm = factors.get("surface", 1.0) * self.surface_mm(structure)
@@ -242,7 +243,7 @@ class ShrinkableNeedle(NamedTuple):
         return self._hit(cov6[:3, :3], target, surface_mm)
 
     def surface_mm(self, structure: str) -> float:
-        """By which the surface of a structure, or where it is "" of the target, may lie off as a whole."""
+        """Standard deviation of a structure's surface as a whole, or of the target's where it is "", mm."""
         if not structure:
             return self.model.target_surface_mm
         return float(self.needles.surface_mm[0, self.model.structures.index(structure)])
@@ -274,7 +275,7 @@ def shrinkable(model: ChanceModel, needles: Needles, q: Floats) -> ShrinkableNee
 
 
 def goals_of(needle: ShrinkableNeedle, p_hit: float, p_touch: Mapping[str, float]) -> list[Goal]:
-    """The limits that are not kept, each with what would mend it."""
+    """The limits that are not satisfied, each with its remedies."""
     case, goals = needle.model.case, []
     least = WISHED_HIT if case.search.min_hit is None else case.search.min_hit
     if p_hit < least:
@@ -302,7 +303,7 @@ def _goal(needle: ShrinkableNeedle, structure: str, limit: float, *, stated: boo
 
 
 def _greatest(passes: Callable[[float], bool]) -> float | None:
-    """The greatest factor below 1 that mends it, by halving; None where not even 0 does."""
+    """The greatest factor below 1 that passes, by halving; None where not even 0 does."""
     if not passes(0.0):
         return None
     low, high = 0.0, 1.0

@@ -10,7 +10,7 @@ from uncertainty_world import declared, world
 
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.doubt import WISHED_HIT, chance_text, goals_of, shrinkable
+from puncture_twin.planning.search.uncertainty_breakdown import WISHED_HIT, chance_text, goals_of, shrinkable
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, proximity
 from puncture_twin.planning.uncertainty.lines import Needles
@@ -126,4 +126,4 @@ def test_explanation_says_the_chances_of_the_table(carton):
 def test_explanation_says_where_there_are_no_chances(carton):
     """Of a direction that was rejected before, it says so."""
     found = carton.explain(np.radians(90), np.radians(0))
-    assert found.doubt is None and found.summary()["chances"] is None and "no chances to hit" in found.text()
+    assert found.breakdown is None and found.summary()["chances"] is None and "no chances to hit" in found.text()

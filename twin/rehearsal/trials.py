@@ -1,8 +1,8 @@
-"""Many rooms at once, without physics: markers read and touched, registered, and the needle moved to the target.
+"""Monte Carlo trials without physics, many at once: markers read and touched, registered, the needle at the target.
 
-Every room draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
+Every trial draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
 parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised;
-tissue does not move. A needle that bends ends off its straight line, its bevel pointing to a side drawn in each room.
+tissue does not move. A needle that bends ends off its straight line, its bevel pointing to a side drawn in each trial.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from puncture_twin.planning.registration.fits.least_squares import (
 from puncture_twin.planning.registration.marker_noise import parameter_variances
 from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.uncertainty.pose_error import Bend
-from puncture_twin.twin.plant.true_needle import TrueNeedle, driven_onto, true_needle
+from puncture_twin.twin.plant.true_needle import TrueNeedle, joints_at_points, true_needle
 
 
 @dataclass(frozen=True, eq=False)
 class Puncture:
-    """What every room repeats: the belief, and the commands that follow from it.
+    """Common part of all trials: the belief, and the commands that follow from it.
 
     Attributes:
         model: The arm.
@@ -50,7 +50,7 @@ class Puncture:
         outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target.
         bend: Of the needle; None where it is straight.
-        aim: Of the method ``joint``: the insertion that every room's pose is corrected for; None where it is not.
+        aim: Of the method ``joint``: the insertion that every trial's pose is corrected for; None where it is not.
     """
 
     model: UrModel
@@ -67,17 +67,17 @@ class Puncture:
     aim: Aim | None = None
 
 
-class Rooms(NamedTuple):
-    """What happened in n rooms; CT frame, mm.
+class Trials(NamedTuple):
+    """Results of n trials; CT frame, mm.
 
     Attributes:
         tip_ct: Shape (n, 3), where the tip ended.
         outward_ct: Shape (n, 3), unit, from there along the needle.
-        target_ct: Shape (n, 3), where the target truly was.
-        T_base_ct: Shape (n, 4, 4), what each room registered.
+        target_ct: Shape (n, 3), true target.
+        T_base_ct: Shape (n, 4, 4), what each trial registered.
         reached: Shape (n,), whether the arm could reach the pose that followed.
         R_ct_needle: Shape (n, 3, 3), the needle's axes as columns; z points to the tip.
-        chi_squared: Shape (n,), of the weighted residuals of each room's markers against the believed noise.
+        chi_squared: Shape (n,), of the weighted residuals of each trial's markers against the believed noise.
         bevel_side: Shape (n,), rad, whereto the bevel points about the needle's z; 0 where it has none.
     """
 
@@ -90,25 +90,25 @@ class Rooms(NamedTuple):
     chi_squared: Floats
     bevel_side: Floats
 
-    def of(self, rows: Bools | Ints) -> Rooms:
-        """Some of the rooms."""
-        return Rooms._make(column[rows] for column in self)
+    def of(self, rows: Bools | Ints) -> Trials:
+        """The results of some trials."""
+        return Trials._make(column[rows] for column in self)
 
-    def reached_alone(self) -> Rooms:
-        """Without the rooms in which the arm did not reach the pose."""
+    def reached_alone(self) -> Trials:
+        """The trials in which the arm reached the pose."""
         return self.of(self.reached)
 
 
-def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Rooms:
-    """Draw rooms from declared errors and rehearse the puncture in each.
+def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Trials:
+    """Draw trials from declared errors and rehearse the puncture in each.
 
     Args:
-        puncture: What every room repeats.
+        puncture: Common part of all trials.
         errors: What their truth is drawn from.
-        count: Rooms.
+        count: Trials.
         rng: The source of all draws.
     """
-    eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))
+    eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))  # stays for all touches of a trial
     T_base_ct, residuals = _registered(puncture, errors, eta, rng)
     q, reached = _commanded(puncture, T_base_ct)
     arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.repeatability, errors.arm.drift)
@@ -119,14 +119,14 @@ def draw_rooms(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rando
     if puncture.bend is not None:
         side = rng.uniform(0, 2 * np.pi, count)
         needle = bent(needle, puncture.bend, side)
-    outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T
+    outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T  # z points to the tip, outward away from it
     R_ct_needle = T_ct_base[:3, :3] @ needle.R_base_needle
     tip_ct, squares = apply(T_ct_base, needle.tip_base), _chi_squared(puncture, residuals)
-    return Rooms(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares, side)
+    return Trials(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares, side)
 
 
 def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
-    """Needles whose bevel took them off, each turned about where it is held so that its straight line ends at the tip.
+    """Bent needles, each rotated about its clamp so that its straight line ends at the tip.
 
     Args:
         needle: n straight needles.
@@ -135,21 +135,21 @@ def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
     """
     x, y = needle.R_base_needle[:, :, 0], needle.R_base_needle[:, :, 1]
     c, s = np.cos(side)[:, None], np.sin(side)[:, None]
-    turn = bend.tip_mm / bend.clamped_mm * (c * y - s * x)
+    turn = bend.tip_mm / bend.clamped_mm * (c * y - s * x)  # rotation vector: z x the side that it bends to
     return TrueNeedle(needle.tip_base + bend.tip_mm * (c * x + s * y), exp_rotation(turn) @ needle.R_base_needle)
 
 
 def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:
-    """Of residuals (n, 3 N) in base axes, by the nominal registration's weights, as `noise_test` computes it."""
+    """Chi-squared of residuals (n, 3 N) in base axes, by the nominal registration's weights."""
     R, points = puncture.T_base_ct[:3, :3], apply(puncture.T_base_ct, puncture.points_ct)
     A = design(points, points.mean(axis=0))
     weights = np.asarray(np.linalg.inv(puncture.noise.covariance(R).whole), dtype=np.float64)
-    left = weights - weights @ A @ least_squares_map(A, weights)
+    left = weights - weights @ A @ least_squares_map(A, weights)  # less what the fit explains
     return np.asarray(np.einsum("na,ab,nb->n", residuals, left, residuals, optimize=True))
 
 
 def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """T_base_ct of every room, shape (n, 4, 4), and its residuals, shape (n, 3 N), mm, base axes.
+    """T_base_ct of every trial, shape (n, 4, 4), and its residuals, shape (n, 3 N), mm, base axes.
 
     Markers are read with errors, and touched by an arm that errs.
     """
@@ -157,8 +157,8 @@ def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.ran
     eta_of = np.broadcast_to(eta[:, None], (count, markers, 28))
     read_ct = puncture.points_ct + _normal(rng, errors.marker_cov_ct, (count, markers))
     there = np.broadcast_to(apply(puncture.T_base_ct, puncture.points_ct), (count, markers, 3))
-    q_true = driven_onto(puncture.model, there, puncture.q_touch, eta_of, puncture.tip_mm)
-    q_encoder = q_true - rng.normal(size=q_true.shape) * errors.arm.repeatability
+    q_true = joints_at_points(puncture.model, there, puncture.q_touch, eta_of, puncture.tip_mm)
+    q_encoder = q_true - rng.normal(size=q_true.shape) * errors.arm.repeatability  # true minus arrival
     flange = flange_pose(puncture.model, q_encoder)
     touched = flange[..., :3, 3] + puncture.tip_mm * flange[..., :3, 2]
     touched = touched + rng.normal(size=touched.shape) * errors.touch_mm
@@ -187,12 +187,12 @@ def _commanded(puncture: Puncture, T_base_ct: Floats) -> tuple[Floats, Bools]:
     poses[:, :3, 3], poses[:, 3, 3] = target_base - puncture.tip_mm * poses[:, :3, 2], 1.0
     turns = wrap_to_pi(inverse(puncture.model, poses) - puncture.q_insertion)
     far = np.where(np.isnan(turns).any(axis=2), np.inf, np.abs(turns).max(axis=2))
-    branch = far.argmin(axis=1)
+    branch = far.argmin(axis=1)  # the planned one moves least
     rows = np.arange(len(poses))
     return puncture.q_insertion + turns[rows, branch], np.isfinite(far[rows, branch])
 
 
 def _normal(rng: np.random.Generator, cov: Floats, shape: tuple[int, ...]) -> Floats:
     """Normal vectors (..., 3) of a covariance (3, 3), which may be singular."""
-    values, axes = np.linalg.eigh(cov)
+    values, axes = np.linalg.eigh(cov)  # no Cholesky: it may be singular
     return np.asarray(rng.normal(size=(*shape, 3)) * np.sqrt(np.maximum(values, 0.0)) @ axes.T)

@@ -1,7 +1,7 @@
-"""The room as it truly is: an arm off its nominal model, two cameras, a head; drawn once for each seed.
+"""The ground truth of a stereo workcell: an arm off its nominal model, two cameras, a head; drawn once for each seed.
 
-Two frames matter to the guidance. The base's, in which the arm is commanded; and C, which the measuring arm defines at
-the calibration and in which the cameras know themselves. Nobody is told how C lies in the base.
+Two frames matter to the guidance: the base's, in which the arm is commanded, and C, which the measuring arm defines at
+the calibration and in which the cameras are known. How C lies in the base is not given to the guidance.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ class TrueTool(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StereoWorkcell:
-    """One drawn room. Whoever guides must not look in here.
+    """The ground truth of one workcell. Guidance must not look in here.
 
     Attributes:
         case: What it was drawn from.
         arm: The true arm.
         T_c_base: Shape (4, 4), mm: the true arm's base in C.
         cameras: The true cameras.
-        T_c_m: Shape (4, 4), mm: where the head truly stands when its markers are seen, image frame to C.
-        T_c_m_after: Shape (4, 4), mm: where it stands from then on.
-        tool: What the arm truly carries.
+        T_c_m: Shape (4, 4), mm: true pose of the head when its markers are seen.
+        T_c_m_after: Shape (4, 4), mm: where it is from then on.
+        tool: The true tool.
     """
 
     case: ServoCase
@@ -70,31 +70,31 @@ class StereoWorkcell:
 
     @property
     def markers_c(self) -> Floats:
-        """Where the markers truly are, shape (n, 3), mm."""
+        """True markers, shape (n, 3), mm."""
         return apply(self.T_c_m, self.case.markers.points)
 
     @property
     def targets_c(self) -> Floats:
-        """Where the targets truly are when the ball comes, shape (n, 3), mm."""
+        """True targets when the ball comes, shape (n, 3), mm."""
         return apply(self.T_c_m_after, self.case.targets.points)
 
     @cached_property
     def head_c(self) -> TriangleMesh:
-        """The head's surface where it truly stands when the ball comes, C, mm."""
+        """True surface of the head when the ball comes, C, mm."""
         return self.case.skin.transformed(self.T_c_m_after)
 
     def ball_c(self, q_true: Floats) -> Floats:
-        """Where the ball's centre truly is, shape (..., 3), mm, at true configurations (..., 6), rad."""
+        """True centre of the ball, shape (..., 3), mm, at true configurations (..., 6), rad."""
         return self._on_flange_c(q_true, self.tool.ball_offset)
 
     def tip_c(self, q_true: Floats) -> Floats:
-        """Where the needle's tip truly is, shape (..., 3), mm, likewise."""
+        """True tip of the needle, shape (..., 3), mm, at true configurations (..., 6), rad."""
         return self._on_flange_c(q_true, self.tool.ball_offset + self.tool.tip_offset)
 
     def _on_flange_c(self, q_true: Floats, offset: Floats) -> Floats:
         flange = self.arm.flange_pose(q_true)
-        beside = offset + np.array([0.0, 0.0, self.case.file.tool.rod_mm])
-        return apply(self.T_c_base, flange[..., :3, 3] + flange[..., :3, :3] @ beside)
+        on_flange = offset + np.array([0.0, 0.0, self.case.file.tool.rod_mm])
+        return apply(self.T_c_base, flange[..., :3, 3] + flange[..., :3, :3] @ on_flange)
 
     def needle_c(self, q_true: Floats) -> Floats:
         """The needle's true axes as columns, z to the tip, shape (3, 3), C, at a true configuration (6,), rad."""
@@ -115,8 +115,8 @@ class StereoWorkcell:
         toward = point_c - camera.center_c
         across = tangent_axes(toward / np.linalg.norm(toward))
         angles = [(r * radius_mm, 2 * np.pi * k / n) for r, n in LINE_OF_SIGHT_RINGS for k in range(n)]
-        detections = np.array([r * (np.cos(a) * across[:, 0] + np.sin(a) * across[:, 1]) for r, a in angles])
-        rays = toward + detections
+        ends = np.array([r * (np.cos(a) * across[:, 0] + np.sin(a) * across[:, 1]) for r, a in angles])
+        rays = toward + ends
         lengths = np.linalg.norm(rays, axis=1)
         nearby = self._head_about(camera.center_c, toward / np.linalg.norm(toward), radius_mm)
         if nearby is None:
@@ -134,7 +134,7 @@ class StereoWorkcell:
         return middles, np.asarray(np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1))
 
     def _head_about(self, origin: Floats, direction: Floats, radius_mm: float) -> TriangleMesh | None:
-        """The triangles of the head that a cylinder about a line may meet; None where there are none."""
+        """Triangles of the head that a cylinder about a line may intersect; None where there are none."""
         middles, reach = self._head_triangles
         offsets = middles - origin
         aside = np.linalg.norm(offsets - (offsets @ direction)[:, None] * direction, axis=1)
@@ -143,7 +143,7 @@ class StereoWorkcell:
 
 
 def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
-    """A room with its errors drawn from what the case declares, or from what it says that its truth is.
+    """A workcell with its errors drawn from what the case declares, or from what it states as its truth.
 
     Raises:
         InputError: Cameras or arm that cannot be.
@@ -167,13 +167,13 @@ def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
 
 
 def planned_cameras(case: ServoCase) -> tuple[Camera, ...]:
-    """The cameras as the case plans them; where they really stand nobody knows better than by calibration."""
+    """The cameras as the case plans them; only a calibration tells where they are."""
     plan = case.file.cameras
     return stereo_pair(*plan.size_px, plan.focal_px, plan.baseline_mm, plan.distance_mm, plan.distortion)
 
 
 def _misplaced(camera: Camera, errors: CameraErrors, rng: np.random.Generator) -> Camera:
-    """A camera as it was really put up: turned, shifted, its lens off its focal length and axis."""
+    """A camera as it is in truth: rotated, shifted, its lens off its focal length and axis."""
     T = pose(exp_rotation(rng.normal(0.0, errors.turn, 3)), rng.normal(0.0, errors.shift_mm, 3))
     cx, cy = np.array([camera.cx, camera.cy]) + rng.normal(0.0, errors.axis_px, 2)
     focal = camera.fx * (1.0 + rng.normal(0.0, errors.focal))
@@ -185,7 +185,7 @@ def _with_other_lens(camera: Camera, errors: CameraErrors, rng: np.random.Genera
 
 
 def calibration_frame(case: ServoCase) -> Floats:
-    """T_base_c, shape (4, 4), mm: C at the calibrated volume's middle, z the way the cameras look, y down.
+    """T_base_c, shape (4, 4), mm: C at the calibrated volume's middle, z along the cameras' view, y down.
 
     The cameras stand on the far side of the head, seen from the arm, and look back and down at it.
     """
@@ -207,11 +207,11 @@ def rod_tool(tool: ToolSection) -> Tool:
 
 
 def workcell_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
-    """The planner's judge of contacts.
+    """The planner's collision checker of the workcell.
 
     Args:
         case: The case.
-        T_base_m: Where the head is believed to stand, shape (4, 4), mm; None for a room without it.
+        T_base_m: Where the head is believed to stand, shape (4, 4), mm; None for a workcell without it.
     """
     boxes = []
     for box in case.file.box:
