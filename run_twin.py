@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_args
 import typer
 
 from puncture_twin.meshes import folder as meshes_folder
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.extras import require_extra
+from puncture_twin.planning.base.errors import InputError, require_extra
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 from puncture_twin.twin.jobs.batch.commands import batch_app

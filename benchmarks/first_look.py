@@ -41,7 +41,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 MAKER = REPOSITORY.parent / "shared" / "cases" / "make_cases.py"
 
 STAGES = {
-    "planning.formats.volumes.volume_source": {"VolumeFile.volume": "reading"},
+    "planning.formats.volumes.volume_files": {"VolumeFile.volume": "reading"},
     "planning.base.provenance": {"InputFiles.read": "reading", "InputFiles.content": "reading"},
     "planning.formats.dicom.ct_series": {"CtSeries.volume": "reading"},
     "planning.init.finder": {"volume_kind": "kind of file"},
@@ -56,7 +56,7 @@ STAGES = {
         "Scan.attached_limbs": "limbs",
         "Scan.unnamed": "unnamed",
     },
-    "planning.anatomy.beyond_labels": {"beyond_labels": "beyond labels"},
+    "planning.anatomy.unseen": {"beyond_labels": "beyond labels"},
     "planning.evidence.checks": {"findings": "evidence"},
     "planning.clearance.fast_engine": {"FastEngine.__init__": "engine's blocks"},
     "planning.search.search": {"search": "search"},

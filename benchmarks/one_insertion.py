@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.twin.jobs.patient.answers import noise_of_lists, one_insertion

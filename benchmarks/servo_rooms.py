@@ -28,7 +28,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, Search, Spot
 from puncture_twin.twin.guidance.stereo.experiment import needle_statistics
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, adjust

@@ -310,7 +310,7 @@ def rehearse(context: CaseContext, plan: Plan, *, seed: int | None = None) -> Re
     Raises:
         InputError: The extra ``twin`` is not installed.
     """
-    from puncture_twin.planning.base.extras import require_extra
+    from puncture_twin.planning.base.errors import require_extra
 
     require_extra("twin", "rehearse")
     from puncture_twin.twin.rehearsal.plan_truth import plan_truth

@@ -9,7 +9,7 @@ import uuid
 import pyarrow.parquet as pq
 from case_world import ORGAN, SKIN, case_text, structure, write_balls
 
-from puncture_twin.planning.base.cache.memory import NO_MEMORY
+from puncture_twin.planning.base.cache.array_cache import NO_MEMORY
 from puncture_twin.planning.batch.cohort import CohortCase
 from puncture_twin.planning.batch.plan import planned, read_plan_table
 from puncture_twin.planning.batch.run_case import CaseTask, run_case

@@ -12,7 +12,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.motion.follow import Rates, time_law
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.twin.world.arm import load_arm
 from puncture_twin.twin.world.client import physics_client, pybullet, step
 from puncture_twin.twin.world.control import (

@@ -2,8 +2,7 @@
 
 from typing import Any, TypeVar
 
-from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.cache.memory import Memory
+from puncture_twin.planning.base.cache.array_cache import Cache, Memory
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 

@@ -14,7 +14,6 @@ from places import ROOT
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.output.draft import DRAFT_PREFIX
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
     TIMINGS_NAME,
@@ -23,6 +22,7 @@ from puncture_twin.planning.base.output.manifest import (
     read_output,
 )
 from puncture_twin.planning.base.output.output_set import LOCK_NAME
+from puncture_twin.planning.base.output.publish import DRAFT_PREFIX
 
 REPOSITORY = ROOT
 RUN_TIMEOUT_S = 600.0

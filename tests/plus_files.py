@@ -11,7 +11,7 @@ from linear_wires import WireFrames, Wires
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import read_input
 
 Floats = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import numpy as np
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.twin.guidance.stereo.joint.joint_model import N_ROD, Guess, Observed, Unknowns
 from puncture_twin.twin.guidance.stereo.robot_calibration import grid_points
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case

@@ -61,7 +61,7 @@ REGISTRATION = (
 PLAIN = MappingProxyType(
     {
         "puncture_twin.planning.case.entry": ("tests/case/test_entry.py",),
-        "puncture_twin.planning.anatomy.skin_entry": (
+        "puncture_twin.planning.anatomy.skin": (
             "tests/anatomy/test_skin_entry.py",
             "tests/search/test_constraints.py",
         ),

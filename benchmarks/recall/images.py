@@ -21,8 +21,7 @@ from scipy import ndimage
 from benchmarks.beside.scene import Asked, is_outer, scanned
 from benchmarks.recall.oracle import Grid, Scene, filled
 from puncture_twin.planning.base.progress import Silent
-from puncture_twin.planning.formats.volumes.orientation import canonical
-from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.formats.volumes.volume_files import canonical, read_volume
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.init.finder import Wanted
 from puncture_twin.planning.init.overrides import with_keys

@@ -10,20 +10,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.beyond_image import beyond_images
-from puncture_twin.planning.anatomy.beyond_labels import beyond_labels
 from puncture_twin.planning.anatomy.body.tables import support_warnings
 from puncture_twin.planning.anatomy.scan import Outside, Scan
 from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.sources import StructureSources
 from puncture_twin.planning.anatomy.structure import Role as Role, Structure as Structure
+from puncture_twin.planning.anatomy.unseen import beyond_images, beyond_labels
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.findings import Finding, Severity
-from puncture_twin.planning.base.near_names import did_you_mean
+from puncture_twin.planning.base.errors import Finding, InputError, Severity
 from puncture_twin.planning.base.progress import Names, unnamed
+from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
 from puncture_twin.planning.formats.labels.label_surface import field_surface

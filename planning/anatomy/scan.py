@@ -1,4 +1,7 @@
-"""The CT of a case as a witness: what it shows outside of the body, and what inside that no structure names."""
+"""The CT of a case as a witness: what it shows outside of the body, and what inside that no structure names.
+
+What the voxels hold in which points lie.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,10 @@ from puncture_twin.planning.anatomy.second_witness import Named, Unnamed, unname
 from puncture_twin.planning.anatomy.skin import Skin, field_of_view
 from puncture_twin.planning.anatomy.surfaces import Imaged, kept_mesh, mesh_arrays
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.cache.array_cache import Arrays
+from puncture_twin.planning.base.cache.entry_file import Arrays
+from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.formats.labels.label_surface import field_surface
 from puncture_twin.planning.formats.mesh_guard import fits
-from puncture_twin.planning.formats.volumes.nearest_voxel import nearest
 from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply
@@ -237,3 +240,32 @@ def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:
 
 def _to_meshes(stored: Arrays) -> list[TriangleMesh | None]:
     return [kept_mesh(stored, n) if f"faces{n}" in stored else None for n in range(int(stored["count"]))]
+
+
+def nearest(values: NDArray[np.float32], T_index_ct: Floats, points_ct: Floats) -> Floats:
+    """Values of the nearest voxels, NaN outside of the image; half way between two it is the one of even index.
+
+    Args:
+        values: Shape (nx, ny, nz).
+        T_index_ct: Shape (4, 4), maps LPS mm to an index of ``values``.
+        points_ct: Shape (n, 3), LPS mm.
+    """
+    order = np.argsort(values.strides)[::-1]  # as it lies in memory: the kernel is compiled for one order alone
+    plain = np.ascontiguousarray(values.transpose(order))
+    return np.asarray(_nearest(plain, T_index_ct[order], np.ascontiguousarray(points_ct)))
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _nearest(values: Any, T: Any, points: Any) -> Any:
+    """As `nearest`, of values that lie in memory as they are numbered. The order of a sum decides half-way points."""
+    found = np.empty(len(points))
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        i = np.rint(T[0, 0] * x + T[0, 2] * z + T[0, 1] * y + T[0, 3])
+        j = np.rint(T[1, 0] * x + T[1, 2] * z + T[1, 1] * y + T[1, 3])
+        k = np.rint(T[2, 0] * x + T[2, 2] * z + T[2, 1] * y + T[2, 3])
+        if 0 <= i < values.shape[0] and 0 <= j < values.shape[1] and 0 <= k < values.shape[2]:
+            found[n] = values[int(i), int(j), int(k)]
+        else:
+            found[n] = np.nan
+    return found

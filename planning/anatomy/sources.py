@@ -15,7 +15,7 @@ from puncture_twin.planning.anatomy.surfaces import Imaged, VolumeSurfaces, kept
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names
-from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.tables import StructureSection, StructuresSection
 from puncture_twin.planning.formats.labels.mask_folder import check_one_grid

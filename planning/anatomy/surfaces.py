@@ -23,15 +23,14 @@ from puncture_twin.planning.anatomy.body.cut_ends import (
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_label, skin_from_mesh, skin_of_image
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import ROUNDED_BY, LabelMap, labelmap_of, segment_names
 from puncture_twin.planning.formats.labels.mask_folder import refuse_label_map
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
-from puncture_twin.planning.formats.volumes.orientation import canonical
-from puncture_twin.planning.formats.volumes.volume_files import Volume
-from puncture_twin.planning.formats.volumes.volume_source import VolumeSource
+from puncture_twin.planning.formats.volumes.volume_files import Volume, VolumeSource, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Value = TypeVar("Value")

@@ -21,7 +21,8 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE, ArmUrdf, Read, read_arm_urdf
 from puncture_twin.planning.arm.urdf.lengths import NOTHING_STATED, StatedLimits, urdf_limits
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined, packed_meshes, unpacked_meshes
 

@@ -1,8 +1,18 @@
-"""The exceptions of the planner: few, and each says what was wrong, where, and what is allowed."""
+"""The exceptions of the planner: few, and each says what was wrong, where, and what is allowed.
+
+What a check of plausibility found: a code and numbers for a program, a sentence for a person.
+
+Parts of the installation that planner, map and page do without, and what is said where one is missing.
+"""
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -83,3 +93,92 @@ def one_line(text: str, most: int = MOST_MESSAGE) -> str:
         head = (most - 3) // 2
         line = line[:head] + "..." + line[len(line) - (most - 3 - head) :]
     return "".join(c if c.isprintable() else "?" for c in line)
+
+
+class Severity(StrEnum):
+    """How much a finding weighs."""
+
+    NOTE = "note"
+    WARNING = "warning"
+    REFUSAL = "refusal"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that the inputs say of each other.
+
+    Attributes:
+        code: What kind of thing it is, in one word.
+        severity: A refusal stops the work, a warning stands in every result, a note is for those who look.
+        sentence: For a person.
+        numbers: What was measured, by name with its unit.
+        way_out: Of a refusal, what would be accepted.
+    """
+
+    code: str
+    severity: Severity
+    sentence: str
+    numbers: Mapping[str, float | list[float] | str] = field(default_factory=dict)
+    way_out: str = ""
+
+    def document(self) -> dict[str, object]:
+        """As it stands under ``findings`` of ``--json``."""
+        return {
+            "code": self.code,
+            "severity": str(self.severity),
+            "numbers": dict(self.numbers),
+            "sentence": self.sentence,
+        }
+
+
+MODULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "twin": ("pybullet", "cv2", "imageio_ffmpeg"),
+        "mirror": ("rtde_receive",),
+        "dask": ("distributed",),
+        "hdf5": ("h5py",),
+    }
+)
+"""Extra to the modules that it installs: the simulator, the cameras' pictures, the film; a running robot; and so on."""
+
+NO_WHEEL_FROM: Mapping[str, tuple[str, tuple[int, int]]] = MappingProxyType(
+    {"pybullet": ("pybullet", (3, 12)), "rtde_receive": ("ur-rtde", (3, 13))}
+)
+"""What an extra leaves out of later Pythons, which have to build it: its name, and the first of them."""
+
+
+def require_extra(extra: str, where: str, *, else_allowed: str = "") -> None:
+    """Refuse what needs a missing part of the installation, before it works for minutes.
+
+    Args:
+        extra: A key of `MODULES`.
+        where: The command or file that needs it.
+        else_allowed: Another way out.
+
+    Raises:
+        InputError: A module of the extra is not installed.
+    """
+    missing = [name for name in MODULES[extra] if find_spec(name) is None]
+    if missing:
+        what = f"it needs the extra '{extra}', which is not installed (no {', '.join(missing)})"
+        allowed = f"{_install_line(extra, missing)}{else_allowed}"
+        raise InputError(what, where=where, allowed=allowed, code="missing_extra")
+
+
+def _install_line(extra: str, missing: list[str]) -> str:
+    """What installs it, from where this was installed: the project is on no index."""
+    if all(name in NO_WHEEL_FROM and sys.version_info >= NO_WHEEL_FROM[name][1] for name in missing):
+        names = " ".join(NO_WHEEL_FROM[name][0] for name in missing)
+        version = ".".join(map(str, sys.version_info[:2]))
+        return f"pip install {names} (no wheel for Python {version}: built in some minutes, with a C++ compiler)"
+    parts = Path(__file__).parents[2]
+    if (parts / "pyproject.toml").is_file():
+        return f"pip install --editable '{parts}[{extra}]'"
+    from importlib.metadata import PackageNotFoundError, distribution
+
+    try:
+        origin = json.loads(distribution("puncture-twin").read_text("direct_url.json") or "{}")
+    except PackageNotFoundError:
+        origin = {}
+    folder = origin.get("url", "FOLDER").removeprefix("file://")
+    return f"pip install '{folder}[{extra}]'" + ("" if origin else " (FOLDER: with this project's pyproject.toml)")

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.html import escape
 from puncture_twin.planning.base.reasons import Rgb, css
+from puncture_twin.planning.base.text import escape
 
 FINEST = np.radians(0.5)
 """rad: a smaller bin is smaller than a pixel at the rim."""

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import is_plain_file
-from puncture_twin.planning.base.input_file import absence, read_input
+from puncture_twin.planning.base.files import absence, is_plain_file, read_input
 from puncture_twin.planning.base.strict_json import text
 
 CASE_ROLE = "case"

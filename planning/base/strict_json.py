@@ -16,7 +16,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import read_input
 
 Value = TypeVar("Value")
 

@@ -18,10 +18,9 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 from pydantic import Field
 
 from puncture_twin.planning.base.errors import InputError, one_line
-from puncture_twin.planning.base.files import is_folder
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import is_folder, read_input
 from puncture_twin.planning.base.provenance import Input, content_input
-from puncture_twin.planning.base.text_names import unprintable_texts
+from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.base.toml_file import SchemaOne, parse_toml
 from puncture_twin.planning.case.options import NO_OPTIONS, SECTIONS, CaseOptions, case_options
 from puncture_twin.planning.case.toml_types import Section, Text

@@ -18,8 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from puncture_twin.planning.base.errors import InputError, one_line
-from puncture_twin.planning.base.files import is_folder
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import is_folder, read_input
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.strict_json import or_null
 from puncture_twin.planning.batch.plan import TABLE_NAME, PlannedCase, read_row

@@ -26,9 +26,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from puncture_twin.planning.base.cache.memory import MEMORY_BYTES, Memory
-from puncture_twin.planning.base.errors import InputError, one_line
-from puncture_twin.planning.base.extras import require_extra
+from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, Memory
+from puncture_twin.planning.base.errors import InputError, one_line, require_extra
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.processes import worker_count
 from puncture_twin.planning.base.progress import Count, Watcher

@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.progress import Stages

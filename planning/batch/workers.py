@@ -20,7 +20,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import NamedTuple
 
-from puncture_twin.planning.base.cache.memory import MEMORY_BYTES
+from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.batch.run_case import READY, CaseEnd, CaseTask, commit_failure, ended, work
 

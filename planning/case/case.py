@@ -15,9 +15,8 @@ import numpy as np
 
 from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.brief import brief
-from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.provenance import Input, InputFiles
+from puncture_twin.planning.base.text import Facts, brief, card, never_raises
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, grid
 from puncture_twin.planning.case.errors import ErrorModel

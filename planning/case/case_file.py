@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, Strict, model_validator
 
-from puncture_twin.planning.base.text_names import unprintable_texts
+from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.case.tables import (
     MAX_LABEL_MAPS,
     MAX_STRUCTURES,

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import unfinished_warnings
+from puncture_twin.planning.base.files import unfinished_warnings
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.settings import RobotSettings
@@ -26,8 +26,7 @@ from puncture_twin.planning.formats.labels.mask_folder import mask_files, struct
 from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING, parse_segments
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.formats.volumes import volume_files as volumes
-from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, data_file
-from puncture_twin.planning.formats.volumes.volume_source import VolumeFile, VolumeSource
+from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, VolumeFile, VolumeSource, data_file
 
 if TYPE_CHECKING:
     from puncture_twin.planning.formats.dicom.ct_series import CtSeries

@@ -9,8 +9,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.near_names import did_you_mean
 from puncture_twin.planning.base.provenance import CASE_ROLE, InputFiles
+from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.case import Case, view_frame
 from puncture_twin.planning.case.case_file import CaseFile

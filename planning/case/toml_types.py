@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from puncture_twin.planning.base.text_names import MAX_NAME
+from puncture_twin.planning.base.text import MAX_NAME
 from puncture_twin.planning.formats.points import plainly_radians
 
 

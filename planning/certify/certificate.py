@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.provenance import inputs_document, read_inputs
@@ -32,6 +30,7 @@ from puncture_twin.planning.base.strict_json import (
     texts,
     whole,
 )
+from puncture_twin.planning.base.text import Facts, brief, card, never_raises
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split

@@ -26,7 +26,7 @@ class SkinSurface:
 
     Attributes:
         corners: Shape (m, 3, 3), mm from the target.
-        normals: Shape (m, 3, 3), unit normal at each corner: what `puncture_twin.planning.anatomy.skin_entry` blends.
+        normals: Shape (m, 3, 3), unit normal at each corner: what `puncture_twin.planning.anatomy.skin` blends.
         fold: Shape (m, 3), whether the number of crossings may change where a ray passes the edge from corner i to
             i + 1: it is not shared by exactly two triangles that lie on its two sides as seen from the target.
         cut: Shape (m,), triangles that are not skin.

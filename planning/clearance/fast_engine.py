@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Arrays, Cache
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, NO_MEMORY, Cache, Memory
+from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.processes import on_threads

@@ -26,7 +26,8 @@ from puncture_twin.planning.arm.links import LINK_NAMES, Link, collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined, packed_meshes, unpacked_meshes
 from puncture_twin.planning.geometry.rigid import pose

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Arrays, Cache
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.collision.bodies import (
     CENTRE_STEPS,
     LEAF_RADIUS_MM,

@@ -13,8 +13,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.arm.tool import Box, Tool, gantry_boxes
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.cache.memory import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory, user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Gantry, Obstacle

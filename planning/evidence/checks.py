@@ -11,12 +11,11 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.default_roles import default_role
-from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.anatomy.regions import absent_organs
+from puncture_twin.planning.anatomy.structure import label_grids
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import InputError, InputListError
-from puncture_twin.planning.base.findings import Finding, Severity
-from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.base.errors import Finding, InputError, InputListError, Severity
+from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
 from puncture_twin.planning.evidence.inside_skin import outside_skin

@@ -13,8 +13,9 @@ from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
-from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.cache.entry_file import Arrays
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.containment import crossings, settled_crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on

@@ -28,12 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.label_grids import label_grids
 from puncture_twin.planning.anatomy.scan import Scan
+from puncture_twin.planning.anatomy.structure import label_grids
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.cache.array_cache import Arrays
-from puncture_twin.planning.base.findings import Finding, Severity
-from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.base.cache.entry_file import Arrays
+from puncture_twin.planning.base.errors import Finding, Severity
+from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.evidence.edges import (
     LEAST_SEEN,

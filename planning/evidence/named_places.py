@@ -17,8 +17,8 @@ from puncture_twin.planning.anatomy.default_roles import default_role, plain_nam
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import Arrays
-from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.base.cache.entry_file import Arrays
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
 from puncture_twin.planning.geometry.spaces import Space

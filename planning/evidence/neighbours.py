@@ -17,8 +17,9 @@ from puncture_twin.planning.anatomy.crossed_names import BONES
 from puncture_twin.planning.anatomy.default_roles import LESION, VESSEL_WORDS, default_role, plain_name
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
-from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.cache.entry_file import Arrays
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of
 from puncture_twin.planning.geometry.voxelize import voxels_inside

@@ -13,7 +13,7 @@ from puncture_twin.planning.anatomy.crossed_names import named_as_crossed
 from puncture_twin.planning.anatomy.default_roles import LESION, NEVER_CROSSED, default_role, never_crossed
 from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.containment import Side, contains, odd_fraction, side_of, winding_number
 from puncture_twin.planning.geometry.spaces import Space, Unit, point_text, to_lps

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import absence
+from puncture_twin.planning.base.files import absence
 from puncture_twin.planning.base.output.manifest import is_output_folder
 
 FILE, FOLDER, HIDDEN = "", "is a folder", "is hidden"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.text_names import check_name
+from puncture_twin.planning.base.text import check_name
 
 MAX_COORDINATE_MM = 100_000.0
 """Farthest from the origin: no workcell is 100 m wide; beyond, a sentinel value or a broken float is likely."""

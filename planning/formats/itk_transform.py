@@ -19,9 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.extras import require_extra
-from puncture_twin.planning.base.input_file import decode_text
+from puncture_twin.planning.base.errors import InputError, require_extra
+from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.guard import guard_transform
 from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.rigid import pose

@@ -28,10 +28,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import decode_text, read_input
+from puncture_twin.planning.base.files import decode_text, read_input
 from puncture_twin.planning.base.strict_json import parse_json
+from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit, to_lps

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.brief import brief
+from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.geometry.rigid import apply
 
 Faces = NDArray[np.int32]

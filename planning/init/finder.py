@@ -35,11 +35,9 @@ from puncture_twin.planning.formats.points import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
-from puncture_twin.planning.init.file_masks import file_masks
-from puncture_twin.planning.init.label_files import Mask, Masks, is_named_by_table, label_file, mask_of
-from puncture_twin.planning.init.mesh_folder import is_mesh, mesh_folder
+from puncture_twin.planning.init.label_files import Mask, Masks, file_masks, is_named_by_table, label_file, mask_of
 from puncture_twin.planning.init.overrides import Overrides
-from puncture_twin.planning.init.segmentation import Place, Segmentation
+from puncture_twin.planning.init.segmentation import Place, Segmentation, is_mesh, mesh_folder
 
 DEPTH = 2
 """Levels of folders below the one that is given."""

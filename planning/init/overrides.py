@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.near_names import did_you_mean
+from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case_file import CaseFile
 
 WAYS = (

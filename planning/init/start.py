@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError, InputListError
 from puncture_twin.planning.base.progress import Names
-from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.evidence.target import readings_inside
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import Side, side_of

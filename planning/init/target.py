@@ -11,7 +11,7 @@ import scipy
 from puncture_twin.planning.anatomy.default_roles import BODY, NOT_ANNOTATED, DefaultRole, default_role, never_crossed
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.near_names import did_you_mean
+from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.evidence.target import Likely, likely_target
 from puncture_twin.planning.formats.points import parse_coordinate
 from puncture_twin.planning.geometry.containment import Side, side_of

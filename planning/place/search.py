@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
+from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
@@ -61,7 +61,7 @@ from puncture_twin.planning.place.mounts import (
 )
 from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.survey import ReachRequest
-from puncture_twin.planning.registration.marker_noise import reading_noise, touches
+from puncture_twin.planning.registration.fit_uncertainty import reading_noise, touches
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.placement import Placement, default_method
 from puncture_twin.planning.registration.registration import Registration, register

@@ -17,9 +17,8 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.brief import brief
-from puncture_twin.planning.base.html import Facts, card, never_raises
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.base.text import Facts, brief, card, never_raises
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD

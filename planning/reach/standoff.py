@@ -10,8 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.anatomy.skin_entry import SkinPaths, skin_paths
+from puncture_twin.planning.anatomy.skin import Skin, SkinPaths, skin_paths
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case

@@ -10,10 +10,10 @@ from puncture_twin.planning.arm.inverse_kinematics import branch_of
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import carried, design
+from puncture_twin.planning.registration.fits import carried, design
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
+from puncture_twin.planning.registration.noise_test import noise_test
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.registration.residual_test import noise_test
 
 APART_MM = 20.0
 """One more marker is no nearer than this to those that are there."""

@@ -14,7 +14,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.reading_noise import ReadingNoise
+from puncture_twin.planning.registration.fits import ReadingNoise
 
 
 @dataclass(frozen=True, eq=False)

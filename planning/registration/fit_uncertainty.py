@@ -1,16 +1,41 @@
-"""What a registration's method makes of the declared errors of its markers."""
+"""What a registration's method makes of the declared errors of its markers.
+
+The declared noise of a case's markers, and how the arm stood, or may have stood, when it touched them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from puncture_twin.planning.arm.inverse_kinematics import inverse
+from puncture_twin.planning.arm.kinematics import (
+    N_PARAMETERS,
+    PARAMETERS,
+    check_arm,
+    error_jacobian,
+    farthest_from_singular,
+    singularity,
+)
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.registration.fits.least_squares import carried, design, differenced_map, least_squares_map
-from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.residual_test import NoiseTest, noise_test
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.errors import ArmUncertainty, ErrorModel
+from puncture_twin.planning.geometry.rigid import frame_about, pose
+from puncture_twin.planning.registration.fits import (
+    ReadingNoise,
+    carried,
+    design,
+    differenced_map,
+    fit_rigid,
+    least_squares_map,
+)
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs, check_pairs
+from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,3 +116,116 @@ def fit_uncertainty(
         L = differenced_map(fit, points_ct, fitted)
     test = noise_test((points_base - fitted).ravel(), covariance.whole, A, found=found)
     return FitUncertainty(noise, R, center, L, test)
+
+
+def parameter_variances(arm: ArmUncertainty) -> Floats:
+    """The diagonal of Sigma_eta, shape (28,), in the order of `error_jacobian`'s columns; mm^2 and rad^2."""
+    deviations = np.empty(N_PARAMETERS)
+    for kind, value in (
+        ("link", arm.link_mm),
+        ("twist", arm.twist),
+        ("joint", arm.joint),
+        ("tip_offset", arm.tip_offset_mm),
+        ("needle_direction", arm.needle_direction),
+    ):
+        deviations[PARAMETERS[kind]] = value
+    return np.asarray(deviations**2)
+
+
+def reading_noise(errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Floats, *, known: bool) -> ReadingNoise:
+    """The noise of markers that were touched in given configurations.
+
+    Args:
+        errors: As declared.
+        model: The arm.
+        tip_mm: Flange to tip.
+        q_touch: Shape (N, 6), rad.
+        known: Whether these are the real ones.
+    """
+    eta_variances = parameter_variances(errors.arm)
+    J = error_jacobian(model, q_touch, tip_mm)[:, :3]
+    Jq = J[..., PARAMETERS["joint"]]
+    cov_base = errors.touch_mm**2 * np.eye(3) + errors.arm.repeatability**2 * Jq @ np.swapaxes(Jq, -1, -2)
+    return ReadingNoise(errors.marker_cov_ct, cov_base, J.reshape(-1, N_PARAMETERS), eta_variances, known)
+
+
+TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
+"""How far the needle may lean from the wished direction, tried in this order."""
+
+AZIMUTHS = 12
+"""Sides to which it may lean."""
+
+LEAST_SINGULARITY = 0.05
+"""A pose nearer than this to a singularity is not used to measure (of 0..1)."""
+
+
+def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:
+    """Joint angles that put the tip on a point, shape (6,), rad: the least tilt, then the farthest from singular.
+
+    Of equals the one with its elbow on the side from which the needle comes: mirrored branches are equal.
+
+    Args:
+        model: The arm.
+        tip_mm: Flange to tip, along the flange's z.
+        point_base: Shape (3,), mm.
+        needle_base: Shape (3,), unit: the wished direction from the needle's top to its tip.
+
+    Raises:
+        NoAnswerError: There are none in the tried directions.
+    """
+    for tilt in np.radians(TILTS_DEG):
+        poses = touching_poses(tip_mm, point_base, needle_base, float(tilt))
+        q = np.concatenate([inverse(model, T)[0] for T in poses])
+        q = q[model.within_limits(q)]
+        if len(q) and singularity(model, q).least().max() >= LEAST_SINGULARITY:
+            return farthest_from_singular(model, q, -needle_base)
+    place = ", ".join(f"{value:.1f}" for value in point_base)
+    raise NoAnswerError(f"a {model.name} cannot touch ({place}) mm with a needle of {tip_mm:g} mm")
+
+
+def touching_poses(tip_mm: float, point_base: Floats, needle_base: Floats, tilt: float) -> list[Floats]:
+    """Flange poses (4, 4) with the tip on a point, leaning by ``tilt`` (rad) to every side; arguments as above."""
+    frame = frame_about(needle_base)
+    sides = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False) if tilt > 0 else [0.0]
+    poses = []
+    for side in sides:
+        lean = [np.sin(tilt) * np.cos(side), np.sin(tilt) * np.sin(side), np.cos(tilt)]
+        R = frame_about(frame @ np.array(lean))  # any roll will do: it is q6 alone
+        poses.append(pose(R, point_base - tip_mm * R[:, 2]))
+    return poses
+
+
+GUESSED_HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+"""An arm bent at the elbow, its needle down."""
+
+
+def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where: str | Path) -> ReadingNoise:
+    """The declared noise of a case's markers, with the arm as it stood at the touches, or as it is guessed to have.
+
+    Raises:
+        InputError: Too few markers to fit, or joints that do not put the tip where the file says that it touched.
+    """
+    model, tip = case.robot.model, case.needle.length_mm
+    check_pairs(markers, where)
+    q_touch = touches(case, markers)
+    if markers.joints is not None:
+        tool = [np.array([0.0, 0.0, tip])]
+        check_arm(model, markers.joints, markers.points_base, tool, names=markers.names, where=where)
+    return reading_noise(errors, model, tip, q_touch, known=markers.joints is not None)
+
+
+def touches(case: Case, markers: MarkerPairs) -> Floats:
+    """How the arm stood when it touched each marker, shape (N, 6), rad: as the file says, or as it may have stood."""
+    if markers.joints is not None:
+        return markers.joints
+    model, tip = case.robot.model, case.needle.length_mm
+    needle = -(fit_rigid(markers.points_ct, markers.points_base)[:3, :3] @ case.T_ct_entry[:3, 2])
+    return np.array([_guessed(model, tip, point, needle) for point in markers.points_base])
+
+
+def _guessed(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:
+    """How the arm may have stood; its home where it cannot touch the point in any direction tried."""
+    try:
+        return touching_configuration(model, tip_mm, point_base, needle_base)
+    except NoAnswerError:
+        return GUESSED_HOME

@@ -9,7 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.near_names import did_you_mean
+from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.formats.points import NamedPoints
 
 MIN_MARKERS = 3

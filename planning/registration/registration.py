@@ -9,25 +9,31 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.aim import Aim
-from puncture_twin.planning.registration.conditioning import Conditioning, conditioning
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
-from puncture_twin.planning.registration.fits.distortion import Distortion, distortion
-from puncture_twin.planning.registration.fits.least_squares import (
+from puncture_twin.planning.registration.fits import (
+    Distortion,
+    ReadingNoise,
     carried,
     design,
+    distortion,
     fit_rigid,
     least_squares_map,
     rigid_fre_mm,
 )
-from puncture_twin.planning.registration.fits.marker_ambiguity import better_names
-from puncture_twin.planning.registration.fits.method import Method, check_residuals, checked_fit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
-from puncture_twin.planning.registration.reading_noise import ReadingNoise
-from puncture_twin.planning.registration.residual_test import Interval, OddMarker, ResidualTest, odd_marker
+from puncture_twin.planning.registration.method import Method, better_names, check_residuals, checked_fit
+from puncture_twin.planning.registration.noise_test import (
+    Conditioning,
+    Interval,
+    OddMarker,
+    ResidualTest,
+    conditioning,
+    odd_marker,
+)
 
 
 def fit_doubts(test: ResidualTest, uncertainty: FitUncertainty | None) -> tuple[str, ...]:

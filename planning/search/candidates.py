@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32, Texts
-from puncture_twin.planning.base.brief import brief
-from puncture_twin.planning.base.findings import Finding
-from puncture_twin.planning.base.html import Facts, card, never_raises
+from puncture_twin.planning.base.errors import Finding
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
+from puncture_twin.planning.base.text import Facts, brief, card, never_raises
 from puncture_twin.planning.case.entry import AngleGrid
 from puncture_twin.planning.uncertainty.chance_model import Chances
 

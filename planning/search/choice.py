@@ -15,7 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.base.input_file import decode_text, read_input, unfinished_warnings
+from puncture_twin.planning.base.files import decode_text, read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles

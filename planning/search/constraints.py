@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.skin_entry import SkinPaths
+from puncture_twin.planning.anatomy.skin import SkinPaths
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.progress import Count

@@ -17,15 +17,13 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
-from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE, beyond_images
+from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE, beyond_images
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.brief import brief
-from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.cache.memory import MEMORY_BYTES, NO_MEMORY, Memory
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, NO_MEMORY, Memory, user_cache
+from puncture_twin.planning.base.errors import Finding, InputError, Severity
 from puncture_twin.planning.base.progress import Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.case.options import NO_OPTIONS, CaseOptions

@@ -11,9 +11,9 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
 from puncture_twin.planning.anatomy.structure import Structure
-from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.bedside import EntryFacts

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
-from puncture_twin.planning.anatomy.skin_entry import SkinPaths
+from puncture_twin.planning.anatomy.skin import SkinPaths
 from puncture_twin.planning.anatomy.structure import Structure
+from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason

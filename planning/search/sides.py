@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, OUTSIDE_BODY, Anatomy
-from puncture_twin.planning.anatomy.skin_entry import SkinPaths, skin_paths
+from puncture_twin.planning.anatomy.skin import SkinPaths, skin_paths
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, GRID_SLACK, angles, grid

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.anatomy.skin import skin_paths
 from puncture_twin.planning.arm.insertion import MAX_JOINT_STEP_RAD_PER_MM
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose, slowed

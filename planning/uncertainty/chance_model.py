@@ -15,7 +15,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.near_names import did_you_mean
+from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, normals_of
 from puncture_twin.planning.reach.standoff import own_lengths

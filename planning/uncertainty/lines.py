@@ -31,7 +31,8 @@ import scipy
 from scipy.special import chdtri, ndtr, ndtri, stdtr
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.cache.array_cache import Arrays, user_cache
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.fast_engine import NearFaces, near_faces
 from puncture_twin.planning.clearance.kernels.blocks import Blocks

@@ -18,7 +18,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import exp_rotation
-from puncture_twin.planning.registration.marker_noise import LEAST_SINGULARITY
+from puncture_twin.planning.registration.fit_uncertainty import LEAST_SINGULARITY
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 TILTS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0)

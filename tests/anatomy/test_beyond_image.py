@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from puncture_twin.planning.anatomy.beyond_image import OUTLINE_MM, REACH_MM, USUAL_MM, assumed, beyond_image
 from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
+from puncture_twin.planning.anatomy.unseen import OUTLINE_MM, REACH_MM, USUAL_MM, assumed, beyond_image
 from puncture_twin.planning.case.settings import CtSettings
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.rigid import exp_rotation

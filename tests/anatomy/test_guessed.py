@@ -5,7 +5,7 @@ import pytest
 
 from puncture_twin.planning.anatomy.anatomy import ball, body_side, guessed
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
-from puncture_twin.planning.base.findings import Severity
+from puncture_twin.planning.base.errors import Severity
 from puncture_twin.planning.geometry.mesh import joined
 
 

@@ -10,9 +10,8 @@ import pytest
 from case_world import ORGAN, SKIN, ball, case_text, structure, write_balls, write_labels
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
-from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache, Memory
 from puncture_twin.planning.base.cache.entry_file import packed, unpacked
-from puncture_twin.planning.base.cache.memory import Memory
 from puncture_twin.planning.base.errors import CacheWarning
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.mesh import TriangleMesh

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh, skin_paths
 from puncture_twin.planning.geometry.containment import NUDGE, Crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import absence, read_input
+from puncture_twin.planning.base.files import absence, read_input
 
 
 @pytest.fixture

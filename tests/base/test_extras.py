@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 from walls.house import modules
 
-from puncture_twin.planning.base import extras
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.extras import MODULES, require_extra
+from puncture_twin.planning.base import errors as extras
+from puncture_twin.planning.base.errors import MODULES, InputError, require_extra
 from puncture_twin.run_twin import main
 
 ROOT = Path(__file__).parents[2]
@@ -41,7 +40,7 @@ def test_planner_map_and_page_need_no_extra():
 )
 def test_a_missing_extra_is_one_line(arguments, monkeypatch, capsys):
     """A command that needs it names it, says how to get it, and ends with exit code 2 before it does anything."""
-    monkeypatch.setattr("puncture_twin.planning.base.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("puncture_twin.planning.base.errors.find_spec", lambda name: None)
     assert main(arguments) == 2
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 1

@@ -5,8 +5,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from puncture_twin.planning.base.html import card, never_raises
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
+from puncture_twin.planning.base.text import card, never_raises
 
 LEGEND = (Entry("safe", (0, 158, 115)), Entry("too close", (213, 94, 0)), Entry("undecided", (255, 255, 255)))
 HOSTILE = '</td><script>alert("1")</script>&'

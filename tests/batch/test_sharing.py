@@ -8,7 +8,7 @@ import pytest
 from case_world import ball, registration_section, write_markers
 from cohort_world import plan_of, table_bytes, task_of, tiny_text, write_patient
 
-from puncture_twin.planning.base.cache.memory import MEMORY_BYTES, Memory
+from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, Memory
 from puncture_twin.planning.batch.run_case import STALE, run_case
 
 

@@ -20,7 +20,7 @@ from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.needle.deflection import GAUGES, Shaft
 from puncture_twin.planning.registration.aim import reached_insertion
-from puncture_twin.planning.registration.marker_noise import reading_noise
+from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.run_twin import app

@@ -13,8 +13,7 @@ from scipy.optimize import nnls
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh, skin_paths
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles

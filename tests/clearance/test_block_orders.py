@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Arrays, Cache
-from puncture_twin.planning.base.cache.entry_file import packed, unpacked
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.base.cache.entry_file import Arrays, packed, unpacked
 from puncture_twin.planning.base.errors import CacheWarning
 from puncture_twin.planning.clearance import fast_engine as module
 from puncture_twin.planning.clearance.fast_engine import FastEngine

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
-from puncture_twin.planning.base.cache.entry_file import packed, unpacked
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.cache.entry_file import Arrays, packed, unpacked
 from puncture_twin.planning.base.errors import CacheWarning
 from puncture_twin.planning.collision import packed as module
 from puncture_twin.planning.collision.packed import TriangleTree

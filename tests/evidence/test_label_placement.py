@@ -6,8 +6,7 @@ from placed_trunk import PHANTOMS, moved, write_trunk
 from places import DATA
 
 from benchmarks.placements import Patient, changed, meshes_of, real, source_of, wrong
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.findings import Severity
+from puncture_twin.planning.base.errors import InputError, Severity
 from puncture_twin.planning.evidence.edges import compare, edge_image, sample_surfaces
 from puncture_twin.planning.evidence.label_placement import REFUSING_Z, STRUCTURES, WARNING_Z, assess, slip_of
 from puncture_twin.planning.geometry.rigid import exp_rotation

@@ -7,7 +7,7 @@ import pytest
 from placed_trunk import moved, write_trunk
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.base.findings import Severity
+from puncture_twin.planning.base.errors import Severity
 from puncture_twin.planning.evidence.named_places import TISSUES, densities, order_of_organs
 from puncture_twin.planning.search.context import prepare
 

@@ -20,8 +20,7 @@ from puncture_twin.planning.base.cache.array_cache import NO_CACHE
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.label_surface import label_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of
-from puncture_twin.planning.formats.volumes.volume_files import read_volume
-from puncture_twin.planning.formats.volumes.volume_source import VolumeFile
+from puncture_twin.planning.formats.volumes.volume_files import VolumeFile, read_volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 REAL = REAL_CT

@@ -6,8 +6,8 @@ from places import REAL_CT
 
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of
 from puncture_twin.planning.formats.labels.naming import V1, V2
-from puncture_twin.planning.formats.labels.numbering import likely_numbering
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.init.label_files import likely_numbering
 
 PLACES = {
     "liver": (-80, 0, 30), "spleen": (90, 40, 50), "kidney_left": (60, 50, -20), "kidney_right": (-60, 50, -30),

@@ -14,14 +14,12 @@ import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+from puncture_twin.planning.anatomy.scan import nearest
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.volumes.nearest_voxel import nearest
 from puncture_twin.planning.formats.volumes.nifti_header import TYPES
 from puncture_twin.planning.formats.volumes.nrrd_header import TYPES as NRRD_TYPES
-from puncture_twin.planning.formats.volumes.orientation import canonical
-from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.formats.volumes.volume_files import VolumeFile, canonical, read_volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, refuse_lost_grid
-from puncture_twin.planning.formats.volumes.volume_source import VolumeFile
 
 SHAPE = (4, 5, 6)
 VALUES = np.arange(120, dtype="<i2").reshape(SHAPE)

@@ -6,7 +6,8 @@ from scipy.special import chdtri
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
-from puncture_twin.planning.registration.fits.least_squares import (
+from puncture_twin.planning.registration.fits import (
+    ReadingNoise,
     design,
     differenced_map,
     fit_rigid,
@@ -14,9 +15,8 @@ from puncture_twin.planning.registration.fits.least_squares import (
     least_squares_map,
 )
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.reading_noise import ReadingNoise
+from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residual_test import NoiseTest, noise_test
 
 T_TRUE = pose(exp_rotation(np.array([0.4, -0.2, 1.1])), np.array([300.0, -200.0, 100.0]))
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147], [0, 80, 60]])

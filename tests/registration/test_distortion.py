@@ -6,8 +6,7 @@ import scipy.stats
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
-from puncture_twin.planning.registration.fits.distortion import DOUBTED, KINDS
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits import DOUBTED, KINDS, fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_4

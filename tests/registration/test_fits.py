@@ -7,9 +7,8 @@ from uncertainty_world import declared, world
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose
-from puncture_twin.planning.registration.fits.least_squares import fit_joint, fit_rigid, fit_triad, fit_weighted
+from puncture_twin.planning.registration.fits import ReadingNoise, fit_joint, fit_rigid, fit_triad, fit_weighted
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.reading_noise import ReadingNoise
 from puncture_twin.planning.registration.registration import register
 
 T_TRUE = pose(exp_rotation(np.array([0.4, -0.2, 1.1])), np.array([300.0, -200.0, 100.0]))

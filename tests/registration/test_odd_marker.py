@@ -5,10 +5,10 @@ import pytest
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.noise_test import FALSE_ALARM, odd_marker
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residual_test import FALSE_ALARM, odd_marker
 
 TURN = np.array([0.3, -0.2, 1.0])
 T_BASE_CT = pose(exp_rotation(TURN), left_jacobian(TURN) @ [300.0, -50.0, 100.0])

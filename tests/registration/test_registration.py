@@ -9,9 +9,9 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.conditioning import conditioning, leverage
-from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_rigid, fit_triad
+from puncture_twin.planning.registration.fits import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
+from puncture_twin.planning.registration.noise_test import conditioning, leverage
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2, TABLE_4
 

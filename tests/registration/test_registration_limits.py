@@ -11,9 +11,9 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.conditioning import leverage
-from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_rigid, fit_triad
+from puncture_twin.planning.registration.fits import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
+from puncture_twin.planning.registration.noise_test import leverage
 from puncture_twin.planning.registration.registration import register
 
 TARGET = np.array([10.0, 20.0, 30.0])

@@ -7,11 +7,11 @@ from scipy.stats import chi2
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.marker_ambiguity import rigid_rss
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.method import rigid_rss
+from puncture_twin.planning.registration.noise_test import DOUBT, MIN_FLE_MM, ResidualTest
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.registration.residual_test import DOUBT, MIN_FLE_MM, ResidualTest
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2
 
 TARGET = np.array([50.0, 130.0, 63.0])

@@ -5,7 +5,7 @@ import numpy as np
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.registration.marker_noise import touching_configuration, touching_poses
+from puncture_twin.planning.registration.fit_uncertainty import touching_configuration, touching_poses
 
 UR3 = ur_model("ur3")
 NEEDLE_MM = 200.0

@@ -17,7 +17,7 @@ from puncture_twin.planning.registration.checks.checked_placement import (
     placement_findings,
 )
 from puncture_twin.planning.registration.checks.markers import Surroundings
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main

@@ -18,8 +18,8 @@ from puncture_twin.planning.case.settings import Needle, RobotSettings, SearchSe
 from puncture_twin.planning.case.tables import MarkerSection, RankingSection, RehearsalSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.conditioning import leverage
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
+from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
+from puncture_twin.planning.registration.noise_test import leverage
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
 

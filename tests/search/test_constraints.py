@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.beyond_image import beyond_image
 from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
-from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh, skin_paths
 from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.anatomy.unseen import beyond_image
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle, SearchSettings
 from puncture_twin.planning.clearance.engine import measure

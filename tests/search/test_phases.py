@@ -8,7 +8,7 @@ from case_world import ORGAN, SKIN, ball, case_text, structure, write_balls
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.anatomy.skin import skin_paths
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.settings import Obstacle

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from puncture_twin.planning.anatomy.skin_entry import SkinPaths
+from puncture_twin.planning.anatomy.skin import SkinPaths
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle

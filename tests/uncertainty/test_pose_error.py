@@ -8,8 +8,8 @@ from scipy.special import chdtri
 from uncertainty_world import NO_ARM, SLICES, declared, world
 
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
-from puncture_twin.planning.registration.conditioning import leverage
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.noise_test import leverage
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.uncertainty.pose_error import error_budget
 from puncture_twin.twin.rehearsal.trials import draw_trials

@@ -8,7 +8,7 @@ from uncertainty_world import NO_ARM, SLICES, declared, world
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.marker_noise import reading_noise
+from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 from puncture_twin.planning.uncertainty.touch_choice import choose_touches
 
 ARM = {"arm": "nominal", "tip_offset_mm": 0.0, "needle_direction_deg": 0.0, "joint_drift_deg": 0.0}

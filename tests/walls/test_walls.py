@@ -14,7 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from walls.house import NAME, ROOT, arrows, cycle, imported, is_package, modules, room_arrows, tree
 
-from puncture_twin.planning.base.extras import MODULES
+from puncture_twin.planning.base.errors import MODULES
 
 PLANT_IN_GUIDANCE = {
     "puncture_twin.twin.guidance.stereo.stereo_workcell",

@@ -22,7 +22,7 @@ from scipy.special import chdtrc
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import design, fit_affine, fit_rigid, fit_triad
+from puncture_twin.planning.registration.fits import design, fit_affine, fit_rigid, fit_triad
 
 Point = tuple[float, float, float]
 

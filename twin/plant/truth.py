@@ -15,7 +15,7 @@ from puncture_twin.planning.case.tables import MarkerSection
 from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid, fit_triad
+from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, match
 
 COLLINEAR = 0.01

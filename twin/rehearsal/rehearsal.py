@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.skin_entry import skin_paths
+from puncture_twin.planning.anatomy.skin import skin_paths
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case, bed_frame

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.brief import brief
+from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.twin.plant.true_needle import NO_TISSUE_FORCE, TissueForce
 

@@ -23,8 +23,7 @@ from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown, TableSide
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned, measured_hu
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, grown
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.volumes.orientation import canonical, in_order
-from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.formats.volumes.volume_files import Volume, canonical, in_order
 from puncture_twin.planning.geometry.parts import largest_part, middle_of, parts_of
 
 BODY_HU = -500.0

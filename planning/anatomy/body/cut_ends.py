@@ -60,7 +60,7 @@ ENDS_FLAT = (
 
 @dataclass(frozen=True, eq=False)
 class FieldOfView:
-    """What was imaged: beyond a face that cuts the body, the body goes on (`planning.anatomy.beyond_image`).
+    """What was imaged: beyond a face that cuts the body, the body goes on (`planning.anatomy.unseen`).
 
     Attributes:
         T_ct_box: Shape (4, 4), rigid; the box frame's origin is its low corner, its axes run mostly to the

@@ -15,7 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.text_names import check_name
+from puncture_twin.planning.base.text import check_name
 from puncture_twin.planning.geometry.rigid import about_fixed_axes, pose
 
 Element = ElementTree.Element

@@ -15,8 +15,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import is_plain_file
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import is_plain_file, read_input
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
 from puncture_twin.planning.base.strict_json import field, fitting, read_json, text, texts
 

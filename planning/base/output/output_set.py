@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.output.draft import Draft, new_draft, sweep
 from puncture_twin.planning.base.output.manifest import Manifest, read_manifest
-from puncture_twin.planning.base.output.publish import publish, refuse_foreign
+from puncture_twin.planning.base.output.publish import Draft, new_draft, publish, refuse_foreign, sweep
 from puncture_twin.planning.base.provenance import Input
 
 NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO})

@@ -10,15 +10,21 @@ When all files of a draft are there:
 The entries that go are the command's old one, every one that owns a file of the same name, and whatever depends on
 those. Whoever is killed before 1 leaves the old set, after 4 the new one, and between them files that no manifest
 lists.
+
+Files that are being written: a draft is a folder of its own inside the output folder, on the same file system.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import signal
+import tempfile
 import threading
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +32,6 @@ from types import FrameType
 from typing import Any
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
     MAX_MANIFEST_BYTES,
@@ -35,6 +40,7 @@ from puncture_twin.planning.base.output.manifest import (
     ManifestEntry,
     file_digest,
 )
+from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.strict_json import read_json
 
 MOST_NAMED = 8
@@ -198,3 +204,68 @@ def _read(path: Path) -> dict[str, Any]:
     except InputError:
         return {}
     return document if isinstance(document, dict) else {}
+
+
+DRAFT_PREFIX = ".puncture-twin-draft-"
+"""Folders of this name are drafts; who holds the folder's lock knows that nobody else is writing to one."""
+
+
+@dataclass(eq=False)
+class Draft:
+    """Files that are being written and belong to nothing yet.
+
+    Attributes:
+        command: Whose; the name of its entry.
+        out: The output folder.
+        folder: Where the files are written.
+        depends_on: Entries of the output folder that these files are made from.
+        parts: Files that go to an entry of another name than the command's.
+        seconds: How long each stage took, for ``timings.json``; read at the end.
+        note: Told what was removed that nobody might expect.
+        old: What the output folder holds.
+        legacy: Files in it that an older version left without a manifest.
+    """
+
+    command: str
+    out: Path
+    folder: Path
+    inputs: Sequence[Input]
+    seconds: Mapping[str, float]
+    note: Callable[[str], None]
+    old: Manifest
+    legacy: tuple[str, ...]
+    depends_on: tuple[str, ...] = ()
+    parts: dict[str, str] = field(default_factory=dict)
+
+    def final(self, files: Iterable[Path]) -> tuple[Path, ...]:
+        """Where files of the draft will lie."""
+        return tuple(self.out / path.relative_to(self.folder) for path in files)
+
+    def split(self, command: str, *files: Path) -> None:
+        """Give files to an entry of their own, which depends on this command's."""
+        self.parts |= {path.relative_to(self.folder).as_posix(): command for path in files}
+
+    def source_has(self, name: str) -> bool:
+        """Whether an entry that this draft depends on has a file of this name in the output folder."""
+        return self.old.owner(name) in self.depends_on
+
+    def keep(self, name: str) -> None:
+        """Take over a file of the command's old entry as it is, if that has it: it may be the input of this run."""
+        if self.old.owner(name) == self.command and (self.out / name).is_file():
+            shutil.copyfile(self.out / name, self.folder / name)
+
+
+def new_draft(out: Path, stack: ExitStack) -> Path:
+    """A folder for the files; it goes with the stack, whatever happens."""
+    draft = Path(tempfile.mkdtemp(prefix=f"{DRAFT_PREFIX}{os.getpid()}-", dir=out))
+    stack.callback(shutil.rmtree, draft, ignore_errors=True)
+    for part in ("files", "state"):
+        (draft / part).mkdir()
+    return draft / "files"
+
+
+def sweep(out: Path) -> None:
+    """Remove drafts of the dead: the lock is held, so nobody else is writing."""
+    for path in out.glob(f"{DRAFT_PREFIX}*"):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, text
 from puncture_twin.planning.formats.dicom.pixels import PixelLayout, pixel_layout, stored_values
 from puncture_twin.planning.formats.dicom.recognise import choose_series, described
@@ -26,9 +26,8 @@ from puncture_twin.planning.formats.dicom.slices import (
     stack_of,
     straight_grid,
 )
-from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, Volume
+from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, Content, Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, check_affine, check_shape
-from puncture_twin.planning.formats.volumes.volume_source import Content
 
 LOSSY = "{} files were compressed with loss, so that their values are not exact"
 CLASS_IN_META = "{} files do not say what they are; the SOP class of their meta information was taken"

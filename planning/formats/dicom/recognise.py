@@ -15,9 +15,8 @@ from pydicom.tag import BaseTag
 from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import is_folder
-from puncture_twin.planning.base.input_file import read_input
-from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.base.files import is_folder, read_input
+from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.formats.dicom.dicom_file import (
     has,
     parse_dicom,

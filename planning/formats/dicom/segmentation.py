@@ -42,8 +42,8 @@ from puncture_twin.planning.formats.dicom.slices import (
     plane_of,
 )
 from puncture_twin.planning.formats.dicom.storage import PLAIN, SEGMENTATION
+from puncture_twin.planning.formats.volumes.volume_files import Content
 from puncture_twin.planning.formats.volumes.volume_header import MAX_SPACING_MM, MIN_SPACING_MM, VolumeGrid, check_shape
-from puncture_twin.planning.formats.volumes.volume_source import Content
 
 MAX_SLICES = 20_000
 """Between the first and the last frame."""

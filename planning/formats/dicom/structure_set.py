@@ -15,7 +15,7 @@ from skimage.morphology import convex_hull_image
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
 from puncture_twin.planning.formats.dicom.dicom_file import (
     has,
@@ -35,8 +35,8 @@ from puncture_twin.planning.formats.dicom.named_masks import (
     unique_names,
 )
 from puncture_twin.planning.formats.dicom.storage import STRUCTURE_SET
+from puncture_twin.planning.formats.volumes.volume_files import Content
 from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, VolumeGrid, check_shape
-from puncture_twin.planning.formats.volumes.volume_source import Content
 from puncture_twin.planning.geometry.rigid import apply
 
 CLOSED = ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")

@@ -25,7 +25,7 @@ from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
-from puncture_twin.planning.formats.volumes.orientation import canonical
+from puncture_twin.planning.formats.volumes.volume_files import canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import is_folder
-from puncture_twin.planning.base.text_names import first_few
+from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.formats.folder import FILE, Entry, entries, unaccounted
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, corner_deviation_mm

@@ -19,8 +19,7 @@ from types import MappingProxyType
 from typing import Generic, Protocol, TypeVar
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.near_names import did_you_mean
-from puncture_twin.planning.base.text_names import check_name, first_few
+from puncture_twin.planning.base.text import check_name, did_you_mean, first_few
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
 
 _ABDOMEN = "spleen kidney_right kidney_left gallbladder liver stomach"

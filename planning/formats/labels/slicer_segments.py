@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.text_names import check_name
+from puncture_twin.planning.base.text import check_name
 from puncture_twin.planning.formats.dicom.named_masks import Mask, MaskVolume, NamedMasks, unique_names
 from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_layered_header
+from puncture_twin.planning.formats.volumes.volume_files import Content
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader
-from puncture_twin.planning.formats.volumes.volume_source import Content
 from puncture_twin.planning.formats.volumes.voxels import decoded
 
 SEGMENT_ENDING = ".nrrd"

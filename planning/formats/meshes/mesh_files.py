@@ -18,9 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.cache.array_cache import Arrays, Cache
+from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.formats.mesh_guard import guard_mesh, twice_areas
 from puncture_twin.planning.formats.meshes.obj import read_obj
 from puncture_twin.planning.formats.meshes.ply import read_ply

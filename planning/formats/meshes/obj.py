@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from puncture_twin.planning.base.input_file import decode_text
+from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.raw_mesh import RawMesh, refuse, triangulate
 
 _IGNORED = frozenset({"vt", "vn", "vp", "o", "g", "s", "mg", "usemtl", "mtllib", "l", "p", "usemap", "maplib"})

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import decode_text
+from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.raw_mesh import RawMesh, refuse, token_array, triangulate
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

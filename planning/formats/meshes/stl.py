@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.input_file import decode_text
+from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.raw_mesh import RawMesh, refuse
 
 _HEADER_BYTES = 84

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import is_plain_file
-from puncture_twin.planning.base.input_file import absence
+from puncture_twin.planning.base.files import absence, is_plain_file
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader, VoxelLayout, check_affine, check_shape
 
 MAX_HEADER_BYTES = 4_000_000

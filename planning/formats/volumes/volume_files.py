@@ -3,26 +3,31 @@
 General readers fill a truncated file with zeros, turn NaN into 0, load a NaN affine and follow a header to any file of
 the machine. So headers and voxels are read here, from the bytes that were hashed: what a header promises is held
 against what is there, and nothing is inflated beyond it. The tests hold every value against SimpleITK.
+
+A volume before its voxels are decoded: which files it is made of, where it lies, and how to get the voxels.
+
+One array order for every volume: axis 0 runs mostly to the patient's left, 1 to the back, 2 to the head.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import is_plain_file
-from puncture_twin.planning.base.input_file import absence, read_input
+from puncture_twin.planning.base.files import absence, is_plain_file, read_input
+from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.formats.volumes import nrrd_header
 from puncture_twin.planning.formats.volumes.nifti_header import parse_nifti_header
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_nrrd_header
-from puncture_twin.planning.formats.volumes.volume_header import MAX_VOXELS, VolumeHeader, VoxelLayout
+from puncture_twin.planning.formats.volumes.volume_header import MAX_VOXELS, VolumeGrid, VolumeHeader, VoxelLayout
 from puncture_twin.planning.formats.volumes.voxels import decoded
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
@@ -143,3 +148,125 @@ def _scaled(stored: NDArray[Any], cells: VoxelLayout) -> NDArray[Any]:
         scaled *= cells.slope
         scaled += cells.intercept
         return scaled.astype(kept)
+
+
+Content = Callable[[str], bytes]
+"""The bytes of a file by its name: those that were hashed, each time."""
+
+
+class VolumeSource(Protocol):
+    """A volume in one file, in two, or in a folder of slices.
+
+    Attributes:
+        path: What was named.
+        files: Every file that decides a voxel or its place, as the content is wanted it.
+        part: Which part of these files it is, where they hold several volumes.
+        notes: What a person should be told of how it was read, one sentence each.
+        grid: Where the voxels lie, LPS mm.
+    """
+
+    @property
+    def path(self) -> Path: ...  # noqa: D102  the class says it
+    @property
+    def files(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def part(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def notes(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def grid(self) -> VolumeGrid: ...  # noqa: D102
+
+    def volume(self) -> Volume:
+        """The volume with its voxels, which are decoded at each call."""
+
+
+@dataclass(frozen=True)
+class VolumeFile:
+    """A volume in one file, or in a header and a file of voxels beside it.
+
+    Attributes:
+        path: What was named.
+        files: That file, and the one beside it.
+        content: Gives the bytes of both.
+    """
+
+    path: Path
+    files: tuple[str, ...]
+    content: Content
+    part: tuple[str, ...] = ()
+
+    @cached_property
+    def grid(self) -> VolumeHeader:
+        """Where the voxels lie, LPS mm, as the checked header states it."""
+        return parse_header(self.content(self.files[0]), self.path)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should be told of how the header was read."""
+        return self.grid.notes
+
+    def volume(self) -> Volume:
+        """The volume with its voxels."""
+        header, *data = (self.content(name) for name in self.files)
+        return parse_volume(header, self.path, data[0] if data else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Oriented:
+    """An array in canonical order.
+
+    Attributes:
+        values: Shape (nx, ny, nz), a view of what was given.
+        T_ct_index: Shape (4, 4), maps an index of ``values`` to LPS mm; its determinant is positive.
+    """
+
+    values: NDArray[Any]
+    T_ct_index: NDArray[np.float64]
+
+    @property
+    def spacing_mm(self) -> NDArray[np.float64]:
+        """Voxel size along each axis, shape (3,), mm."""
+        return np.asarray(np.linalg.norm(self.T_ct_index[:3, :3], axis=0))
+
+
+TILE = (32, 64)
+"""Slices and rows that are copied at a time: what they take lies in a processor's own memory."""
+
+
+def in_order(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
+    """A copy that lies in memory in the order of its axes, the last one fastest, as every mask does that is made of it.
+
+    Args:
+        values: Shape (nx, ny, nz), in any order, such as a view of a file that runs the other way.
+        dtype: Of the copy.
+    """
+    found = np.empty(values.shape, dtype)
+    for k in range(0, values.shape[2], TILE[0]):
+        for j in range(0, values.shape[1], TILE[1]):
+            tile = (slice(None), slice(j, j + TILE[1]), slice(k, k + TILE[0]))
+            found[tile] = values[tile]
+    return found
+
+
+def canonical(values: NDArray[Any], T_ct_index: NDArray[np.float64]) -> Oriented:
+    """The same voxels with their axes permuted and flipped so that they run along +L, +P, +S as nearly as can be.
+
+    What an algorithm makes of a volume may depend on the array's order (ambiguous cells of marching cubes do);
+    after this step it cannot depend on how the file stored it.
+
+    Args:
+        values: Shape (ni, nj, nk).
+        T_ct_index: Shape (4, 4), maps index (i, j, k) to LPS mm.
+    """
+    axes = T_ct_index[:3, :3] / np.linalg.norm(T_ct_index[:3, :3], axis=0)
+    order = max(itertools.permutations(range(3)), key=lambda p: sum(abs(axes[row, p[row]]) for row in range(3)))
+    T_index_oriented = np.zeros((4, 4))
+    T_index_oriented[3, 3] = 1.0
+    flips = []
+    for row, axis in enumerate(order):
+        backward = bool(axes[row, axis] < 0)
+        T_index_oriented[axis, row] = -1.0 if backward else 1.0
+        T_index_oriented[axis, 3] = values.shape[axis] - 1 if backward else 0
+        flips.append(slice(None, None, -1 if backward else 1))
+    T_ct_oriented = T_ct_index @ T_index_oriented
+    return Oriented(values.transpose(order)[tuple(flips)], T_ct_oriented)

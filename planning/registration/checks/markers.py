@@ -30,8 +30,8 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.registration.checks.places import place_excluded, untouchable
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
-from puncture_twin.planning.registration.fits.marker_ambiguity import Renaming, renamings
+from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.method import Renaming, renamings
 from puncture_twin.planning.registration.registration import Registration
 
 MARKER_ON_SKIN_MM = 30.0

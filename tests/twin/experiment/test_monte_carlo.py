@@ -6,7 +6,7 @@ from scipy.optimize import minimize_scalar
 from typer.testing import CliRunner
 
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.run_twin import app
 from puncture_twin.twin.experiment.chen2019 import (
     AS_FOUND,

@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import fit_rigid
+from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.twin.guidance.stereo.cameras.calibration import CameraCalibration, calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, Search, look_at

@@ -15,8 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import atomic, is_folder
-from puncture_twin.planning.base.input_file import decode_text, read_input
+from puncture_twin.planning.base.files import atomic, decode_text, is_folder, read_input
 from puncture_twin.planning.formats.points import joint_readings, row_numbers
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording

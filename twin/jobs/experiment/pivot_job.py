@@ -15,7 +15,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import PARAMETERS, check_recording, flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
 from puncture_twin.planning.case.case import Case

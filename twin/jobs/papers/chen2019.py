@@ -17,7 +17,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import needle_pose, outward
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits.least_squares import fit_affine, fit_triad
+from puncture_twin.planning.registration.fits import fit_affine, fit_triad
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2, TABLE_4, Point
 
 TOLERANCE_MM = 0.01

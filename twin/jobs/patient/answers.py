@@ -15,7 +15,7 @@ from puncture_twin.planning.anatomy.anatomy import load_anatomy, load_skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError, InputListError
-from puncture_twin.planning.base.input_file import read_input
+from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.case.case import Case
@@ -28,12 +28,11 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.advice import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.planning.registration.checks.places import touchable_points
-from puncture_twin.planning.registration.fits.least_squares import rigid_fre_mm
-from puncture_twin.planning.registration.fits.method import LEAST_FOUND_MM
+from puncture_twin.planning.registration.fits import ReadingNoise, rigid_fre_mm
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
-from puncture_twin.planning.registration.reading_noise import ReadingNoise
+from puncture_twin.planning.registration.method import LEAST_FOUND_MM
+from puncture_twin.planning.registration.noise_test import INTERVAL
 from puncture_twin.planning.registration.registration import Registration, register
-from puncture_twin.planning.registration.residual_test import INTERVAL
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, choose, chosen_angles, refuse_other_entry, with_file_read
 from puncture_twin.planning.search.context import CaseContext

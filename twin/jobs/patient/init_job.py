@@ -8,8 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.cache.memory import Memory
+from puncture_twin.planning.base.cache.array_cache import Memory, user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import withdraw, writing
+from puncture_twin.planning.base.output.publish import Draft
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan

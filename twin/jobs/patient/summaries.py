@@ -11,7 +11,7 @@ from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.registration.fits.distortion import Distortion
+from puncture_twin.planning.registration.fits import Distortion
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext

@@ -15,9 +15,8 @@ from puncture_twin.planning.arm.kinematics import check_recording, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.extras import require_extra
-from puncture_twin.planning.base.input_file import read_input, unfinished_warnings
+from puncture_twin.planning.base.errors import InputError, require_extra
+from puncture_twin.planning.base.files import read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points import joint_readings, parse_joint_recording

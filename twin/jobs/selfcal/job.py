@@ -9,8 +9,8 @@ from typing import Any
 
 from puncture_twin.planning.base.errors import PlanningError
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.base.output.draft import Draft
 from puncture_twin.planning.base.output.output_set import withdraw, writing
+from puncture_twin.planning.base.output.publish import Draft
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME, write_recording

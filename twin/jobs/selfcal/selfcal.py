@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.input_file import read_input, unfinished_warnings
+from puncture_twin.planning.base.files import read_input, unfinished_warnings
 from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.geometry.rigid import exp_rotation

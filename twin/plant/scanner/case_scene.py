@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.anatomy.beyond_labels import BEYOND_LABELS
 from puncture_twin.planning.anatomy.default_roles import default_role
 from puncture_twin.planning.anatomy.structure import Structure
+from puncture_twin.planning.anatomy.unseen import BEYOND_LABELS
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case import Case, bed_frame

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Arrays, Cache
+from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
+from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.candidates import Candidates

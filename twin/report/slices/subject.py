@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, OUTSIDE_BODY
-from puncture_twin.planning.anatomy.beyond_image import BEYOND_IMAGE
+from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.search.bending import insertion_along

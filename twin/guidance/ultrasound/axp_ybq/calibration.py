@@ -8,8 +8,8 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.brief import brief
-from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.base.errors import Finding, Severity
+from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.geometry.rigid import log_rotation, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (

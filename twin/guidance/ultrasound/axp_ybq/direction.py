@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.base.errors import Finding, InputError, Severity
 from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
     DIRECTION,

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.brief import brief
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from puncture_twin.planning.formats.points import joint_readings
 

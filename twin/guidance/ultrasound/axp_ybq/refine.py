@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.findings import Finding, Severity
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton, lacking
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import SCALE, Estimate, parameter_units
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import directions_image, linearised_tip

@@ -1,0 +1,156 @@
+"""Names that come from files: what a terminal, a page and a table may be given.
+
+One line for a value that holds arrays: what ``print`` and a prompt show.
+
+The known name that was likely meant by an unknown one: another capital, a letter too many, two letters swapped.
+
+How a value shows itself in a notebook: a small piece of HTML that needs nothing from outside, and never raises.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import html
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from puncture_twin.planning.base.errors import InputError, one_line
+
+MAX_NAME = 200
+"""Characters of a name; the longest of TotalSegmentator has 29. A longer one is refused, never cut: two names that
+differ at their end must not become one."""
+
+ALLOWED_NAME = f"printable characters on one line, {MAX_NAME} at most: no escape sequence, line break or direction mark"
+
+
+def check_name(name: str, what: str, *, where: str | Path) -> str:
+    """A name that may be printed as it is.
+
+    Args:
+        name: The name as the file states it.
+        what: What it names, for the error: "label 3", "point 2".
+        where: The file, for the error.
+
+    Raises:
+        InputError: An empty name, one of more than `MAX_NAME` characters, or one with a control or format character.
+    """
+    if not name.strip():
+        raise InputError(f"{what} has an empty name", where=where, allowed=ALLOWED_NAME)
+    if len(name) > MAX_NAME:
+        raise InputError(f"{what} has a name of {len(name)} characters", where=where, allowed=ALLOWED_NAME)
+    if not name.isprintable():
+        raise InputError(f"{what} has the name {name!a}", where=where, allowed=ALLOWED_NAME)
+    return name
+
+
+def first_few(names: Sequence[str], most: int = 8) -> str:
+    """The first few of a list, and how many more there are.
+
+    >>> first_few(["liver", "colon", "aorta"], 2)
+    'liver, colon and 1 more'
+    """
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+def unprintable_texts(document: object) -> Iterator[str]:
+    """Every key and string of a nested document (tables, lists) that holds a control or format character."""
+    waiting = [document]
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, str) and not one.isprintable():
+            yield one
+        elif isinstance(one, dict):
+            waiting += [*one.keys(), *one.values()]
+        elif isinstance(one, list | tuple):
+            waiting += one
+
+
+Value = TypeVar("Value")
+
+
+def brief(describe: Callable[[Value], str]) -> Callable[[Value], str]:
+    """Make a ``__repr__`` of a method that says what a value holds; it never raises: a failing test prints values too.
+
+    >>> class Grid:
+    ...     @brief
+    ...     def __repr__(self) -> str:
+    ...         return "3 directions"
+    >>> Grid()
+    <Grid: 3 directions>
+    """
+
+    @functools.wraps(describe)
+    def shown(value: Value) -> str:
+        try:
+            return f"<{type(value).__name__}: {one_line(describe(value))}>"
+        except Exception:  # a value that is only half made still has a name
+            return object.__repr__(value)
+
+    return shown
+
+
+LEAST_ALIKE = 0.6
+"""Of two names, by difflib's ratio, without capitals."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """A question that names the nearest known name; empty where none is near.
+
+    >>> did_you_mean("arota", ["liver", "aorta"]), did_you_mean("m1", ["M1", "M2"]), did_you_mean("x", ["liver"])
+    ("; did you mean 'aorta'?", "; did you mean 'M1'?", '')
+    """
+    plain = {one.casefold(): one for one in known}
+    near = difflib.get_close_matches(name.casefold(), plain, n=1, cutoff=LEAST_ALIKE)
+    return f"; did you mean '{plain[near[0]]}'?" if near else ""
+
+
+Facts = Iterable[tuple[str, str]]
+"""Names and values, as plain text."""
+
+
+STYLE = (
+    "font:13px/1.45 system-ui,sans-serif;display:flex;flex-wrap:wrap;gap:16px;align-items:flex-start;padding:10px 12px;"
+    "border:1px solid #d9dce1;border-radius:8px;max-width:880px;background:#fff;color:#1b1e23"
+)
+ROW = "background:none"
+NAME = "text-align:left;padding:1px 14px 1px 0;font-weight:500;color:#5a616b;vertical-align:top;white-space:nowrap"
+CELL = "text-align:left;padding:1px 0;overflow-wrap:anywhere"
+"""Colours of text and ground are stated together, so that a dark notebook can read both."""
+
+
+def escape(value: object) -> str:
+    """Text made safe for HTML."""
+    return html.escape(str(value), quote=True)
+
+
+def card(title: str, facts: Facts, picture: str = "") -> str:
+    """A title, a table of facts and, beside it, a picture.
+
+    Args:
+        title: Plain text.
+        facts: Names and values, plain text.
+        picture: HTML, such as an SVG; "" for none.
+    """
+    rows = "".join(
+        f'<tr style="{ROW}"><th style="{NAME}">{escape(name)}</th><td style="{CELL}">{escape(value)}</td></tr>'
+        for name, value in facts
+    )
+    table = f'<table style="border-collapse:collapse;margin:0;border:0"><tbody>{rows}</tbody></table>'
+    head = f'<div style="font-weight:600;font-size:15px;margin-bottom:4px">{escape(title)}</div>'
+    return f'<div style="{STYLE}"><div style="flex:1 1 320px">{head}{table}</div>{picture}</div>'
+
+
+def never_raises(make: Callable[[Value], str]) -> Callable[[Value], str]:
+    """What a notebook calls: where a value cannot be shown, its class and the error are."""
+
+    @functools.wraps(make)
+    def shown(value: Value) -> str:
+        try:
+            return make(value)
+        except Exception as error:  # a notebook must not lose the value to its picture
+            return f"<pre>{escape(object.__repr__(value))}\n{escape(type(error).__name__)}</pre>"
+
+    return shown
