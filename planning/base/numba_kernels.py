@@ -35,6 +35,8 @@ from puncture_twin.planning.base.cache.entry_file import check_own_folder
 from puncture_twin.planning.base.cache.source_stamp import files_unedited, library_versions, sources_with, stamp_of
 from puncture_twin.planning.base.errors import CacheWarning
 
+__all__ = ["allocation_free", "is_compiled", "nb"]
+
 config: Any = nb.config
 """It makes its attributes when it is loaded."""
 
