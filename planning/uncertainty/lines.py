@@ -535,7 +535,7 @@ def first_touches(problem, root, directions, radii):  # type: ignore[no-untyped-
 
 @nb.njit(cache=True, error_model="numpy")
 def _first_touch(scene, start, ahead, gap, hint):  # type: ignore[no-untyped-def]
-    """Distance at which a ray first touches, from where the clearance is ``gap``."""
+    """Standard deviations at which a ray first touches, from where the clearance is ``gap``."""
     fastest, beta, low, clear = fastest_approach(scene, start, ahead), 0.0, 0.0, 0.0
     while gap >= 0.0 and beta < RAYS_TO:
         step = next_step(gap / fastest, clear, beta - low, RAY_STEP)
