@@ -181,7 +181,7 @@ def convex_hull(points: Floats) -> TriangleMesh | None:
 
 
 def _thickness_mm(points: Floats) -> float:
-    """How far points (n, 3), mm, reach across the plane that fits them best."""
+    """Extent of points (n, 3), mm, across the plane that fits them best."""
     centred = points - points.mean(axis=0)
     across = np.linalg.eigh(centred.T @ centred).eigenvectors[:, 0]  # of the least eigenvalue
     return float(np.ptp(centred @ across))

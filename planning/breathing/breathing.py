@@ -60,7 +60,7 @@ class Breathing:
         return np.asarray(s <= (1.0 if self.gate is None else self.gate))
 
     def moved_ct(self, s: float, weight: float = 1.0) -> Floats:
-        """How far something of a weight is from where the CT shows it, at a position s; shape (3,), mm."""
+        """Displacement of something of a weight from where the CT shows it, at a position s; shape (3,), mm."""
         return np.asarray((s - self.scanned_at) * weight * self.amplitude_mm * self.direction_ct)
 
     def phase_text(self, s: float) -> str:

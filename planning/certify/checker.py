@@ -250,7 +250,7 @@ class _Checker:
         )
 
     def _skin_rejects(self, known: _Known, reason: str) -> bool:
-        """No skin soon enough (whatever else is there), a second crossing, or too flat an entry."""
+        """Whether no skin is soon enough (whatever else is there), or is crossed twice, or too flatly."""
         if reason == "unknown_region" and self._even:
             return True
         facts = known.facts

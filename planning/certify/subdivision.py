@@ -259,7 +259,7 @@ def any_flange(needle: Needle, question: Question, count: int) -> Floats:
 
 
 def flange_bounds(needle: Needle, question: Question, skin: SkinBounds) -> Floats:
-    """How far from the target the flanges over n cones are at least and at most, shape (n, 2), mm.
+    """Least and largest distance of the flanges over n cones from the target, shape (n, 2), mm.
 
     They hold for every direction whose path and skin angle the case allows; along others no tip ever waits. The flange
     is the farther, the longer the path and the larger the angle.
@@ -316,7 +316,7 @@ class _Record:
         self.leaves.append(tuple(column[leaf] for column in columns))
 
     def certificate(self, question: Question, size: float, evaluator: _Evaluator) -> Certificate:
-        """All levels together."""
+        """The certificate of all recorded levels."""
         theta, beta, verdict, code, triangle, bound = (
             np.concatenate(column) for column in zip(*self.leaves, strict=True)
         )

@@ -287,7 +287,7 @@ def _empty_answer(questions: int) -> Answer:
 
 
 def _halvings(step: Floats) -> int:
-    """How often a step (6,), rad, is halved for all checks together; one that is no number not at all."""
+    """Number of halvings of a step (6,), rad, for all checks together; none of one that is no number."""
     length = math.sqrt(float(step @ step))
     return min(HALVINGS, max(0, math.ceil(math.log2(length / LOOK_FIRST_RAD)))) if 0.0 < length < math.inf else 0
 

@@ -133,7 +133,7 @@ def _gantry_boxes(gantry: Gantry, T_base_ct: Floats) -> tuple[Box, ...]:
 
 
 def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
-    """How far the skin reaches outward of the bore within the gantry's thickness; 0 where it does nowhere.
+    """Depth by which the skin reaches beyond the bore within the gantry's thickness, mm; 0 where it does not.
 
     Decided about is each whole triangle and the round bore: the wall, and all that lies outward of it, is what is
     farther from the axis than the bore's radius between the two planes of its faces. The distance from the axis is a

@@ -70,7 +70,7 @@ class Program:
 
 
 class JointMove(NamedTuple):
-    """One ``movej``: straight in joint angles."""
+    """One ``movej``: a move that is straight in joint angles."""
 
     q: Floats
     """Where it ends, shape (6,), rad."""

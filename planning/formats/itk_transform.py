@@ -39,7 +39,7 @@ _NUMBER = re.compile(r"[!-^`-~]+")
 
 
 def most_bytes(name: str) -> int:
-    """How large a transform file may be, by its ending."""
+    """Largest size of a transform file, by its ending, bytes."""
     return MAX_HDF5_BYTES if name.lower().endswith(HDF5_ENDINGS) else MAX_TEXT_BYTES
 
 

@@ -397,7 +397,7 @@ def _largest(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _span(p):  # type: ignore[no-untyped-def]  # numba infers
-    """How far from the ray a point of the plane across it lies, along one axis or the other."""
+    """Distance of a point of the plane across a ray from it, along one axis or the other."""
     return max(abs(p[0]), abs(p[1]))
 
 
@@ -427,7 +427,7 @@ def _turn(p, q):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
-    """How far a point lies along a ray."""
+    """Distance of a point along a ray."""
     return p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
 
 

@@ -187,7 +187,7 @@ def _shortcut_check(checker: StateChecker) -> SegmentContact | None:
 
 
 def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
-    """How far from each waypoint between the ends its rounding may begin, shape (k - 2,), rad; 0 where none is free."""
+    """Distance from each inner waypoint at which its rounding may begin, shape (k - 2,), rad; 0 where none is free."""
     if len(waypoints) == 2:
         return np.zeros(0)
     steps = np.diff(waypoints, axis=0)

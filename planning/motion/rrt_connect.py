@@ -57,7 +57,7 @@ class Connected(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Where a run samples, and when it stops."""
+    """Sampling box and stopping rule of a run."""
 
     bounds: Floats
     """Shape (6, 2), rad: where samples are drawn; home and goals lie in it."""

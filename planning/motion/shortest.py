@@ -132,7 +132,7 @@ def _straight(contact_of: SegmentContact, home: Floats, goals: Floats, away: lis
 
 
 def _run(task: Task, best: Path | None, seed: int, max_samples: int) -> Connected:
-    """One run: where a path shorter than the best can lie; without one near home and goals first, then anywhere."""
+    """One run of the planner: where a path shorter than the best can lie; without one near home and goals first."""
     if best is not None:
         spare = (best.length - np.abs(task.goals - task.home)).max(axis=0) / 2.0  # there and back along one joint
         limits = Limits(_box(task, spare.clip(0.0)), max_samples, best.length)

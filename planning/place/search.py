@@ -275,7 +275,7 @@ class _Refiner:
 
     @property
     def estimated(self) -> int:
-        """How many sites were estimated."""
+        """Number of estimated sites."""
         return len(self._hoped)
 
     def refine(self, seeds: Sequence[Site], step_mm: float) -> list[tuple[Site, ReachEstimate]]:

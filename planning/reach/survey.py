@@ -413,7 +413,7 @@ def sampled(
 def _sampled(  # type: ignore[no-untyped-def]  # numba infers
     lengths, R, target, outward, branch, turn, lengths_mm, samples, bodies, most_mm
 ):
-    """As :func:`sampled`: with as many more samples as the largest motion asks for, until it asks for none."""
+    """Fill the states of `sampled`: with as many more samples as the largest motion demands, until none are."""
     needle, standoff = lengths_mm
     while True:
         step = standoff / (samples - 1)

@@ -250,7 +250,7 @@ class Candidates(Columns):
 
     @property
     def least_clearance(self) -> Floats:
-        """To any structure with a margin, shape (n,), mm: the least of all positions of the breath that are checked."""
+        """Least clearance to a structure with a margin over all checked positions of the breath, shape (n,), mm."""
         if self.breathing is None:
             return self.clearance.least
         return np.asarray(np.fmin(self.clearance.least, self.breathing.clearance))
@@ -262,7 +262,7 @@ class Candidates(Columns):
         return rows[np.argsort(self.ranking.rank[rows], kind="stable")]
 
     def counts(self) -> dict[str, int]:
-        """How many candidates fell to which reason, most frequent first; "safe" among them."""
+        """Number of candidates by reason, most frequent first; "safe" among them."""
         counted = Counter(self.verdict.reason.tolist()).most_common()
         return {str(reason) or "safe": count for reason, count in counted}
 

@@ -65,7 +65,7 @@ class Choice:
         return self.angles is None and self.entry_mm is None and self.entry_file is None
 
     def text(self, space: Space) -> str:
-        """How it was chosen, such as "rank 3"; an entry in the case's space."""
+        """Text of the choice, such as "rank 3"; an entry in the case's space."""
         if self.angles is not None:
             return "its angles"
         if self.entry_file is not None and self.entry_mm is None:

@@ -332,7 +332,7 @@ def reason_text(candidates: Candidates, row: int) -> str:
 
 
 def deep_text(clearance_mm: float) -> str:
-    """How deep a needle of a negative clearance is in what it crosses: at least, so rounded down, to 0.01 mm.
+    """Text of how deep a needle of negative clearance is at least in what it crosses, rounded down to 0.01 mm.
 
     >>> deep_text(-0.5951), deep_text(-0.6), deep_text(-1e-9)
     (', at least 0.59 mm deep', ', at least 0.6 mm deep', '')

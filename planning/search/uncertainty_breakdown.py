@@ -264,7 +264,7 @@ class ShrinkableNeedle(NamedTuple):
 
 
 def shrinkable(model: ChanceModel, needles: Needles, q: Floats) -> ShrinkableNeedle:
-    """One candidate whose sources can be shrunk.
+    """Split one candidate's error into sources that can be shrunk.
 
     Args:
         model: Of the case.

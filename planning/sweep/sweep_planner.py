@@ -59,7 +59,7 @@ class SweepPlan:
     stopped: str
 
     def off_point_mm(self, T_base_flange: Floats) -> Floats:
-        """How far flange poses (m, 4, 4), mm, leave the virtual TCP from its point, shape (m,)."""
+        """Distance of the virtual TCP from its point at flange poses (m, 4, 4), mm, shape (m,)."""
         reach = self.needle_length_mm + self.standoff_mm
         virtual = T_base_flange[:, :3, 3] + reach * T_base_flange[:, :3, 2]
         return np.asarray(np.linalg.norm(virtual - self.point_base, axis=1))
@@ -210,7 +210,7 @@ def _least_turn(R: Floats, z: Floats) -> Floats:
 
 
 def _why_not(checker: CellChecker, before: Floats, q: Floats, step: float) -> str:
-    """What keeps the arm from the next direction, in words; empty where nothing does."""
+    """Reason that the arm cannot go on to the next direction, in words; empty where it can."""
     if not np.isfinite(step):
         return "the arm does not reach on, or a joint would be beyond its limits"
     if step > MOST_JOINT_STEP:

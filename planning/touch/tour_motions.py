@@ -94,7 +94,7 @@ RESOLUTION = 1e-9
 
 
 class NoMotionError(NoAnswerError):
-    """No motion leads to the standoff of one of the touches."""
+    """Raised where no motion leads to the standoff of one of the touches."""
 
     def __init__(self, place: int, why: str) -> None:
         self.place = place
@@ -233,7 +233,7 @@ def _is_near(q: Floats, q_touch: Floats, distances: Floats) -> bool:
 
 
 def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
-    """What keeps the arm from a straight approach, in words; empty where nothing does.
+    """Reason that the arm cannot approach straight, in words; empty where it can.
 
     Args:
         checkers: Of the workcell.

@@ -290,7 +290,7 @@ class NeedleUncertainty:
     freedom: int | None
 
     def reach(self, length: float, threshold: float) -> tuple[float, float]:
-        """How near a face must be to matter, mm, at the tip and at the axis' other end: farther than any line leads."""
+        """Distance within which a face may matter, mm, at the tip and at the axis' other end."""
         tip, top, turn = self._widths(length)
         start, end = threshold + self._size * (self.surface_mm + tip), threshold + self._size * (self.surface_mm + top)
         return start, end + 0.5 * length * (self._size * turn) ** 2
@@ -304,7 +304,7 @@ class NeedleUncertainty:
 
     @cached_property
     def _widths(self) -> Callable[[float], tuple[float, float, float]]:
-        """For an axis of a given length: how far tip (mm), other end (mm) and direction (rad) may lie off, at most."""
+        """By length of the axis: largest displacement of tip (mm), other end (mm) and direction (rad) per deviation."""
         shift, lean = self.root[:3], self.root[3:]
         tip, turn = float(np.linalg.norm(shift, 2)), float(np.linalg.norm(lean, 2))
 
@@ -365,7 +365,7 @@ def displacement(root, z):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, error_model="numpy")
 def next_step(clear, before, stepped, smallest):  # type: ignore[no-untyped-def]
-    """How far on, where nothing is nearer than ``clear``: as far as what is clear there will reach back, it seems."""
+    """Next step, where nothing is nearer than ``clear``: as far as what is clear there will probably reach back."""
     if clear < smallest:
         return smallest
     falls = min(max((before - clear) / stepped, -0.8), 1.0) if before > 0.0 else 1.0
@@ -536,7 +536,7 @@ def first_touches(problem, root, directions, radii):  # type: ignore[no-untyped-
 
 @nb.njit(cache=True, error_model="numpy")
 def _first_touch(scene, start, ahead, gap, hint):  # type: ignore[no-untyped-def]
-    """How far out a ray touches, from where the distance is ``gap``."""
+    """Standard deviations at which a ray first touches, from where the clearance is ``gap``."""
     fastest, beta, low, clear = fastest_approach(scene, start, ahead), 0.0, 0.0, 0.0
     while gap >= 0.0 and beta < RAYS_TO:
         step = next_step(gap / fastest, clear, beta - low, RAY_STEP)

@@ -49,7 +49,7 @@ def not_cancelled(fit: FitUncertainty, J: Floats, target_base: Floats) -> Floats
 
 
 class Bend(NamedTuple):
-    """How far the bevel deflects the tip, to any side alike, and how far behind the tip the shaft is clamped; mm."""
+    """Deflection of the tip by the bevel, to any side alike, and distance of the shaft's clamp behind it; mm."""
 
     tip_mm: float
     clamped_mm: float

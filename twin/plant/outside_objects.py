@@ -51,7 +51,7 @@ def place_outside_objects(
 
 
 def lines(outline: Outline, count: int, at_mm: float, rng: np.random.Generator) -> Iterator[Part]:
-    """So many lines, tubes and cables in turn, each over front or flank.
+    """Draw lines, tubes and cables in turn, each over front or flank.
 
     Args:
         outline: Of the trunk.
@@ -171,7 +171,7 @@ def _on(outline: Outline, z: float, spoke: Floats, off_mm: float) -> Floats:
 
 
 def _lack(outline: Outline, point: Floats, off_mm: float) -> float:
-    """How much nearer to the skin than wanted a point is, along its own spoke, mm."""
+    """Distance by which a point is too near to the skin, along its own spoke, mm."""
     away = point[:2] - outline.middle(point[2])
     radius = float(np.linalg.norm(away))
     return outline.reach(float(point[2]), away / radius) + off_mm - radius

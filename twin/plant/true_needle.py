@@ -157,7 +157,7 @@ class TissueForce(NamedTuple):
 
     @property
     def text(self) -> str:
-        """For a person."""
+        """The forces in words, for a person."""
         if self.along_n == self.across_n == 0.0:
             return "the tissue did not push: the needle met none"
         return f"the tissue pushed with up to {self.along_n:.2f} N along the needle, {self.across_n:.2f} N across it"

@@ -190,7 +190,7 @@ class Rehearsal:
 
     @property
     def followed_text(self) -> str:
-        """How the insertion was followed, for a person."""
+        """Control of the insertion in words, for a person."""
         return f"{CONTROLS[self.control]}, at most {self.off_path_mm:.3f} mm off its commanded path"
 
     @property

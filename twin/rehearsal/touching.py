@@ -207,7 +207,7 @@ class StoppedError(Exception):
 
 
 def touch_marker(cell: TouchingCell, touch: Touch) -> TouchReading | FailedTouch:
-    """One marker: come, set the line, feel, read, go back to the standoff.
+    """Touch one marker: come, set the line, approach until contact, read, go back to the standoff.
 
     Args:
         cell: The workcell, the arm at the last standoff or at home.

@@ -76,7 +76,7 @@ def pack(mesh: TriangleMesh, known: NDArray[np.int32] | None = None) -> Blocks:
 
 
 def _outward(disc: Floats) -> NDArray[np.float32]:
-    """To float32, radius and thickness grown by more than the rounding of anything that made them."""
+    """Convert to float32, radius and thickness grown by more than the rounding of anything that made them."""
     grown = disc.copy()
     grown[3:] = grown[3:] * (1 + 1e-5) + 1e-6
     return grown.astype(np.float32)

@@ -262,7 +262,7 @@ def settled_at(scene, work, room, at, frames):
 
 @allocation_free()
 def first_not_clear(scene, frames, work, room, tested, of_state, begins, found, answers):
-    """At each of some states that have nothing to do with one another, the first check that is not proven clear.
+    """First check that is not proven clear at each of some independent states.
 
     Args:
         scene: See :class:`ProofScene`.

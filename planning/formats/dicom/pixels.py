@@ -32,7 +32,7 @@ MAX_FRAMES = 20_000
 
 @dataclass(frozen=True)
 class PixelLayout:
-    """How an image stores its values.
+    """Storage of an image's values.
 
     Attributes:
         frames: Images in the file.
@@ -54,7 +54,7 @@ class PixelLayout:
 
 
 def pixel_layout(data: Dataset, where: str) -> PixelLayout:
-    """How an image stores its values; plain pixels must have the length that follows from it.
+    """Storage of an image's values; plain pixels must have the length that follows from it.
 
     Raises:
         InputError: A colour image, an unusual layout, no pixels, or pixels of another length.

@@ -257,7 +257,7 @@ def _refuse_unknown(patterns: Sequence[LabelRule], names: Mapping[int, str], whe
 
 
 def specificity(pattern: str, name: str) -> float:
-    """How closely a pattern names one name: infinite for the name itself, else its characters that are no wildcards.
+    """Closeness of a pattern to one name: infinite for the name itself, else its characters that are no wildcards.
 
     >>> specificity("aorta", "aorta"), specificity("rib_*_7", "rib_left_7"), specificity("*", "aorta")
     (inf, 6, 0)

@@ -166,7 +166,7 @@ _ALLOWED_ARRAYS = "an array as long as the file states, complete, in ascii, bina
 
 
 class Encoding(NamedTuple):
-    """How the arrays of a file are written.
+    """Encoding of a file's arrays.
 
     Attributes:
         byte_order: "<" or ">".

@@ -125,7 +125,7 @@ def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bo
 
 
 def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats, hidden: Bools) -> tuple[Metal, _Line]:
-    """All of a needle that thick slices, between which it is diluted, show only in pieces at first."""
+    """The whole needle, where thick slices dilute it and show it only in pieces at first."""
     for _ in range(GROWTHS):
         at = np.argwhere((volume.values > LEVELS_HU[-1]) & ~hidden)
         points = apply(volume.T_ct_index, at.astype(float)) - line.middle
@@ -232,7 +232,7 @@ class _Rod(NamedTuple):
     diameter_mm: float | None
 
     def parts(self, points: Floats) -> Floats:
-        """How much of each point (n, 3), mm, is the rod.
+        """Part of the rod at each point (n, 3), mm, 0 to 1.
 
         Of a thin rod: π r² times the integral of the Gaussian's density along the axis, from infinity to the end. With
         Q the inverse covariance, a = n'Qn and m = n'Qx / a that is r²/2 √(det Q / a) exp(-(x'Qx - a m²) / 2) Φ(-m √a).

@@ -112,7 +112,7 @@ def ball_scene(plan: CamerasSection, ball: LocatedPair, hidden: float, rng: np.r
 
 
 def look_at(detector: Detector, ball: LocatedPair, searches: tuple[Search, ...], frames: int = 1) -> Detections | Lost:
-    """One ball in every camera, several images each; all must show it.
+    """Detect one ball in every camera, several images each; all must show it.
 
     Pictures of one camera are averaged by their inverse covariances.
     """

@@ -145,7 +145,7 @@ def _declaration(session: Session) -> DeclarationTest | None:
 
 
 def declaration_test(trials: Sequence[ServoTrial]) -> DeclarationTest | None:
-    """All seeds together; None where none has a test."""
+    """Test of the declaration over all seeds together; None where none has a test."""
     known = [one.declaration for one in trials if one.declaration is not None]
     if not known:
         return None

@@ -189,7 +189,7 @@ class NoiseSection(Section):
         return self
 
     def noise(self) -> Noise:
-        """In mm and rad."""
+        """The stated noise in mm and rad."""
         angles = (float(np.radians(angle)) for angle in (self.robot_deg, self.direction_deg))
         robot_rad, direction_rad = angles
         return Noise(self.robot_mm, robot_rad, self.image_mm, direction_rad, self.off_plane_mm)

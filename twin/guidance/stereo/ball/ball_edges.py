@@ -125,7 +125,7 @@ def visible_fraction(
 
 
 def _scales(camera: Camera, direction: Floats, across: Floats) -> Floats:
-    """How far an outline moves across itself, px per radian, when a tangent circle grows: 1 / |J^-T e|."""
+    """Scale of an outline across itself, px per radian of a tangent circle's growth: 1 / |J^-T e|."""
     normals = np.linalg.solve(camera.angle_slope(direction).T, across)
     return np.asarray(1 / np.linalg.norm(normals, axis=0))
 

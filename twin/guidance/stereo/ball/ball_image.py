@@ -244,7 +244,7 @@ def _occluder(rays: Floats, center: Floats, camera: Camera, scene: BallScene) ->
 
 
 def disc_distance(fraction: float) -> float:
-    """How far off the centre of the occluder must be to hide a fraction of the disc; lengths in radii of the ball."""
+    """Offset of the occluder's centre that hides a fraction of the disc; lengths in radii of the ball."""
 
     def hidden(distance: float) -> float:
         r, R, d = 1.0, OCCLUDER_SIZE, distance

@@ -171,7 +171,7 @@ def _best(
 def _measure(
     grey: Grey, camera: Camera, center: Floats, radius: float, settings: TrackerSettings
 ) -> DetectedBall | LostBall:
-    """One circle: edges about Hough's place, the vote, then edges about the measured place until they agree."""
+    """Measure one circle: edges about Hough's place, the vote, then edges about the measured place until they agree."""
     direction = camera.rays(center)
     spokes = Spokes(direction, radius / camera.local_scale(direction), settings.spokes, settings.first_reach_px)
     fitted = _fit(grey, camera, spokes, radius, settings)

@@ -72,7 +72,7 @@ class DeclaredArm(NamedTuple):
         return np.asarray(slopes)
 
     def play_motion(self, q: Floats, turn: Floats) -> Floats:
-        """How the declared play moves the flange from where its joints say, shape (n, 6); arguments as above."""
+        """Motion of the flange by the declared play from where its joints say, shape (n, 6); arguments as above."""
         return np.asarray(self._play_slopes(q, turn).sum(axis=2))
 
     def _play_slopes(self, q: Floats, turn: Floats) -> Floats:

@@ -109,7 +109,7 @@ class Calibration:
         return self.noise_ratio**2
 
     def chi_squared_chance(self) -> float:
-        """How often a right declaration has residuals as large as these."""
+        """Chance of residuals as large as these under a right declaration."""
         return float(chi2.sf(self.chi_squared_ratio * self.freedom, self.freedom))
 
     def warnings(self) -> tuple[str, ...]:

@@ -153,7 +153,7 @@ class Recording:
 
 
 def _both(first: Floats | None, second: Floats | None) -> Floats | None:
-    """One after the other, where both are there."""
+    """Two optional arrays, one after the other, where both are there."""
     return None if first is None or second is None else np.concatenate([first, second])
 
 
