@@ -397,7 +397,7 @@ BESIDE_SPINE = (
 
 
 class Plausibility(NamedTuple):
-    """How a naming fits a label map.
+    """Agreement of a naming with the places of organs in a label map.
 
     Attributes:
         rules: How many could be checked.
