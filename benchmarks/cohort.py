@@ -33,7 +33,8 @@ from puncture_twin.planning.case.options import case_options
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main as command
 
-CASE = """schema = 1
+CASE = """schema = 2
+region = "other"
 name = "small"
 space = "LPS"
 [target]
@@ -63,6 +64,8 @@ mesh = "rib.stl"
 unit = "mm"
 role = "avoid"
 margin_mm = 3.0
+[end]
+structures = 3
 """
 
 BALLS = {"skin": (90.0, (0, 0, 0)), "organ": (20.0, (0, 0, 0)), "rib": (5.0, (40, 0, 40))}

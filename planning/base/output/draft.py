@@ -30,7 +30,6 @@ class Draft:
         seconds: How long each stage took, for ``timings.json``; read at the end.
         note: Told what was removed that nobody might expect.
         old: What the output folder holds.
-        legacy: Files in it that an older version left without a manifest.
     """
 
     command: str
@@ -40,7 +39,6 @@ class Draft:
     seconds: Mapping[str, float]
     note: Callable[[str], None]
     old: Manifest
-    legacy: tuple[str, ...]
     depends_on: tuple[str, ...] = ()
     parts: dict[str, str] = field(default_factory=dict)
 

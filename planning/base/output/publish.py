@@ -149,9 +149,6 @@ def _report_removed(draft: Draft, others: set[str]) -> None:
     if others:
         named = ", ".join(sorted(others))
         draft.note(f"{draft.out}: the files of {named} were removed: {draft.command} has replaced a part of them")
-    if draft.legacy:
-        named = ", ".join(draft.legacy)
-        draft.note(f"{draft.out}: files of an older version, without a manifest, were replaced or removed: {named}")
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_na
 from puncture_twin.planning.export.slicer import NAMES, SLICER, Drawn, entry_area, slicer_files
 from puncture_twin.planning.plan.plan_check import with_case_arm
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
-from puncture_twin.planning.plan.recheck import check_plan, with_case_warnings
+from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.choice import Choice, choose, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.jobs.patient.main_job import plan_case
@@ -53,7 +53,7 @@ def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, ch
         note(f"warning: {found.note}")
     source, plan = found.input("plan"), parse_plan(found.data, plan_path)
     check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
-    plan = with_case_warnings(with_case_arm(plan, context.case), context)
+    plan = with_case_arm(plan, context.case)
     names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
     texts = moveit_files(plan, context.case, context.anatomy, source=plan_path)
     made_from = {source.path: source.sha256}

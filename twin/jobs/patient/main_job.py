@@ -260,12 +260,11 @@ def export(
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     from puncture_twin.planning.export.exporter import export_name, export_plan
-    from puncture_twin.planning.plan.recheck import check_plan, with_case_warnings
+    from puncture_twin.planning.plan.recheck import check_plan
 
     source, plan = _read_plan(plan_path, note)
     if context is not None:
         check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
-        plan = with_case_warnings(plan, context)
     checker = None if context is None or context.reach is None else context.reach.checker
     name = export_name(plan_path, format_name)
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
