@@ -11,20 +11,15 @@ import os
 import sys
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from puncture_twin.meshes import folder as meshes_folder
-from puncture_twin.planning.base.errors import InputError, require_extra
-from puncture_twin.planning.base.files import check_writable
+from puncture_twin.planning.base.errors import require_extra
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 from puncture_twin.twin.jobs.batch.commands import batch_app
-from puncture_twin.twin.jobs.call_room import with_room
-from puncture_twin.twin.jobs.collector import late_collection
 from puncture_twin.twin.jobs.exit_codes import exit_code_of, finish
-from puncture_twin.twin.jobs.first_use import compiling_beside
-from puncture_twin.twin.jobs.leave import leave
 from puncture_twin.twin.jobs.options import (
     ArmOption,
     CaseArgument,
@@ -35,10 +30,12 @@ from puncture_twin.twin.jobs.options import (
     OutOption,
     PicturesOption,
     SourceArgument,
+    VersionOption,
+    out_folder,
+    prepared,
     with_choice,
 )
-from puncture_twin.twin.jobs.second_process import second_process
-from puncture_twin.twin.jobs.terminal import default_out
+from puncture_twin.twin.jobs.terminal import leave, look_seldom, print_whole
 from puncture_twin.twin.report.progress import progress_display
 
 if TYPE_CHECKING:
@@ -47,25 +44,9 @@ if TYPE_CHECKING:
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
 
-CERTIFY_DEG = 0.25
-"""Smallest cell of a certificate where nobody says."""
-
 app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        from importlib.metadata import version
-
-        print(f"puncture-twin {version('puncture-twin')}")
-        raise typer.Exit
-
-
-VersionOption = Annotated[
-    bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
-]
 
 
 @app.callback(invoke_without_command=True, epilog="What the words of the output mean: docs/words.md.")
@@ -80,13 +61,10 @@ def _without_command(context: typer.Context, version: VersionOption = False) -> 
 def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> None:
     """The main job on the embedded abdomen: search, plan, rehearse, report."""
     require_extra("twin", "demo")
-    from puncture_twin.twin.jobs.rehearser import get_ready
+    from puncture_twin.twin.jobs.patient import main_job, text
 
-    with progress_display() as progress, compiling_beside(), second_process(get_ready) as beside:
-        from puncture_twin.planning.search.context import prepare
-        from puncture_twin.twin.jobs.patient import main_job, text
-
-        run = main_job.demo_case(prepare(meshes_folder() / "abdomen", watcher=progress), out_dir, beside)
+    with prepared(meshes_folder() / "abdomen") as context:
+        run = main_job.demo_case(context, out_dir)
     finish("demo", run, run.summary(), text.rehearsal_text(run), as_json)
 
 
@@ -145,18 +123,11 @@ def init(
     as_json: JsonOption = False,
 ) -> None:
     """Write FOLDER/case.toml from what is in the folder: roles and margins from the table of default roles."""
-    from puncture_twin.planning.case.case_file import Region
     from puncture_twin.planning.init.finder import Wanted
     from puncture_twin.planning.init.overrides import overrides_of
     from puncture_twin.planning.init.start import Request
     from puncture_twin.twin.jobs.patient.init_job import init_case, init_text
 
-    if region is not None and region not in get_args(Region):
-        raise InputError(f"region '{region[:40]}' is not known", where="--region", allowed=", ".join(get_args(Region)))
-    if space is Space.LOCAL:
-        raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
-    if hit_radius is not None and (target is None or not 0 < hit_radius <= 100):
-        raise InputError(f"{hit_radius:g}", where="--hit-radius", allowed="mm, above 0, at most 100, beside --target")
     stated = [*(settings or []), *(["search.trust_labels=true"] if trust_labels else [])]
     overrides = overrides_of(skin, ignore or [], unknown or [], stated)
     wanted = Wanted(space or Space.LPS, naming, unit, ct, segmentation, up, overrides)
@@ -179,7 +150,7 @@ def search(
     certified: Annotated[bool, typer.Option("--certify", help="Judge the angles between the grid points too.")] = False,
     certify_size: Annotated[
         float | None,
-        typer.Option(min=0.05, max=10, help="Smallest cell of --certify, degrees.", show_default=f"{CERTIFY_DEG:g}"),
+        typer.Option(min=0.05, max=10, help="Smallest cell of --certify, degrees.", show_default="0.25"),
     ] = None,
     certify_touch: Annotated[
         float | None,
@@ -188,24 +159,13 @@ def search(
     as_json: JsonOption = False,
 ) -> None:
     """Judge every entry direction of a case; write the table, the map, the scene and the page."""
-    from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.patient import main_job, text
 
-    folder = _out(out_dir, case, "search")
-    for option, value in (("--certify-touch", certify_touch), ("--certify-size", certify_size)):
-        if value is not None and not certified:
-            raise InputError("of a certificate that nobody asked for", where=option, allowed="beside --certify")
-    with progress_display() as progress, compiling_beside():
-        context = prepare(case, arm=arm, engine=engine, watcher=progress)
+    folder = out_folder(out_dir, case, "search")
+    certify = main_job.certify_options(certified, certify_size, certify_touch)
+    with prepared(case, arm=arm, engine=engine) as context:
         checked = context.cross_check(check_again) if check_again else None
-        run = main_job.search_case(
-            context,
-            folder,
-            pictures=pictures,
-            checked=checked,
-            certify_deg=(certify_size or CERTIFY_DEG) if certified else None,
-            certify_touch=certify_touch,
-        )
+        run = main_job.search_case(context, folder, pictures=pictures, checked=checked, certify=certify)
     finish("search", run, run.summary(), text.search_text(run), as_json)
 
 
@@ -216,11 +176,10 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Prove every cell of a certificate again, with a plain checker that shares none of the fast code."""
-    from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.patient import answers, text
 
-    with progress_display() as progress:
-        report = answers.verify_certificate(certificate, prepare(case, arm=False, watcher=progress))
+    with prepared(case, arm=False) as context:
+        report = answers.verify_certificate(certificate, context)
     finish("verify", report, report, text.certificate_text(report), as_json)
 
 
@@ -246,7 +205,6 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Explain one candidate in full, the best where none is named; or check a list, a row a row."""
-    from puncture_twin.planning.search.context import prepare
     from puncture_twin.planning.search.explain import NEAREST
     from puncture_twin.twin.jobs.choosing.list_job import check_list, lists_of
     from puncture_twin.twin.jobs.patient.answers import check_candidate
@@ -256,8 +214,7 @@ def check(
             listed = check_list(case, entries, targets, choice, out_dir=out_dir, arm=arm, watcher=progress)
         finish("check", listed, listed.summary(), listed.text(), as_json)
         return
-    with progress_display() as progress, compiling_beside():
-        context = prepare(case, arm=arm, watcher=progress)
+    with prepared(case, arm=arm) as context:
         explained = check_candidate(context, choice)
         if picture is not None:
             from puncture_twin.twin.jobs.patient.pictures import write_check_picture
@@ -280,17 +237,11 @@ def compare(
     as_json: JsonOption = False,
 ) -> None:
     """Show two paths side by side: two choices of a case, one and the best, or two plans; 1 where one is rejected."""
-    from puncture_twin.planning.search.context import prepare
-    from puncture_twin.twin.jobs.choosing.compare_job import compare_choices, compare_plans, parse_two, two_plans
+    from puncture_twin.twin.jobs.choosing.compare_job import compare_source
 
     stated = (theta or [], beta or [], rank or [], window or [], entry or [])
-    plans = two_plans(source, other, case, any(stated))
     with progress_display() as progress:
-        if plans is None:
-            choices = parse_two(*stated)
-            compared = compare_choices(prepare(source, arm=arm, watcher=progress), choices)
-        else:
-            compared = compare_plans(plans, None if case is None else prepare(case, watcher=progress))
+        compared = compare_source(source, other, case, stated, arm, progress)
     finish("compare", compared, compared.summary(), compared.text(), as_json)
 
 
@@ -303,12 +254,11 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Search, plan to the best candidate that the arm can come to, or to the one that is named; write plan.json."""
-    from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.patient import main_job, text
 
-    folder = _out(out_dir, case, "plan")
-    with progress_display() as progress, compiling_beside():
-        run = main_job.plan_case(prepare(case, watcher=progress), folder, choice)
+    folder = out_folder(out_dir, case, "plan")
+    with prepared(case) as context:
+        run = main_job.plan_case(context, folder, choice)
     finish("plan", run, run.summary(), text.plan_text(run), as_json)
 
 
@@ -332,44 +282,23 @@ def rehearse(
 ) -> None:
     """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
     require_extra("twin", "rehearse")
-    from puncture_twin.planning.search.context import prepare
+    from puncture_twin.twin.jobs.experiment.sweep_job import sweep_case, sweep_end, sweep_text
     from puncture_twin.twin.jobs.patient import main_job, text
-    from puncture_twin.twin.jobs.patient.case_or_plan import case_of, is_plan
-    from puncture_twin.twin.jobs.patient.run import RoomCount
-    from puncture_twin.twin.jobs.rehearser import get_ready
+    from puncture_twin.twin.jobs.patient.run import room_count
 
-    if physics > (seeds or 0):
-        raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
-    rooms = None if seeds is None else RoomCount(seeds, physics)
-    folder = _out(out_dir, source, "rehearse")
+    rooms, folder = room_count(seeds, physics), out_folder(out_dir, source, "rehearse")
     if sweep or to is not None:
-        _sweep(source, folder, choice, to if sweep else "", alone=seeds is None and case is None, as_json=as_json)
+        end = sweep_end(source, to, sweep=sweep, alone=seeds is None and case is None)
+        with prepared(source) as context:
+            swept = sweep_case(context, folder, choice, end)
+        finish("rehearse --sweep", swept, swept.summary(), sweep_text(swept), as_json)
         return
-    planned_case = case_of(source, case, choice)
-    if planned_case is None:
-        raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
-    with progress_display() as progress, compiling_beside():
-        if is_plan(source):
-            run = main_job.rehearse_plan(prepare(planned_case, watcher=progress), source, folder, rooms)
+    with prepared(main_job.rehearsed_case(source, case, choice)) as context:
+        if main_job.is_plan(source):
+            run = main_job.rehearse_plan(context, source, folder, rooms)
         else:
-            with second_process(get_ready) as beside:
-                run = main_job.rehearse_case(prepare(planned_case, watcher=progress), folder, rooms, choice, beside)
+            run = main_job.rehearse_case(context, folder, rooms, choice)
     finish("rehearse", run, run.summary(), text.rehearsal_text(run), as_json)
-
-
-def _sweep(source: Path, folder: Path, choice: Choice, to: str | None, *, alone: bool, as_json: bool) -> None:
-    from puncture_twin.planning.search.context import prepare
-    from puncture_twin.twin.jobs.experiment.sweep_job import parse_angles, sweep_case, sweep_text
-    from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
-
-    if to == "":
-        raise InputError("a sweep ends there", where="--to", allowed="--sweep --to THETA,BETA")
-    if is_plan(source) or not alone:
-        raise InputError("a sweep is of one case", where="--sweep", allowed="a case, no plan, no --seeds")
-    end = parse_angles(to)
-    with progress_display() as progress:
-        run = sweep_case(prepare(source, watcher=progress), folder, choice, end)
-    finish("rehearse --sweep", run, run.summary(), sweep_text(run), as_json)
 
 
 @app.command()
@@ -383,12 +312,11 @@ def touch(
 ) -> None:
     """Plan how markers are touched for a puncture, touch them in the twin, write touch.csv; 1 if too few were."""
     require_extra("twin", "touch")
-    from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
 
-    folder = _out(out_dir, case, "touch")
-    with progress_display() as progress:
-        run = touch_case(prepare(case, watcher=progress), folder, choice, seed)
+    folder = out_folder(out_dir, case, "touch")
+    with prepared(case) as context:
+        run = touch_case(context, folder, choice, seed)
     finish("touch", run, run.summary(), touch_text(run), as_json)
 
 
@@ -413,24 +341,19 @@ def pivot(
     as_json: JsonOption = False,
 ) -> None:
     """Find the needle's tip on the flange: from touches of one place, or executed in the twin; 1 if they contradict."""
-    from puncture_twin.twin.jobs.experiment.pivot_job import pivot_case, pivot_text
+    from puncture_twin.planning.case.read_case import load_case
+    from puncture_twin.twin.jobs.experiment import pivot_job
 
     if joints is not None:
-        if any(option is not None for option in (out_dir, poses, at, seed)):
-            raise InputError("touches that were read", where="pivot", allowed="JOINTS.csv alone, or the twin's options")
-        from puncture_twin.planning.case.read_case import load_case
-
-        read = pivot_case(load_case(case), joints)
-        finish("pivot", read, read.summary(), pivot_text(read), as_json)
-    else:
-        require_extra("twin", "pivot")
-        from puncture_twin.planning.search.context import prepare
-        from puncture_twin.twin.jobs.experiment.pivot_job import parse_place, pivot_tour, pivot_tour_text
-
-        place, folder = parse_place(at), _out(out_dir, case, "pivot")
-        with progress_display() as progress:
-            run = pivot_tour(prepare(case, watcher=progress), folder, 8 if poses is None else poses, place, seed or 0)
-        finish("pivot", run.found, run.summary(), pivot_tour_text(run), as_json)
+        pivot_job.refuse_of_twin(out_dir, poses, at, seed)
+        read = pivot_job.pivot_case(load_case(case), joints)
+        finish("pivot", read, read.summary(), pivot_job.pivot_text(read), as_json)
+        return
+    require_extra("twin", "pivot")
+    place, folder = pivot_job.parse_place(at), out_folder(out_dir, case, "pivot")
+    with prepared(case) as context:
+        run = pivot_job.pivot_tour(context, folder, 8 if poses is None else poses, place, seed or 0)
+    finish("pivot", run.found, run.summary(), pivot_job.pivot_tour_text(run), as_json)
 
 
 @app.command()
@@ -442,12 +365,11 @@ def place(
     as_json: JsonOption = False,
 ) -> None:
     """Find where the arm should stand to hold most of the organ-safe directions; write the placements and their map."""
-    from puncture_twin.planning.search.context import prepare
     from puncture_twin.twin.jobs.patient.place_job import place_case, place_text
 
-    folder = _out(out_dir, case, "place")
-    with progress_display() as progress:
-        run = place_case(prepare(case, arm=False, watcher=progress), folder, jobs=jobs, pictures=pictures)
+    folder = out_folder(out_dir, case, "place")
+    with prepared(case, arm=False) as context:
+        run = place_case(context, folder, jobs=jobs, pictures=pictures)
     finish("place", run, run.summary(), place_text(run), as_json)
 
 
@@ -468,26 +390,20 @@ def mirror(
     """Show a running arm's needle in the CT: tip, distance to the target. Writes nothing to the robot."""
     from puncture_twin.planning.base.provenance import inputs_document
     from puncture_twin.planning.case.read_case import load_case
-    from puncture_twin.twin.jobs.robot.mirror import Mirror, RecordedJoints, connect, live_states, mirror_text
+    from puncture_twin.twin.jobs.robot.mirror import Mirror, mirror_text, readings_of
     from puncture_twin.twin.jobs.terminal import ended_by_ctrl_c
 
-    if (host is None) == (recorded is None):
-        raise InputError("one arm at a time", where="mirror", allowed="either HOST or --from joints.csv")
     followed = load_case(case)
-    mirrored, inputs = Mirror.of(followed), followed.inputs
-    if recorded is not None:
-        recording = RecordedJoints.read(recorded)
-        inputs, states = (recording.input, *inputs), recording.states(followed)
-        for warning in recording.warnings():
-            print(f"warning: {warning}", file=sys.stderr)
-    else:
-        states = live_states(connect(str(host)), period_s=1.0 / rate, seconds=seconds)
+    read = readings_of(host, recorded, followed, period_s=1.0 / rate, seconds=seconds)
+    for warning in read.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
     shown = []
     with ended_by_ctrl_c():
-        for one in mirrored.follow(states):
+        for one in Mirror.of(followed).follow(read.states):
             shown.append(one.summary()) if as_json else print(mirror_text(one), flush=True)
     if as_json:
-        finish("mirror", shown, {"case": str(case), "inputs": inputs_document(inputs), "states": shown}, "", as_json)
+        summary = {"case": str(case), "inputs": inputs_document(read.inputs), "states": shown}
+        finish("mirror", shown, summary, "", as_json)
 
 
 @app.command()
@@ -506,67 +422,13 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write a plan for a robot, read back and within the arm's limits. Research software, not a medical device."""
-    from puncture_twin.planning.export.exporter import FORMATS
-    from puncture_twin.planning.export.moveit import MOVEIT
-    from puncture_twin.planning.export.slicer import SLICER
-    from puncture_twin.planning.search.context import prepare
-    from puncture_twin.twin.jobs.choosing.candidates_export import CANDIDATE_FORMATS
-    from puncture_twin.twin.jobs.patient import main_job, text
-    from puncture_twin.twin.jobs.patient.case_or_plan import case_of, is_plan
-    from puncture_twin.twin.jobs.patient.summaries import export_summary
+    from puncture_twin.twin.jobs.patient.export_jobs import export_source, refuse_format
 
-    formats = (*FORMATS, MOVEIT, SLICER, *CANDIDATE_FORMATS)
-    if format_name not in formats:
-        raise InputError(f"format '{format_name}' is not known", where="--format", allowed=", ".join(formats))
-    folder = _out(out_dir, source, f"export-{format_name}")
-    if format_name in CANDIDATE_FORMATS:
-        _export_candidates(source, format_name, folder, choice, as_json)
-        return
-    planned_case = case_of(source, case, choice)
-    if format_name == SLICER:
-        _export_to_slicer(source, folder, choice, as_json)
-        return
-    if format_name == MOVEIT and planned_case is None:
-        raise InputError("moveit's scene is the case's", where=source, allowed="export plan.json --case CASE")
+    refuse_format(format_name)
+    folder = out_folder(out_dir, source, f"export-{format_name}")
     with progress_display() as progress:
-        context = None if planned_case is None else prepare(planned_case, watcher=progress)
-        if format_name == MOVEIT and context is not None:
-            from puncture_twin.twin.jobs.patient.export_jobs import export_to_moveit
-
-            done = export_to_moveit(context, source if is_plan(source) else None, folder, choice)
-        elif context is None or is_plan(source):
-            done = main_job.export(source, format_name, folder, context, progress.note)
-        else:
-            done = main_job.export_case(context, format_name, folder, choice)
-    checked = context is not None
-    finish("export", done, export_summary(done, checked), text.export_text(done, checked), as_json)
-
-
-def _export_candidates(source: Path, format_name: str, out_dir: Path, choice: Choice, as_json: bool) -> None:
-    from puncture_twin.planning.search.context import prepare
-    from puncture_twin.twin.jobs.choosing.candidates_export import TABLE, export_candidates, table_of
-    from puncture_twin.twin.jobs.patient.main_job import search_case
-
-    table = table_of(source, choice)
-    with progress_display() as progress:
-        if table is None:
-            search_case(prepare(source, watcher=progress), out_dir, pictures=False)
-            table = out_dir / TABLE
-        done = export_candidates(table, format_name, out_dir, progress.note)
-    finish("export", done, done.summary(), done.text(), as_json)
-
-
-def _export_to_slicer(source: Path, out_dir: Path, choice: Choice, as_json: bool) -> None:
-    from puncture_twin.planning.search.context import prepare
-    from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
-    from puncture_twin.twin.jobs.patient.export_jobs import export_to_slicer
-
-    if is_plan(source):
-        allowed = "a case, with --rank, --window, --theta or --entry"
-        raise InputError("slicer shows a case", where=source, allowed=allowed)
-    with progress_display() as progress:
-        done = export_to_slicer(prepare(source, watcher=progress), out_dir, choice)
-    finish("export", done, done.summary(), done.text(), as_json)
+        done = export_source(source, case, format_name, folder, choice, progress)
+    finish("export", done.found, done.summary, done.text, as_json)
 
 
 @app.command()
@@ -588,12 +450,7 @@ def register(
     """Register a case's markers, or two lists of markers; print residuals, the expected error and its sources."""
     from puncture_twin.twin.jobs.patient import answers, text
 
-    if markers_base is None:
-        report = answers.registration_report(source)
-    elif target is None:
-        raise InputError("two lists of markers need a target", where="register", allowed="--target X,Y,Z in mm")
-    else:
-        report = answers.lists_report(source, markers_base, target, space, fle)
+    report = answers.register_report(source, markers_base, target, space, fle)
     if picture is not None:
         from puncture_twin.twin.jobs.patient.pictures import write_budget_picture
 
@@ -632,7 +489,9 @@ def servo(
     from puncture_twin.twin.jobs.servo.job import run_servo
 
     with progress_display() as progress:
-        job = run_servo(case, _out(out_dir, case, "servo"), seeds, partial(progress.count, "seeds"), progress.note)
+        job = run_servo(
+            case, out_folder(out_dir, case, "servo"), seeds, partial(progress.count, "seeds"), progress.note
+        )
     finish("servo", job, job.summary, job.text, as_json)
 
 
@@ -671,15 +530,19 @@ def scan(
     """Scan a case with a virtual CT; write DICOM, NIfTI, labels, and what is read off it beside the truth."""
     from math import radians
 
-    from puncture_twin.planning.search.context import prepare
-    from puncture_twin.twin.jobs.experiment.scan_beside import parse_beside
-    from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, parse_marker, scan_case, scan_text
+    from puncture_twin.twin.jobs.experiment.scan_job import (
+        ScanRequest,
+        parse_beside,
+        parse_marker,
+        scan_case,
+        scan_text,
+    )
     from puncture_twin.twin.plant.scanner.image import ScanSettings
 
     settings = ScanSettings(spacing, pixel, noise, seed=seed, fov_mm=fov, length_mm=length, turn=radians(turn))
     request = ScanRequest(settings, parse_marker(marker), rehearsal, parse_beside(arms, bed, lines))
-    with progress_display() as progress:
-        run = scan_case(prepare(case, arm=False, watcher=progress), _out(out_dir, case, "scan"), request)
+    with prepared(case, arm=False) as context:
+        run = scan_case(context, out_folder(out_dir, case, "scan"), request)
     finish("scan", run, run.summary(), scan_text(run), as_json)
 
 
@@ -698,30 +561,19 @@ def reproduce(
 ) -> None:
     """Print a paper's numbers beside ours; exit 0 only if every one holds."""
     require_extra("twin", "reproduce")
-    from puncture_twin.twin.jobs.papers.papers import PAPERS, chen2019_experiment
+    from puncture_twin.twin.jobs.papers.papers import reproduced
 
-    if paper not in PAPERS:
-        raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))
-    if experiment and paper != "chen2019":
-        raise InputError(f"{paper} has no such experiment", where="--experiment", allowed="reproduce chen2019")
-    if runs and not experiment:
-        raise InputError("--runs are of the experiment", where="--runs", allowed="reproduce chen2019 --experiment")
-    folder = _out(out_dir, Path(paper), "reproduce")
+    folder = out_folder(out_dir, Path(paper), "reproduce")
     with progress_display() as progress:
-        result = chen2019_experiment(folder, seeds, runs, progress) if experiment else PAPERS[paper](folder, seeds)
+        result = reproduced(paper, folder, seeds, progress, experiment=experiment, runs=runs)
     finish("reproduce", result, result.summary, result.text, as_json)
-
-
-def _out(named: Path | None, source: Path, command: str) -> Path:
-    return check_writable(named or default_out(source, command))
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for one another
-    with late_collection():
-        as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
-        return with_room(partial(exit_code_of, partial(_parsed, arguments), _print_whole, as_json=as_json))
+    as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
+    return exit_code_of(partial(_parsed, arguments), print_whole, as_json=as_json)
 
 
 def _parsed(arguments: list[str] | None) -> Any:
@@ -735,13 +587,9 @@ def _parser() -> Any:
     return typer.main.get_command(app)
 
 
-def _print_whole(line: str) -> None:
-    """Print a line at once, so that Ctrl-C comes before or after it."""
-    print(f"{line}\n", end="", file=sys.stderr)
-
-
 def program() -> NoReturn:
     """Run a command as all that this process is for, and end it with the command's exit code."""
+    look_seldom()
     leave(main())
 
 

@@ -41,7 +41,6 @@ FUNCTIONS = {
     },
     "planning.search.ranking": {"ranked": "ranking"},
     "planning.search.uncertainty_breakdown": {"uncertainty_breakdown": "chances"},
-    "twin.jobs.second_process": {"SecondProcess.end": "rehearsal and film, beside"},
 }
 """By module: what of it is timed under which name."""
 

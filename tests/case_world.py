@@ -5,6 +5,7 @@ and, in a label map, a vessel.
 """
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -16,7 +17,8 @@ from puncture_twin.planning.anatomy.body.body_mask import ct_image
 from puncture_twin.planning.anatomy.body.cut_ends import cut_ends
 from puncture_twin.planning.anatomy.skin import skin_of_image
 
-HEAD = """schema = {schema}
+HEAD = """schema = 2
+region = "{region}"
 name = "{name}"
 space = "{space}"
 [target]
@@ -31,11 +33,19 @@ NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.2"
 SEARCH = "theta_deg = [0, 10]\nstep_deg = 10.0"
 
 
-def case_text(*sections, name="small", schema="1", space="LPS", target=TARGET, needle=NEEDLE, search=SEARCH):
-    """A case file: its head with these lines, then its sections."""
-    return HEAD.format(schema=schema, name=name, space=space, target=target, needle=needle, search=search) + "".join(
-        sections
-    )
+def case_text(
+    *sections, name="small", region="other", space="LPS", target=TARGET, needle=NEEDLE, search=SEARCH, listed=0
+):
+    """A case file: its head with these lines, its sections, and their count; `listed` as for `whole`."""
+    head = HEAD.format(region=region, name=name, space=space, target=target, needle=needle, search=search)
+    return whole(head + "".join(sections), listed)
+
+
+def whole(text, listed=0):
+    """A case file that ends with the count of its structures, of which so many are named by ``[[structures]]``."""
+    rest = re.sub(r"\[end\]\nstructures = \d+\n", "", text).rstrip("\n")
+    count = sum(line == "[[structure]]" for line in rest.split("\n")) + listed
+    return f"{rest}\n[end]\nstructures = {count}\n"
 
 
 def structure(name, role, source=None, **keys):
@@ -130,8 +140,8 @@ def write_labels(path, labels=None, spacing=(2.0, 2.0, 2.0), compressed=True):
     SimpleITK.WriteImage(image, path, useCompression=compressed)
 
 
-def write_case(folder, *changes, text=CASE, labels=None, spacing=(2.0, 2.0, 2.0)):
-    """Write the usual patient's case, with (old, new) changes to its text; returns its file.
+def write_case(folder, *changes, text=CASE, labels=None, spacing=(2.0, 2.0, 2.0), listed=0):
+    """Write the usual patient's case, with (old, new) changes to its text, and its count; returns its file.
 
     Args:
         folder: Where.
@@ -139,11 +149,13 @@ def write_case(folder, *changes, text=CASE, labels=None, spacing=(2.0, 2.0, 2.0)
         text: The case file.
         labels: Voxels (z, y, x); a vessel with label 3 by default.
         spacing: Of the label map, mm, along x, y and z.
+        listed: See `whole`; None leaves the count as the text has it.
     """
     write_balls(folder)
     write_labels(folder / "labels.nrrd", labels, spacing, compressed=False)
     write_markers(folder)
-    (folder / "case.toml").write_text(changed(text, *changes))
+    said = changed(text, *changes)
+    (folder / "case.toml").write_text(said if listed is None else whole(said, listed))
     return folder / "case.toml"
 
 

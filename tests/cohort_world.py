@@ -7,7 +7,7 @@ import time
 import uuid
 
 import pyarrow.parquet as pq
-from case_world import ORGAN, SKIN, case_text, structure, write_balls
+from case_world import ORGAN, SKIN, case_text, structure, whole, write_balls
 
 from puncture_twin.planning.base.cache.array_cache import NO_MEMORY
 from puncture_twin.planning.batch.cohort import CohortCase
@@ -34,7 +34,7 @@ def write_patient(folder, *changes, text=None):
     for old, new in changes:
         assert old in said
         said = said.replace(old, new, 1)
-    (folder / "case.toml").write_text(said)
+    (folder / "case.toml").write_text(whole(said))
     return folder / "case.toml"
 
 

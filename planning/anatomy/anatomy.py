@@ -219,7 +219,7 @@ def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh 
 
 def _check_count(case: Case, count: int) -> None:
     """Of a case that states how many structures it has, before a surface is made; the CT adds others later."""
-    if wrong := "" if case.stated_structures is None else count_difference(case.stated_structures, count):
+    if wrong := count_difference(case.stated_structures, count):
         raise InputError(wrong, where=case.path, allowed="the number of structures that are read")
 
 

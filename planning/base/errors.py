@@ -27,6 +27,17 @@ MOST_MESSAGE = 1_500
 class PlanningError(Exception):
     """Base of everything that the planner raises on purpose."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """With all its parts, which a process that sends it makes again; they do not follow from the message alone."""
+        return _error_again, (type(self), self.args, vars(self))
+
+
+def _error_again(kind: type[PlanningError], arguments: tuple[Any, ...], parts: dict[str, Any]) -> PlanningError:
+    error = kind.__new__(kind, *arguments)
+    error.args = arguments
+    vars(error).update(parts)
+    return error
+
 
 class InputError(PlanningError):
     """Input that cannot be used. The command line prints it as one line and exits with code 2.

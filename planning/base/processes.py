@@ -5,13 +5,17 @@ And on threads, where compiled code does it.
 
 from __future__ import annotations
 
+import copyreg
 import multiprocessing
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from functools import partial
-from typing import TypeVar
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 from puncture_twin.planning.base.progress import Count
 
@@ -20,6 +24,14 @@ Answer = TypeVar("Answer")
 
 BATCH = 48
 """At most so many things at a time go to a process."""
+
+
+def _mapping(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    return MappingProxyType(values)
+
+
+copyreg.pickle(MappingProxyType, lambda mapping: (_mapping, (dict(mapping),)))
+# Read-only mappings go to other processes as what they are: a case and its structures hold some.
 
 
 def worker_count(wanted: int, pieces: int) -> int:
@@ -36,6 +48,23 @@ def worker_count(wanted: int, pieces: int) -> int:
     return max(1, min(wanted, cores, pieces))
 
 
+def _begin_worker() -> None:
+    """Ctrl-C is the command's, which ends its workers; and no worker outlives a command that was killed.
+
+    What a library prints goes to standard error: standard output is the command's answer.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.dup2(2, 1)
+    command = multiprocessing.parent_process()
+    assert command is not None
+    threading.Thread(target=_end_with, args=(command,), daemon=True).start()
+
+
+def _end_with(command: Any) -> None:
+    command.join()
+    os._exit(1)
+
+
 @contextmanager
 def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of `worker_count` spawned processes; where the block ends early, as by Ctrl-C, nothing more begins.
@@ -45,7 +74,7 @@ def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
         pieces: Of the work.
     """
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(worker_count(jobs, pieces), mp_context=context)
+    pool = ProcessPoolExecutor(worker_count(jobs, pieces), mp_context=context, initializer=_begin_worker)
     try:
         yield pool
     finally:

@@ -115,7 +115,7 @@ def parse_toml(
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place, said = _said(data, first["loc"], first["msg"].removeprefix("Value error, "), first["type"])
-        value = "" if isinstance(first["input"], dict | list | tuple) else f" (given: {first['input']!r:.60})"
+        value = "" if isinstance(first["input"], dict | list | tuple | None) else f" (given: {first['input']!r:.60})"
         allowed = f"the keys, types and ranges of {keys}"
         raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error
 

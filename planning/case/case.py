@@ -54,8 +54,8 @@ class Case:
         T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
         files: The case file and all that it names, read once.
         volumes: Those of them that are volumes: the CT and the label maps.
-        stated_structures: How many structures the case says that it has, the skin among them; None in schema 1.
-        region: Which part of the body it shows; None in schema 1.
+        stated_structures: How many structures the case says that it has, the skin among them.
+        region: Which part of the body it shows.
         warnings: What the case file itself leaves open, one sentence each.
         hit_radius_mm: Within which of the target the tip hits; None counts the target's own mesh.
         errors: What is declared to err, or None.
@@ -85,11 +85,11 @@ class Case:
     rehearsal: RehearsalSection
     files: InputFiles
     volumes: CaseVolumes
+    stated_structures: int
+    region: str
     ct: CtSettings = field(default_factory=CtSettings)
     gantry: Gantry | None = None
     place: PlaceSection = field(default_factory=PlaceSection)
-    stated_structures: int | None = None
-    region: str | None = None
     warnings: tuple[str, ...] = ()
     hit_radius_mm: float | None = None
     errors: ErrorModel | None = None

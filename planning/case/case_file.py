@@ -1,7 +1,7 @@
 """The whole case file: its tables, and what no single table can tell. See docs/reference/case.md for the keys.
 
 A TOML file that was cut between two tables is whole TOML with fewer organs, and an organ that is not there counts as
-free. So schema 2 states the number of structures once: in the file's last table, ``[end]``, which every cut loses, or
+free. So a case states the number of its structures once: in the file's last table, ``[end]``, which every cut loses, or
 at the top, before the first table, where it tells lost structures but nothing that is lost after them.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import Field, Strict, model_validator
+from pydantic import BeforeValidator, Field, Strict, model_validator
 
 from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.case.tables import (
@@ -34,7 +34,7 @@ from puncture_twin.planning.case.tables import (
     TissueSection,
     ToolSection,
 )
-from puncture_twin.planning.case.toml_types import CaseName, CaseSchema, Section, Text
+from puncture_twin.planning.case.toml_types import CaseName, Section, Text
 
 COUNT_KEY = "structures = N"
 """The name under which the count at the top reaches the model: TOML knows ``structures`` as an array of tables too."""
@@ -43,33 +43,27 @@ Region = Literal["abdomen", "chest", "pelvis", "brain", "head", "neck", "spine",
 """Which part of the body, or of what else, a case shows."""
 
 
-def with_count(data: Any) -> Any:
-    """The file's content with a count at the top under `COUNT_KEY`."""
-    if not isinstance(data, dict) or data.get("schema") != 2:
+def _known_schema(value: object) -> object:
+    if isinstance(value, bool) or value != 2:
+        said = "not stated" if value is None else f"schema {value!r} is not known"
+        raise ValueError(f'{said}; write schema = 2, region = "...", and last [end] with structures = N')
+    return value
+
+
+def _stated_region(value: object) -> object:
+    if value is None:
+        raise ValueError(f"schema = 2 needs region, one of {', '.join(get_args(Region))}")
+    return value
+
+
+def _statements(data: Any) -> Any:
+    """The file's content with a count at the top under `COUNT_KEY`, and None for what is not stated and must be."""
+    if not isinstance(data, dict):
         return data
     count = data.get("structures")
     if isinstance(count, int) and not isinstance(count, bool):
-        rest = {key: value for key, value in data.items() if key != "structures"}
-        return {**rest, COUNT_KEY: count}
-    return data
-
-
-def check_statement(schema: int, region: str | None, at_top: int | None, at_end: int | None) -> None:
-    """Whether what schema 2 demands is there, once; and none of it in schema 1.
-
-    Raises:
-        ValueError: It is missing, or stated twice with two numbers.
-    """
-    if schema == 1:
-        if region is not None or at_end is not None:
-            raise ValueError("region and [end] belong to schema = 2")
-        return
-    if at_top is None and at_end is None:
-        raise ValueError("schema = 2 needs its last table, [end] with structures = N; was the file cut?")
-    if at_top is not None and at_end is not None and at_top != at_end:
-        raise ValueError(f"structures = {at_top} at the top and {at_end} in [end]; keep one")
-    if region is None:
-        raise ValueError(f"schema = 2 needs region, one of {', '.join(get_args(Region))}")
+        data = {**{key: value for key, value in data.items() if key != "structures"}, COUNT_KEY: count}
+    return {"schema": None, "region": None, **data}
 
 
 def count_difference(stated: int, found: int) -> str:
@@ -88,9 +82,9 @@ class EndSection(Section):
 class CaseFile(Section):
     """The whole file."""
 
-    schema_: CaseSchema = Field(alias="schema")
+    schema_: Annotated[Literal[2], BeforeValidator(_known_schema)] = Field(alias="schema")
     structure_count: Annotated[int, Strict(), Field(ge=1)] | None = Field(None, alias="structures = N")
-    region: Region | None = None
+    region: Annotated[Region, BeforeValidator(_stated_region)]
     name: CaseName
     space: Literal["LPS", "RAS", "local"]
     target: TargetSection
@@ -113,9 +107,19 @@ class CaseFile(Section):
     end: EndSection | None = None
 
     @property
-    def stated_structures(self) -> int | None:
-        """How many structures the file says that it has, the skin among them; None in schema 1."""
-        return self.structure_count if self.end is None else self.end.structures
+    def stated_structures(self) -> int:
+        """How many structures the file says that it has, the skin among them.
+
+        Raises:
+            ValueError: It does not say, or says two numbers.
+        """
+        at_top, at_end = self.structure_count, None if self.end is None else self.end.structures
+        stated = at_top if at_end is None else at_end
+        if stated is None:
+            raise ValueError("schema = 2 needs its last table, [end] with structures = N; was the file cut?")
+        if at_top not in {None, stated}:
+            raise ValueError(f"structures = {at_top} at the top and {at_end} in [end]; keep one")
+        return stated
 
     @property
     def ct_name(self) -> str | None:
@@ -124,15 +128,13 @@ class CaseFile(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _with_count(cls, data: Any) -> Any:
-        return with_count(data)
+    def _as_stated(cls, data: Any) -> Any:
+        return _statements(data)
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
-        at_end = None if self.end is None else self.end.structures
-        check_statement(self.schema_, self.region, self.structure_count, at_end)
         stated = self.stated_structures
-        wrong = "" if stated is None or self.structures else count_difference(stated, len(self.structure))
+        wrong = "" if self.structures else count_difference(stated, len(self.structure))
         if wrong:
             raise ValueError(wrong)
         return self

@@ -19,7 +19,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.named_files import CaseVolumes
-from puncture_twin.planning.case.tables import ErrorsSection, RehearsalSection
+from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 DEFAULT_READING_MM = 0.5
@@ -159,7 +159,6 @@ def error_model(
     space: Space,
     cells: Cells | None = None,
     fle_mm: float | None = None,
-    rehearsal: RehearsalSection | None = None,
     where: str | Path = "errors",
 ) -> ErrorModel:
     """The declaration in mm and radians, with the defaults filled in.
@@ -169,13 +168,11 @@ def error_model(
         space: Of the case, in which ``bed_axis`` is meant.
         cells: Of the case's own CT, which give pixel, spacing and bed axis where the section does not.
         fle_mm: ``registration.fle_mm``, the short form: rms length of a marker's whole error, touch included.
-        rehearsal: For its older names of three of these keys.
         where: What errors name.
 
     Raises:
         InputError: One error declared twice, or slices that differ from pixels without a bed axis.
     """
-    section = _with_older_names(section, rehearsal, where)
     stated = section.model_fields_set
     if fle_mm is not None:
         twice = sorted(stated & {"ct_pixel_mm", "ct_spacing_mm", "ct_in_plane_mm", "ct_slice_mm", "touch_mm"})
@@ -240,30 +237,6 @@ def _bed_axis(section: ErrorsSection, space: Space, cells: Cells | None, where: 
     return np.asarray(vector / length)
 
 
-OLDER_NAMES = (
-    ("fle_ct_mm", ("ct_in_plane_mm", "ct_slice_mm")),
-    ("fle_touch_mm", ("touch_mm",)),
-    ("joint_offset_deg", ("joint_drift_deg",)),
-)
-"""Keys of ``[rehearsal]``, and what they are called in ``[errors]``."""
-
-
-def _with_older_names(section: ErrorsSection, rehearsal: RehearsalSection | None, where: str | Path) -> ErrorsSection:
-    """The section with what ``[rehearsal]`` states under its older names."""
-    stated = set() if rehearsal is None else rehearsal.model_fields_set
-    update: dict[str, float] = {}
-    for old, names in OLDER_NAMES:
-        if old not in stated:
-            continue
-        cells = {"ct_pixel_mm", "ct_spacing_mm"} if old == "fle_ct_mm" else set()
-        twice = sorted(section.model_fields_set & ({*names} | cells))
-        if twice:
-            message = f"rehearsal.{old} and errors.{twice[0]} state the same error"
-            raise InputError(message, where=where, allowed=f"errors.{names[0]} alone")
-        update |= dict.fromkeys(names, getattr(rehearsal, old))
-    return section.model_copy(update=update)
-
-
 def _or(value: float | None, default: float) -> float:
     return default if value is None else value
 
@@ -271,7 +244,7 @@ def _or(value: float | None, default: float) -> float:
 def errors_of(
     content: CaseFile, section: ErrorsSection | None, case_volumes: CaseVolumes, path: Path, *, truth: bool = False
 ) -> ErrorModel | None:
-    """The declared errors, or the truth's own, which know no short form and no older names."""
+    """The declared errors, or the truth's own, which know no short form."""
     if section is None:
         return None
     return error_model(
@@ -279,7 +252,6 @@ def errors_of(
         space=Space(content.space),
         cells=_ct_cells(content, case_volumes),
         fle_mm=None if truth or content.registration is None else content.registration.fle_mm,
-        rehearsal=None if truth else content.rehearsal,
         where=f"{path}: {'rehearsal.errors' if truth else 'errors'}",
     )
 

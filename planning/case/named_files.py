@@ -248,14 +248,9 @@ def _key(file: str, called: str) -> str:
     return f"{file}#{called}"
 
 
-SCHEMA_ONE_NOTE = (
-    "schema = 1 does not show whether the case file is whole: schema = 2 states its structures and its region "
-    "(docs/how-to/case-schema-2.md)"
-)
-
 TOP_COUNT_NOTE = (
     "structures = N stands at the top of the case, so that a cut after its last structure would not be seen; "
-    "state it in [end], the file's last table (docs/how-to/case-schema-2.md)"
+    "state it in [end], the file's last table"
 )
 
 NOT_LAST_NOTE = "[end] is not the last table of the case: what stands after it could be cut off unseen"
@@ -282,20 +277,14 @@ def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tupl
         path: The case file, for the error.
 
     Raises:
-        InputError: A list whose last line does not end, in schema 2.
+        InputError: A list whose last line does not end.
     """
-    unfinished = [said for name in _line_files(files) for said in unfinished_warnings(files.content(name), name)]
-    if unfinished and content.schema_ == 2:
-        raise InputError(unfinished[0], where=path, allowed="files of which every line ends with a line break")
-    return (*_notes(content, files.content(path.name).decode("utf-8")), *unfinished)
-
-
-def _notes(content: CaseFile, text: str) -> list[str]:
-    if content.schema_ == 1:
-        return [SCHEMA_ONE_NOTE]
+    for name in _line_files(files):
+        for said in unfinished_warnings(files.content(name), name):
+            raise InputError(said, where=path, allowed="files of which every line ends with a line break")
     if content.end is None:
-        return [TOP_COUNT_NOTE]
-    return [] if ends_with_end(text) else [NOT_LAST_NOTE]
+        return (TOP_COUNT_NOTE,)
+    return () if ends_with_end(files.content(path.name).decode("utf-8")) else (NOT_LAST_NOTE,)
 
 
 def _line_files(files: InputFiles) -> list[str]:

@@ -24,7 +24,7 @@ from puncture_twin.planning.case.tables import MarkerSection, tool_of
 from puncture_twin.planning.formats.points import parse_points
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
-ALLOWED_CASE = "a TOML case file with schema = 1 or 2, or a folder with case.toml"
+ALLOWED_CASE = "a TOML case file with schema = 2, or a folder with case.toml"
 
 
 def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:

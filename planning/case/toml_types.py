@@ -11,7 +11,6 @@ from pydantic import (
     AfterValidator,
     AllowInfNan,
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Field,
     Strict,
@@ -58,16 +57,6 @@ Degrees180 = Annotated[Number, Field(ge=0, le=180)]
 Yes = Annotated[bool, Strict()]
 Label = Annotated[int, Strict(), Field(ge=1, le=65535)]
 Anatomical = Literal["left", "right", "anterior", "posterior", "head", "feet"]
-
-
-def _known_schema(value: object) -> object:
-    if isinstance(value, bool) or value not in (1, 2):
-        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1 and schema = 2")
-    return value
-
-
-CaseSchema = Annotated[int, BeforeValidator(_known_schema)]
-"""The key ``schema``: 1 or 2."""
 
 
 class Section(BaseModel):

@@ -165,8 +165,6 @@ def ignored_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
 
 def absent_usual_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
     """The usual organs of the case's region that nobody named: they count as free."""
-    if case.region is None:
-        return
     absent = absent_organs(case.region, [*(structure.name for structure in anatomy.structures), *anatomy.ignored])
     if absent:
         said = f"no structure is named like {', '.join(absent)}; what has no structure counts as free"

@@ -19,9 +19,6 @@ from puncture_twin.planning.geometry.containment import Side, contains, odd_frac
 from puncture_twin.planning.geometry.spaces import Space, Unit, point_text, to_lps
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
-UNNAMED = frozenset((None, "phantom"))
-"""Regions in which structures have any name."""
-
 MOST_AROUND = 0.5
 """An open mesh may go so far around the target: of the rays that cross it oddly, and of its winding number."""
 
@@ -119,7 +116,7 @@ def target_in_vessel(case: Case) -> Iterator[Finding]:
     """That the target is a vessel or the like: its structure is not avoided, so paths that end in it are safe.
 
     And that its name is not wholly known: a ``Tumorvene`` is a vessel, a lesion's by a part of its name alone, and an
-    ``AAA`` is an aneurysm. In a phantom, and where a case of schema 1 states no region, any name is usual.
+    ``AAA`` is an aneurysm. In a phantom any name is usual.
     """
     if case.own_target:
         return
@@ -130,7 +127,7 @@ def target_in_vessel(case: Case) -> Iterator[Finding]:
         return
     line = default_role(name, "other")
     part = line == LESION and not named_as_crossed(name)
-    if part or (line is None and case.region not in UNNAMED):
+    if part or (line is None and case.region != "phantom"):
         of = "is a lesion's by a part of it alone" if part else "the table of default roles does not know"
         said = f"a name that {of}, and every safe path ends in it: is it no vessel?"
         yield Finding("target_name_unknown", Severity.WARNING, f"the target lies in '{name}', {said}")

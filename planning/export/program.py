@@ -432,17 +432,13 @@ def plain_text(text: str) -> str:
 SENTENCE_WIDTH = 110
 """Columns of a warning's lines in a comment."""
 
-WARNINGS_UNKNOWN = "warnings: not known, the plan's file is older than their statement; plan again"
 
-
-def warning_lines(warnings: Sequence[str] | None) -> list[str]:
+def warning_lines(warnings: Sequence[str]) -> list[str]:
     """The warnings of a plan for a comment: how many, then each whole, on as many lines as it needs.
 
     >>> warning_lines(("the 'skin' is open; a box",))
     ['1 warning stood when this was planned:', 'warning: the skin is open, a box']
     """
-    if warnings is None:
-        return [WARNINGS_UNKNOWN]
     if not warnings:
         return ["warnings: none stood when this was planned"]
     lines = [line for one in warnings for line in textwrap.wrap(f"warning: {plain_sentence(one)}", SENTENCE_WIDTH)]

@@ -135,17 +135,15 @@ def _approach(program: Program) -> list[str]:
     return [*lines, *(["  stopj(1.4)", _SETTLE] if len(program.stream_q) else [])]
 
 
-def _of_warnings(warnings: Sequence[str] | None) -> str:
+def _of_warnings(warnings: Sequence[str]) -> str:
     """Warnings in the popup: how many, and how the first begins."""
-    if warnings is None:
-        return "Its warnings are not known. "
     if not warnings:
         return ""
     first = textwrap.shorten(plain_sentence(warnings[0]), FIRST_WORDS, placeholder=" ...")
     return f"{counted(warnings)}: {first} See the program. "
 
 
-def _insertion(program: Program, warnings: Sequence[str] | None) -> list[str]:
+def _insertion(program: Program, warnings: Sequence[str]) -> list[str]:
     acceleration = _number(program.insertion_mm_s2 * M_PER_MM)
     return [
         f"  if far_from(standoff_q, {START_TOLERANCE_RAD}):",

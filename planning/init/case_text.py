@@ -19,7 +19,10 @@ from puncture_twin.planning.init.finder import Markers
 from puncture_twin.planning.init.overrides import STATED, with_keys, with_line
 from puncture_twin.planning.init.segmentation import Assigned, Segmentation, quoted
 
-HEAD = """# Written by `init`: a start. Look at the roles and margins below before any result is trusted.
+HEAD = """#:schema ./case.schema.json
+# (by which editors complete keys, where `run-twin schema > case.schema.json` has written it here)
+
+# Written by `init`: a start. Look at the roles and margins below before any result is trusted.
 # Every key: docs/reference/case.md; where roles and margins come from: docs/reference/default-roles.md.
 schema = 2
 region = "{region}"

@@ -50,8 +50,8 @@ class Plan:
         insertion: From standoff to the target.
         clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
             to patient and workcell, ``needle`` to the nearest structure with a margin.
-        speeds: What it keeps: the case's. A file that does not say so keeps the default.
-        warnings: Of its case when it was made, one sentence each; None of a file that is older than their statement.
+        speeds: What it keeps: the case's.
+        warnings: Of its case when it was made, one sentence each.
     """
 
     case_name: str
@@ -71,8 +71,8 @@ class Plan:
     approach: Trajectory
     insertion: Trajectory
     clearance_mm: Mapping[str, float]
+    warnings: tuple[str, ...]
     speeds: SpeedLimits = DEFAULT_SPEEDS
-    warnings: tuple[str, ...] | None = None
 
     @brief
     def __repr__(self) -> str:
@@ -120,7 +120,7 @@ def _facts(plan: Any) -> Facts:
     for phase, millimetres in plan.clearance_mm.items():
         yield CLEARANCE_TEXT[phase], f"{millimetres:.1f} mm"
     yield "seed", str(plan.seed)
-    yield "warnings", "not known: an older file" if plan.warnings is None else "; ".join(plan.warnings) or "none"
+    yield "warnings", "; ".join(plan.warnings) or "none"
 
 
 def _point(point: Any) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, HIGHEST, SpeedLimits
+from puncture_twin.planning.arm.kinematics import HIGHEST, SpeedLimits
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -34,9 +34,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import arm_document, check_geometry, rate_limits, read_arm
 
 PLAN_VERSION = 3
-"""Version of the file's layout. 2: states the peaks of both phases beside the limits; the approach is smooth. 3: lists
-its inputs with their roles, files that a file names included. What came later may be absent: `arm`, `speed_limits`,
-`warnings`."""
+"""Version of the file's layout. `arm` is absent for an arm of the table, whose name says its numbers."""
 
 PLAN_ALLOWED = f"a plan.json of version {PLAN_VERSION}; plan again"
 
@@ -95,7 +93,7 @@ def write_plan(plan: Plan, path: Path) -> None:
         "approach": _trajectory_document(plan.approach),
         "insertion": _trajectory_document(plan.insertion),
         "clearance_mm": {phase: or_null(value) for phase, value in plan.clearance_mm.items()},
-        **({} if plan.warnings is None else {"warnings": list(plan.warnings)}),
+        "warnings": list(plan.warnings),
     }
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -165,7 +163,7 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         *((f"inputs.{at}.", one, INPUT_NAMES) for at, one in enumerate(document["inputs"])),
     ):
         # a phase whose clearance is not stated is for whoever has the case to miss
-        optional = set(known) if part is document["clearance_mm"] else {"speed_limits", "arm", "warnings"}
+        optional = set(known) if part is document["clearance_mm"] else {"arm"}
         for name in sorted(set(part) ^ set(known) - (optional - set(part))):
             what = "is not known" if name in part else "is missing"
             raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
@@ -195,15 +193,13 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
         approach=field(document, "approach", _trajectory),
         insertion=field(document, "insertion", _trajectory),
         clearance_mm=field(document, "clearance_mm", _clearances),
-        speeds=field({"speed_limits": None, **document}, "speed_limits", _speed_limits),
-        warnings=field(document, "warnings", texts) if "warnings" in document else None,
+        speeds=field(document, "speed_limits", _speed_limits),
+        warnings=field(document, "warnings", texts),
     )
 
 
 def _speed_limits(value: Any) -> SpeedLimits:
-    """What a plan says that it keeps; plans from before it was said keep the default, or are refused."""
-    if value is None:
-        return DEFAULT_SPEEDS
+    """What a plan says that it keeps."""
     if set(value) != set(SpeedLimits._fields):
         raise ValueError(f"speed_limits are {', '.join(SpeedLimits._fields)}")
     speeds = SpeedLimits(*(number(value[name]) for name in SpeedLimits._fields))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,14 +65,9 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
     return candidates
 
 
-def with_case_warnings(plan: Plan, context: CaseContext) -> Plan:
-    """A plan that was checked, with its case's warnings: an older file does not state them."""
-    return replace(plan, warnings=context.anatomy.warnings)
-
-
 def _check_warnings(plan: Plan, context: CaseContext, path: Path) -> None:
     """Refuse a plan that states other warnings than its case has: people decide by them."""
-    if plan.warnings is not None and plan.warnings != context.anatomy.warnings:
+    if plan.warnings != context.anatomy.warnings:
         apart = set(plan.warnings) ^ set(context.anatomy.warnings)
         shown = f", such as '{min(apart)}'" if apart else ""
         raise InputError(f"its warnings are not those of the case{shown}", where=path, allowed="plan again")

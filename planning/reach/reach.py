@@ -17,17 +17,14 @@ import numpy as np
 from puncture_twin.planning.arm.insertion import first_stop, needle_lines, reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import inverse, pan_angle, wrapped_solutions, wrist_angles
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, away_from_singularities, singularity
-from puncture_twin.planning.arm.tool import Box, Tool
-from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.bodies import BODY_NAMES
-from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.reach.survey import (
     MARGIN_DIGITS,
@@ -402,37 +399,3 @@ def _rotated(checker: StateChecker, answer: ReachAnswer) -> list[ReachAnswer]:
     ]
     inside = [q for q in motions if checker.model.within_limits(q).all()]
     return [replace(answer, insertion_q=q, margin=reach_margin(checker.model, q)) for q in inside]
-
-
-NEEDLE = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
-
-STANDOFF_MM = 120.0
-
-TARGET = np.array([360.0, 20.0, 100.0])
-"""In the middle of the body, mm, base frame."""
-
-OUTWARD = np.array([[0.0, 0.0, 1.0], [-0.3, 0.2, 0.93], [0.9, 0.1, 0.3], [0.3, 0.0, 0.95]])
-"""Two directions that the arm reaches, and two that it does not."""
-
-CORNERS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
-
-FACES = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-"""Faces of an octahedron, counterclockwise from outside."""
-
-
-def small_workcell() -> FastChecker:
-    """A UR3, a body over a table, something else next to it; mm, base frame."""
-    table = Box("table", pose(np.eye(3), TARGET - [0.0, 0.0, 220.0]), (300.0, 300.0, 20.0))
-    body, outside = octahedron(TARGET, 80.0), octahedron(TARGET - [0.0, 200.0, 100.0], 40.0)
-    return FastChecker(ur_model("ur3"), NEEDLE, [table], body, outside=outside, padding_mm=1.0)
-
-
-def check_small_workcell(checker: FastChecker) -> list[ReachAnswer]:
-    """Reach of the small workcell's directions: compiles every kernel of the arm before a case needs it."""
-    outward = OUTWARD / np.linalg.norm(OUTWARD, axis=1, keepdims=True)
-    return assess_reach_all(checker, [ReachRequest(TARGET, u, NEEDLE.needle_length_mm, STANDOFF_MM) for u in outward])
-
-
-def octahedron(at: Floats, radius_mm: float) -> TriangleMesh:
-    """Corners (6, 3) at a distance from a place (3,), mm."""
-    return TriangleMesh(at + radius_mm * CORNERS, FACES)

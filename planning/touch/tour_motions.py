@@ -340,6 +340,7 @@ def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
         approach=approach,
         insertion=follow_smoothly(slowed(model, speeds), line, depths, max_tip_speed_mm_s=speeds.insertion_speed_mm_s),
         clearance_mm={},
+        warnings=context.anatomy.warnings,
         speeds=speeds,
     )
     touched = motion_contact(plan, checker)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy
 import SimpleITK as sitk  # noqa: N813
+from case_world import whole
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN, ball
 from puncture_twin.planning.anatomy.body.body_mask import body_mask, filled_slices
@@ -32,7 +33,8 @@ PLANK = ScannedPart("plank", supine.slab((-250, supine.BACK_MM - 6, -400), (250,
 NEEDLE = "length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.2"
 
 CASE = """
-schema = 1
+schema = 2
+region = "other"
 name = "supine"
 space = "LPS"
 [target]
@@ -101,7 +103,8 @@ def write_scene(folder, parts, grid, seed=3, fill=None, scanner=False):
 def write_case(folder, *, skin='ct = "ct.nii.gz"', structures=SPINE, search="", more="", step=STEP_DEG, name="case"):
     """A case beside the scene."""
     path = folder / f"{name}.toml"
-    path.write_text(CASE.format(needle=NEEDLE, step=step, search=search, skin=skin, structures=structures, more=more))
+    text = CASE.format(needle=NEEDLE, step=step, search=search, skin=skin, structures=structures, more=more)
+    path.write_text(whole(text))
     return path
 
 

@@ -11,6 +11,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 import trimesh
+from case_world import whole
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
@@ -27,7 +28,8 @@ CAP = {"theta": (4 * DEG, 40 * DEG), "beta": (-30 * DEG, 30 * DEG)}
 """Toward the head; angles from 0 to 25 degrees are imaged, waited for beyond the image, or inserted beyond it."""
 
 CASE = """
-schema = 1
+schema = 2
+region = "other"
 name = "cut"
 space = "LPS"
 [target]
@@ -72,7 +74,7 @@ def cut_case(folder, standoff=""):
         mesh.apply_translation(middle)
         mesh.export(folder / f"{name}.ply")
     path = folder / "case.toml"
-    path.write_text(CASE.format(standoff=standoff))
+    path.write_text(whole(CASE.format(standoff=standoff)))
     return prepare(path, arm=False)
 
 

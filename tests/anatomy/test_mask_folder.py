@@ -40,8 +40,8 @@ def write_masks(folder):
 def case_of(folder, source):
     """A case of the usual skin and a source of structures."""
     write_balls(folder, "skin")
-    text = case_text(SKIN, "[[structures]]\n" + RULES.format(source=source), END.format(3), schema="2")
-    (folder / "case.toml").write_text(text.replace("schema = 2", 'schema = 2\nregion = "phantom"'))
+    text = case_text(SKIN, "[[structures]]\n" + RULES.format(source=source), region="phantom", listed=2)
+    (folder / "case.toml").write_text(text)
     return folder / "case.toml"
 
 

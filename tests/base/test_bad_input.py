@@ -15,6 +15,7 @@ from case_world import (
     case_text,
     registration_section,
     structure,
+    whole,
     write_balls,
     write_labels,
     write_markers,
@@ -395,7 +396,7 @@ def test_there_are_enough_ways_to_be_wrong():
 def test_a_wrong_command_line_is_refused(arguments, message, folder, capfd):
     """Missing, misspelled and impossible arguments: the same exit code and form."""
     text = (folder / "case.toml").read_text()
-    (folder / "case.toml").write_text(text[: text.index("[registration]")])
+    (folder / "case.toml").write_text(whole(text[: text.index("[registration]")]))
     (folder / "manifest.json").write_text("{}")
     named = {"CASE": folder, "MANIFEST": folder / "manifest.json"}
     assert message in refused([named.get(a, a) for a in arguments], capfd)
@@ -426,7 +427,8 @@ def test_open_and_inverted_meshes_work_with_a_warning(folder, tmp_path, capfd):
 def test_a_refusal_is_the_one_object_of_json(folder, capfd, change, arguments, code, where):
     """What, where and what is allowed, for a program; the same line stands on stderr, and the exit code is 2."""
     if change:
-        (folder / "case.toml").write_text((folder / "case.toml").read_text() + f"[end]\n{change}\n")
+        text = (folder / "case.toml").read_text()
+        (folder / "case.toml").write_text(text[: text.index("[end]")] + f"[end]\n{change}\n")
     assert main([str(folder) if one == "CASE" else one for one in arguments] + ["--json"]) == 2
     captured = capfd.readouterr()
     error = json.loads(captured.out)["error"]

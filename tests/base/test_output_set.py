@@ -113,18 +113,8 @@ def test_own_files_are_never_touched(planned):
     assert read(planned / "plan.json").data == b"q"
 
 
-def test_files_of_a_version_without_manifests_are_an_old_set(tmp_path):
-    """They are removed, and named; a file that only sounds like one stays, and so does somebody's recording."""
-    for name in ("candidates.parquet", "report.html", "plan.json", "plan.script", "notes.txt", "recording.csv"):
-        (tmp_path / name).write_text("old")
-    said = []
-    write(tmp_path, "search", {"candidates.parquet": "new"}, note=said.append)
-    assert names(tmp_path) == {"candidates.parquet", "notes.txt", "recording.csv"} | OURS
-    assert len(said) == 1 and "plan.json, plan.script, report.html" in said[0]
-
-
-def test_a_map_that_no_version_wrote_is_not_overwritten(tmp_path):
-    """Without a table beside it, map.png is somebody's own."""
+def test_a_file_that_no_manifest_lists_is_not_overwritten(tmp_path):
+    """It is somebody's own, whatever it is called."""
     (tmp_path / "map.png").write_text("mine")
     with pytest.raises(InputError, match=r"map.png is to be written"):
         write(tmp_path, "search", {}, names=("map.png",))

@@ -94,8 +94,8 @@ BAD = {
         ("length_mm = 210.0", "length_mm = 0.21"),
         "needle.length_mm: .*greater than or equal to 20",
     ),
-    "another schema": (("schema = 1", "schema = 3"), "schema 3 is not known"),
-    "no schema": (("schema = 1", ""), "schema: Field required"),
+    "another schema": (("schema = 2", "schema = 1"), "schema 1 is not known; write schema = 2, region"),
+    "no schema": (("schema = 2", ""), "schema: not stated; write schema = 2, region"),
     "text for a number": (
         ("diameter_mm = 1.2", 'diameter_mm = "1.2"'),
         "needle.diameter_mm: Input should be a valid number",
@@ -178,7 +178,7 @@ def test_contradictions_with_the_robot_are_refused(added, message, write):
     [
         (b"\x00\xff\xfe binary", "is not TOML"),
         (b"schema = ", "is not TOML"),
-        (b"", "Field required"),
+        (b"", "schema: not stated; write schema = 2"),
         (b"# " + b"x" * 2_000_000, "larger than 1 MB"),
     ],
 )

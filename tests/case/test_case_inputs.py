@@ -27,6 +27,7 @@ CASE = case_text(
     registration_section(),
     '[rehearsal]\ntruth_base = "truth.csv"\n',
     name="inputs",
+    listed=1,
     target='# 1\npoints = "targets.csv"\nname = "T"\nstructure = "organ"',
 )
 

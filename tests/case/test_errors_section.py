@@ -6,13 +6,13 @@ from pydantic import ValidationError
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.errors import Cells, error_model
-from puncture_twin.planning.case.tables import ErrorsSection, RehearsalSection
+from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space
 
 
-def model(space=Space.LPS, cells=None, fle_mm=None, rehearsal=None, **keys):
+def model(space=Space.LPS, cells=None, fle_mm=None, **keys):
     """The declaration of some keys."""
-    return error_model(ErrorsSection(**keys), space=space, cells=cells, fle_mm=fle_mm, rehearsal=rehearsal)
+    return error_model(ErrorsSection(**keys), space=space, cells=cells, fle_mm=fle_mm)
 
 
 def test_a_cell_makes_a_uniform_error():
@@ -46,9 +46,6 @@ def test_a_bed_axis_turns_the_slices_and_ras_is_understood():
         ({"ct_slice_mm": 1.0, "bed_axis": (0.0, 0.0, 0.0)}, "bed_axis is zero"),
         ({"fle_mm": 1.0, "touch_mm": 0.1}, "state the same error"),
         ({"fle_mm": 1.0, "ct_pixel_mm": 0.1}, "state the same error"),
-        ({"rehearsal": RehearsalSection(fle_touch_mm=0.2), "touch_mm": 0.1}, "state the same error"),
-        ({"rehearsal": RehearsalSection(fle_ct_mm=0.2), "ct_spacing_mm": 0.1}, "state the same error"),
-        ({"rehearsal": RehearsalSection(joint_offset_deg=0.2), "joint_drift_deg": 0.1}, "state the same error"),
     ],
 )
 def test_contradictions_are_refused(settings, told):
@@ -63,14 +60,11 @@ def test_cell_and_deviation_are_one_error():
         ErrorsSection(ct_pixel_mm=1.0, ct_in_plane_mm=0.3)
 
 
-def test_the_short_form_and_the_older_names():
-    """fle_mm^2/3 in each axis and no touch; [rehearsal]'s keys mean these."""
+def test_the_short_form():
+    """fle_mm^2/3 in each axis and no touch."""
     short = model(fle_mm=0.9)
     np.testing.assert_allclose(short.marker_cov_ct, 0.27 * np.eye(3))
     assert short.touch_mm == 0
-    old = model(rehearsal=RehearsalSection(fle_ct_mm=0.4, fle_touch_mm=0.2, joint_offset_deg=0.1))
-    np.testing.assert_allclose(old.marker_cov_ct, 0.16 * np.eye(3))
-    assert (old.touch_mm, old.arm.drift) == (0.2, np.radians(0.1))
 
 
 def test_a_nominal_arm_errs_ten_times_as_much():

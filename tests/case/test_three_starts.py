@@ -42,7 +42,6 @@ def hand_written(source, masks, count):
     return (
         changed(
             head,
-            ("schema = 1", 'schema = 2\nregion = "abdomen"'),
             ("length_mm = 210.0", "length_mm = 200.0"),
             COARSE,
             (naming, f'masks = "{masks}"\n' if masks else naming),

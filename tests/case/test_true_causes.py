@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from case_world import CASE, write_case
+from case_world import write_case
 from round_body import X, body_hu, inside, write_image
 
 from puncture_twin.planning.anatomy.default_roles import NOT_ANNOTATED, default_role
@@ -109,8 +109,7 @@ def test_nothing_at_all_says_so(tmp_path):
 
 def test_a_list_that_was_cut_is_refused_before_a_volume_is_read(tmp_path):
     """A missing line break cost minutes: volumes of gigabytes were read first."""
-    text = CASE.replace("schema = 1", 'schema = 2\nregion = "other"')
-    write_case(tmp_path, text=text + "\n[end]\nstructures = 4\n")
+    write_case(tmp_path)
     (tmp_path / "markers_ct.csv").write_text((tmp_path / "markers_ct.csv").read_text().rstrip("\n"))
     for volume in tmp_path.glob("*.n*"):
         volume.write_bytes(b"no volume")

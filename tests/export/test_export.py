@@ -90,6 +90,7 @@ def plan_to(waypoints, *, speed_scale=0.5, tip_mm_s=10.0, model=UR3):
         insertion=follow_smoothly(model, way, depths, max_tip_speed_mm_s=tip_mm_s),
         clearance_mm={"approach": 12.0},
         speeds=FAST if speed_scale <= 0.5 else FAST._replace(tip_speed_mm_s=5000.0),
+        warnings=(),
     )
 
 
@@ -613,11 +614,10 @@ DOUBT = "markers_ct with x and y negated, as LPS and RAS differ, would lie on th
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_warnings_stand_whole_in_every_file(plan, name, tmp_path):
-    """Their words, in comments; an older plan says that they are not known, one without any that there are none."""
+    """Their words, in comments; a plan without any says that there are none."""
     said = {
         (DOUBT, "a\nb"): "2 warnings stood when this was planned:",
         (): "warnings: none stood when this was planned",
-        None: "warnings: not known",
     }
     bodies = []
     for number, (warnings, line) in enumerate(said.items()):
@@ -628,13 +628,12 @@ def test_warnings_stand_whole_in_every_file(plan, name, tmp_path):
         if warnings:
             comment = " ".join(one[2:] for one in lines if one.startswith("# "))
             assert "would lie on the skin, too alike to tell" in comment and "warning: a_b" in comment
-    assert bodies[0] == bodies[1] == bodies[2]
+    assert bodies[0] == bodies[1]
 
 
 @pytest.mark.parametrize(
     ("warnings", "words"),
     [
-        (None, "Its warnings are not known. "),
         ((), ""),
         ((DOUBT, "another"), "2 warnings: markers_ct with x and y negated, as LPS and RAS differ, "),
         (("x" * 500,), "1 warning: ... See the program. "),

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import SimpleITK
-from case_world import CASE, changed, registration_section, write_case
+from case_world import CASE, changed, registration_section, whole, write_case
 from export.slicer_facts import MARKUP, POINT, SCHEMA, check_attributes, check_properties
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
@@ -185,7 +185,7 @@ def test_what_cannot_be_shown_is_refused_and_nothing_is_written(tmp_path, contex
     write_case(tmp_path, *CHANGES, local, NO_ROBOT)
     text = (tmp_path / "case.toml").read_text()
     vessel = text.index('[[structure]]\nname = "vessel"')
-    (tmp_path / "case.toml").write_text(text[:vessel])
+    (tmp_path / "case.toml").write_text(whole(text[:vessel]))
     with pytest.raises(InputError, match="Slicer knows LPS and RAS"):
         export_to_slicer(prepare(tmp_path), tmp_path / "a", BEST)
     assert not [one for one in (tmp_path / "a").glob("*") if one.suffix in (".json", ".mrml", ".tfm", ".vtp")]

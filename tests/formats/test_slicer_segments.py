@@ -126,7 +126,7 @@ def test_a_case_takes_segments_that_overlap_by_their_names(tmp_path):
         '[[structures]]\nseg = "body.seg.nrrd"\ntarget = ["lesion 1"]\ntraverse = ["right lung"]\navoid = { rib = 2 }\n'
     )
     target = 'position_mm = [0.0, 0.0, 0.0]\nstructure = "lesion 1"'
-    (tmp_path / "case.toml").write_text(case_text(structure("skin", "skin"), rules, target=target))
+    (tmp_path / "case.toml").write_text(case_text(structure("skin", "skin"), rules, target=target, listed=3))
     case = load_case(tmp_path)
     assert ("seg", "body.seg.nrrd") in [(one.role, one.path) for one in case.inputs]
     found = {one.name: one for one in load_anatomy(case).structures}

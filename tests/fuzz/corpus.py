@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import SimpleITK
 import trimesh
-from case_world import MARKERS, registration_section
+from case_world import MARKERS, registration_section, whole
 from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_case
 from pydicom.uid import ImplicitVRLittleEndian, RLELossless
 from slicer_files import vtk_model
@@ -38,9 +38,6 @@ LABELS = (
     '[[structures]]\nlabelmap = "labels.seg.nrrd"\navoid = { "ves*" = 2.0 }\nignore = ["bone"]\n'
     '[[structure]]\nname = "lesion"\nlabelmap = "labels.nii.gz"\nlabel = 2\nrole = "unknown"\nmargin_mm = 1.0\n'
 )
-SCHEMA_TWO = 'schema = 2\nregion = "other"'
-STATED = 5
-"""Structures of ``stated.toml``, the skin among them: three balls and two labels."""
 CHECKS = (
     'case = "case.toml"\n[[check]]\ntheta_deg = 20\nbeta_deg = 135\nverdict = "rejected"\nreason = "too_close"\n'
     'structure = "rib"\nclearance_mm = { rib = 41.2 }\ntolerance_mm = 0.1\n[[check]]\ntheta_deg = 0\nbeta_deg = 0\n'
@@ -69,9 +66,8 @@ def make_corpus(folder):
     make_transforms(folder)
     sound_case(folder, CASE + RIB)
     text = CASE + RIB + LABELS + REGISTRATION + TABLE
-    (folder / "full.toml").write_text(text)
-    (folder / "stated.toml").write_text(text.replace("schema = 1", SCHEMA_TWO) + f"[end]\nstructures = {STATED}\n")
-    (folder / "mount.toml").write_text(CASE + RIB + MOUNT)
+    (folder / "full.toml").write_text(whole(text, listed=1))
+    (folder / "mount.toml").write_text(whole(CASE + RIB + MOUNT))
     (folder / "x.collision.toml").write_text(CHECKS)
     for name in ("head/servo.toml", "head/head.ply", "head/markers.csv", "head/targets.csv", "selfcal/selfcal.toml"):
         (folder / name.split("/")[1]).write_bytes((embedded() / name).read_bytes())
@@ -276,4 +272,5 @@ def straight_plan():
         approach=Trajectory(np.zeros(1), q[:1]),
         insertion=evenly((depth - depth[0]) / 2.0, q),
         clearance_mm={"approach": 20.0, "insertion": 10.0, "needle": 5.0},
+        warnings=(),
     )

@@ -7,7 +7,6 @@ import numpy as np
 from fuzz.output_sets import rewritten_set, whole_set
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.anatomy.unseen import BEYOND_LABELS
-from puncture_twin.planning.case.named_files import SCHEMA_ONE_NOTE
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.checks_file import read_checks
@@ -125,11 +124,11 @@ def whole_certificate(certificate):
 def whole_case(read):
     """Finite numbers, one skin, something to avoid, unique names, a target inside; meshes that are whole.
 
-    And nothing is lost: there are as many structures as the file states, or a note says that it states none.
+    And nothing is lost: there are as many structures as the file states.
     """
     case, anatomy = read
     stated = sum(structure.name != BEYOND_LABELS for structure in anatomy.structures) + 1  # the skin is one
-    assert case.stated_structures == stated or SCHEMA_ONE_NOTE in case.warnings
+    assert case.stated_structures == stated
     assert np.isfinite(case.target_ct).all() and np.isfinite(case.T_ct_entry).all()
     names = [structure.name for structure in anatomy.structures]
     assert len(set(names)) == len(names) and any(s.demands_margin for s in anatomy.structures)
@@ -230,7 +229,7 @@ LABELS = {
     "labels.nhdr": "text",
 }
 TRANSFORMS = {"transform.h5": "hdf5", "earliest.h5": "hdf5", "transform.tfm": "text"}
-CASES = ("full.toml", "stated.toml", "case.toml", "mount.toml")
+CASES = ("full.toml", "case.toml", "mount.toml")
 TARGETS = [
     Target("mesh", MESHES, read_own_mesh, whole_mesh),
     Target("volume", {"ct.nii.gz": "gzip", "ct.nrrd": "headed", **LABELS}, read_volume, whole_volume),

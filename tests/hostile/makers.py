@@ -4,7 +4,7 @@ import json
 import struct
 
 import numpy as np
-from case_world import case_text, structure, write_balls
+from case_world import case_text, structure, whole, write_balls
 
 from puncture_twin.planning.certify.cells import Cells
 from puncture_twin.planning.certify.certificate import Certificate, write_certificate
@@ -26,7 +26,7 @@ STRUCTURE = RIB.replace('"rib"', '"s{0}"')
 def sound_case(folder, text=CASE + RIB):
     """A case of three balls, in which everything is right."""
     write_balls(folder, ending="ply")
-    (folder / "case.toml").write_text(text)
+    (folder / "case.toml").write_text(whole(text))
 
 
 def case_with(before="", after="", old="", new=""):

@@ -14,8 +14,6 @@ from walls.house import modules, tree
 from puncture_twin.run_twin import app
 
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
-BEFORE = {"migration.md"}
-"""Pages that name what was before."""
 GENERATED = {"rooms/"}
 """What exists in the built site alone."""
 
@@ -79,8 +77,7 @@ def test_every_file_and_module_that_is_named_exists(page):
     """A page that names a moved file is worse than one that names none."""
     text = page.read_text(encoding="utf-8")
     known = modules()
-    if page.name not in BEFORE:
-        assert [name for name in FILE.findall(text) if not (ROOT / name).exists()] == []
+    assert [name for name in FILE.findall(text) if not (ROOT / name).exists()] == []
     for dotted in DOTTED.findall(text):
         room, _, name = dotted.rpartition(".")
         assert dotted in known or (room in known and name in names_of(known[room])), dotted
@@ -89,8 +86,7 @@ def test_every_file_and_module_that_is_named_exists(page):
 @each_page
 def test_every_class_that_is_named_exists(page):
     """Renamed classes are renamed on the pages too."""
-    if page.name not in BEFORE:
-        assert set(CLASS.findall(page.read_text(encoding="utf-8"))) - class_names() == set()
+    assert set(CLASS.findall(page.read_text(encoding="utf-8"))) - class_names() == set()
 
 
 @each_page

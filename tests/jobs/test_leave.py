@@ -11,7 +11,7 @@ import pytest
 ENDS = """
 import atexit, os, sys, tempfile, threading, time
 from concurrent.futures import ThreadPoolExecutor
-from puncture_twin.twin.jobs.leave import leave
+from puncture_twin.twin.jobs.terminal import leave
 
 class Last:
     def __del__(self):
@@ -41,7 +41,7 @@ def test_what_others_count_on_is_done_and_nothing_more():
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full is of Linux")
 def test_an_output_that_cannot_be_written_is_told():
     """As by Python itself: 120."""
-    code = "from puncture_twin.twin.jobs.leave import leave; print('answer'); leave(0)"
+    code = "from puncture_twin.twin.jobs.terminal import leave; print('answer'); leave(0)"
     with Path("/dev/full").open("w") as full:
         buffered = {**os.environ, "PYTHONUNBUFFERED": ""}
         done = subprocess.run([sys.executable, "-c", code], stdout=full, env=buffered, check=False)
@@ -51,7 +51,7 @@ def test_an_output_that_cannot_be_written_is_told():
 def test_who_does_not_wait_for_the_end_sees_no_traceback():
     """Ctrl-C once the command is over ends the process, as it does one that knows nothing of it."""
     code = (
-        "import os, signal, threading, time\nfrom puncture_twin.twin.jobs.leave import leave\n"
+        "import os, signal, threading, time\nfrom puncture_twin.twin.jobs.terminal import leave\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "def interrupt():\n    time.sleep(0.5)\n    os.kill(os.getpid(), signal.SIGINT)\n    time.sleep(20)\n"
         "threading.Thread(target=interrupt).start()\n"

@@ -247,6 +247,13 @@ def test_ctrl_c_is_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_path, 
     assert problems(copy) == ()
 
 
+@pytest.fixture
+def one_core(monkeypatch):
+    """Nothing begins in a process beside."""
+    monkeypatch.setattr("puncture_twin.twin.jobs.patient.rehearsed.worker_count", lambda wanted, pieces: 1)
+
+
+@pytest.mark.usefixtures("one_core")
 def test_one_process_writes_what_two_write(carton, rehearsed, tmp_path):
     """A plan executed and filmed here, after the pictures, gives the bytes of one that was so while they were drawn."""
     rehearse_case(prepare(carton), tmp_path)
@@ -254,6 +261,7 @@ def test_one_process_writes_what_two_write(carton, rehearsed, tmp_path):
         assert path.name == "timings.json" or path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
 
 
+@pytest.mark.usefixtures("one_core")
 def test_the_page_links_the_film_that_there_is(carton, rehearsed, tmp_path, monkeypatch):
     """The page is drawn while the film is made; where that is a GIF, for want of an encoder, again."""
 

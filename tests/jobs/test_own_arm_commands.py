@@ -167,7 +167,7 @@ BAD = [
     (with_bytes("j.csv", (JOINTS + "400,-9,9,0,9,0\n0,-9,9,0,9,0\n").encode()), ["pivot", "j.csv"], "j.csv"),
     (in_text("touch.csv", "\nB,", "\nA,"), ["register"], "the name 'A' is used 2 times|touch.csv"),
     (in_metres, ["plan"], "touch|markers"),
-    (with_bytes("touch.csv", b"\xff\xfe"), ["touch"], "touch.csv: .*text"),
+    (with_bytes("touch.csv", b"\xff\xfe\n"), ["touch"], "touch.csv: .*text"),
     (with_bytes("r.json", b'{"schema": 1}'), ["scan", "--rehearsal", "r.json"], "r.json"),
     (with_bytes("r.json", b"\0"), ["scan", "--rehearsal", "r.json"], "r.json"),
     (in_text("case.toml", "[rehearsal]", "[rehearsal]\nhu = 3"), ["scan", "--marker", "cube"], "cube|hu"),

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from case_world import whole
 
 from puncture_twin.planning.case.entry import grid
 from puncture_twin.planning.search.context import prepare
@@ -15,7 +16,8 @@ from puncture_twin.run_twin import main
 
 PIXEL, STEP_DEG = 2.0, 9.0
 NEEDLE = "[needle]\nlength_mm = 150.0\nshaft_mm = 120.0\ndiameter_mm = 1.2\n"
-CASE = """schema = 1
+CASE = """schema = 2
+region = "other"
 name = "small"
 space = "LPS"
 [target]
@@ -68,7 +70,7 @@ def truth(tmp_path_factory):
     for name, mesh in meshes().items():
         mesh.export(folder / f"{name}.ply")
         text += f'[[structure]]\nname = "{name}"\nmesh = "{name}.ply"\nunit = "mm"\n{ROLES[name]}\n'
-    (folder / "case.toml").write_text(text)
+    (folder / "case.toml").write_text(whole(text))
     context = prepare(folder, arm=False)
     return folder, context, _answers(context, context.case.T_ct_entry[:3, :3])
 
@@ -147,7 +149,7 @@ def test_what_is_thinner_than_a_voxel_is_not_lost(tmp_path, capsys):
         mesh.export(tmp_path / f"{name}.ply")
         role = THIN.get(name) or ROLES[name]
         text += f'[[structure]]\nname = "{name}"\nmesh = "{name}.ply"\nunit = "mm"\n{role}\n'
-    (tmp_path / "case.toml").write_text(text)
+    (tmp_path / "case.toml").write_text(whole(text))
     context = prepare(tmp_path, arm=False)
     wanted = _answers(context, context.case.T_ct_entry[:3, :3])
     out = tmp_path / "ct"

@@ -15,7 +15,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.plan.plan import motion_contact
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
 from puncture_twin.planning.plan.planner import make_plan
-from puncture_twin.planning.plan.recheck import _check_limits, check_plan, with_case_warnings
+from puncture_twin.planning.plan.recheck import _check_limits, check_plan
 from puncture_twin.planning.search.candidates import Ranking
 from puncture_twin.planning.search.context import prepare
 
@@ -290,7 +290,7 @@ def test_a_plan_that_flatters_itself_is_refused(carton, planned, key, value):
 
 
 def test_a_plan_states_the_warnings_of_its_case(carton, document):
-    """One that drops a warning, or adds one, is refused with its case; an older one that states none is read."""
+    """One that drops a warning, or adds one, is refused with its case."""
     content, write = document
     stood = list(carton.anatomy.warnings)
     assert stood and content["warnings"] == stood
@@ -299,11 +299,6 @@ def test_a_plan_states_the_warnings_of_its_case(carton, document):
     for wrong in ("none", [1], None):
         with pytest.raises(InputError, match="warnings"):
             read_plan(write(warnings=wrong))
-    older = {name: value for name, value in content.items() if name != "warnings"}
-    path = write()
-    path.write_text(json.dumps(older))
-    assert read_plan(path).warnings is None
-    assert with_case_warnings(read_plan(path), carton).warnings == carton.anatomy.warnings
 
 
 def leaves(value, path=()):
@@ -380,9 +375,6 @@ def test_keys_that_come_or_go_are_refused(carton, document):
             path = write()
             path.write_text(json.dumps(edited))
             line = refusal(path, carton)
-            if name in ("speed_limits", "warnings"):  # older plans state neither: the default, and nothing known
-                assert line is None
-                continue
             assert line is not None, (table, name)
             assert name in line or str(table[-1]) in line, (table, name, line)
 

@@ -61,7 +61,7 @@ def case(tmp_path):
             ORGAN,
             structure("rib", "avoid"),
             "\n[end]\nstructures = 3\n",
-            schema='2\nregion = "phantom"',
+            region="phantom",
             needle=NEEDLE.replace("150", "180"),
         )
         (tmp_path / "case.toml").write_text(text)

@@ -72,7 +72,7 @@ def case(tmp_path):
             structure("rib", "avoid"),
             f"{more}\n[end]\nstructures = 3\n",
             name="slips",
-            schema='2\nregion = "phantom"',
+            region="phantom",
             space=space,
             needle=NEEDLE.replace("150", "180"),
         )

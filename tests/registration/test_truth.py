@@ -79,6 +79,8 @@ def case(folder: Path, *, markers: bool = True, method: str = "rigid", **rehears
         rehearsal=RehearsalSection(**rehearsal),
         files=files_in(folder),
         volumes=CaseVolumes(files_in(folder), folder / "case.toml"),
+        stated_structures=1,
+        region="other",
     )
 
 

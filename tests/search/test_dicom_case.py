@@ -10,7 +10,7 @@ import dicom_world as world
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
-from case_world import structure
+from case_world import structure, whole
 from places import REAL_CT, ROOT, TESTS
 
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
@@ -24,7 +24,8 @@ from tools.phantoms.ct_image import rendered
 
 SPINE = structure("spine", "avoid", {"labelmap": "labels.nii.gz", "label": 2}, margin_mm=2.0)
 LESION = structure("lesion", "target", {"labelmap": "labels.nii.gz", "label": 1})
-HEAD = """schema = 1
+HEAD = """schema = 2
+region = "other"
 name = "supine"
 space = "LPS"
 [target]
@@ -74,7 +75,7 @@ def write_scene(folder):
 def write_case(folder, name, ct):
     """A case with this CT."""
     text = HEAD + structure("skin", "skin", {"ct": ct}) + LESION + SPINE
-    (folder / f"{name}.toml").write_text(text)
+    (folder / f"{name}.toml").write_text(whole(text))
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +164,8 @@ def write_structures(folder):
     )
     for kind, file in (("seg", "seg.dcm"), ("rtstruct", "rt.dcm")):
         rules = 'target = ["the lesion"]\navoid = { "spi*" = 2.0 }\n'
-        (folder / f"{kind}.toml").write_text(f'{head}[[structures]]\n{kind} = "{file}"\n{rules}')
+        text = whole(f'{head}[[structures]]\n{kind} = "{file}"\n{rules}', listed=2)
+        (folder / f"{kind}.toml").write_text(text)
 
 
 def test_seg_and_rtstruct_give_the_verdicts_of_a_label_map(scene):

@@ -23,7 +23,7 @@ from puncture_twin.planning.search.phases import with_breathing_reach
 from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.planning.search.table import to_table
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.patient.main_job import search_case
+from puncture_twin.twin.jobs.patient.main_job import CertifyOptions, search_case
 
 SEARCH = "theta_deg = [0, 80]\nstep_deg = 10.0\nmax_skin_angle_deg = 25.0"
 WEIGHTS = {"skin": 0.4, "rib": 0.0, "vessel": 0.7, "dome": 1.4}
@@ -189,7 +189,7 @@ def test_a_search_that_cannot_be_certified_searches_nothing(patient, tmp_path):
     """The refusal comes first, and leaves no file."""
     context = replace(patient, case=replace(patient.case, breathing=breathing()))
     with pytest.raises(InputError, match="a body that does not move"):
-        search_case(context, tmp_path / "out", certify_deg=1.0)
+        search_case(context, tmp_path / "out", certify=CertifyOptions(1.0, None))
     assert not (tmp_path / "out").exists()
 
 

@@ -70,7 +70,8 @@ def _closed(rng, path):
     path.chmod(0)
 
 
-CASE = """schema = 1
+CASE = """schema = 2
+region = "other"
 name = "files"
 space = "LPS"
 [target]
@@ -89,6 +90,8 @@ role = "skin"
 masks = "masks"
 target = ["liver"]
 avoid = { "*" = 2.0 }
+[end]
+structures = 6
 """
 
 

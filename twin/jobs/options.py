@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from puncture_twin.planning.base.files import check_writable
+from puncture_twin.twin.jobs.terminal import default_out
+from puncture_twin.twin.report.progress import progress_display
+
+if TYPE_CHECKING:
+    from puncture_twin.planning.search.context import CaseContext
 
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
 SourceArgument = Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json.")]
@@ -42,6 +49,38 @@ ArmOption = Annotated[
         show_default="where the case says where its base is",
     ),
 ]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        sys.stdout.write(f"puncture-twin {version('puncture-twin')}\n")
+        raise typer.Exit
+
+
+VersionOption = Annotated[
+    bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+]
+
+
+def out_folder(named: Path | None, source: Path, command: str) -> Path:
+    """The folder of `OutOfCaseOption`.
+
+    Raises:
+        InputError: It cannot be written to.
+    """
+    return check_writable(named or default_out(source, command))
+
+
+@contextmanager
+def prepared(case: Path, *, arm: bool | None = None, engine: str = "fast") -> Iterator[CaseContext]:
+    """A case as `prepare` gives it, whose progress is shown while the block runs."""
+    from puncture_twin.planning.search.context import prepare
+
+    with progress_display() as progress:
+        yield prepare(case, arm=arm, engine=engine, watcher=progress)
+
 
 CHOICE_OPTIONS = {
     "theta": Annotated[float | None, typer.Option("--theta", min=0, max=180, help="Puncture angle, degrees.")],

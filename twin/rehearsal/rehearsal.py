@@ -49,7 +49,7 @@ class TipError:
     depth_mm: float
 
 
-def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth, engine: FclEngine | None = None) -> Rehearsal:
+def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsal:
     """Execute a plan where the truth differs from the belief. The same plan and truth give the same numbers.
 
     Args:
@@ -57,7 +57,6 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth, engine: Fcl
         case: The case of the plan.
         anatomy: Its structures.
         truth: Where the patient lies and what the joints do; all randomness is in it.
-        engine: Of the anatomy's structures, in their order, where it is at hand.
 
     Raises:
         InputError: The twin has no body of this arm, or its base stands in the patient.
@@ -84,7 +83,7 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth, engine: Fcl
         T_base_flange_true=done.T_base_flange,
         tip_true_ct=tip_ct,
         clearance_times_s=times[samples],
-        clearance_mm=_clearances(plan, case, anatomy, tip_ct[samples], forward_ct[samples], engine),
+        clearance_mm=_clearances(plan, case, anatomy, tip_ct[samples], forward_ct[samples]),
         contacts=_contacts(case, anatomy, truth, done, times, phase),
         max_joint_speed=done.max_speed,
         speed_limits=model.max_speeds.copy(),
@@ -121,13 +120,13 @@ def _clearance_samples(phase: NDArray[np.str_]) -> NDArray[np.int64]:
 
 
 def _clearances(
-    plan: Plan, case: Case, anatomy: Anatomy, tips_ct: Floats, forward_ct: Floats, engine: FclEngine | None
+    plan: Plan, case: Case, anatomy: Anatomy, tips_ct: Floats, forward_ct: Floats
 ) -> MappingProxyType[str, Floats]:
     """FCL's distance of the needle's axis to every structure, at every sample, minus the radius."""
     meshes = [structure.mesh for structure in anatomy.structures]
     bounds = [mesh.bounds for mesh in meshes]
     distance = np.empty((len(tips_ct), len(meshes)))
-    engine = engine or FclEngine(meshes)
+    engine = FclEngine(meshes)
     for row, (tip, forward) in enumerate(zip(tips_ct, forward_ct, strict=True)):
         distance[row] = engine.distances(tip, -forward, plan.needle_length_mm)
         for column, (mesh, (low, high)) in enumerate(zip(meshes, bounds, strict=True)):

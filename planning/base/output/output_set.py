@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.manifest import Manifest, read_manifest
@@ -61,7 +60,7 @@ def writing(
         stack.enter_context(_folder(out))
         stack.enter_context(locked(out))
         sweep(out)
-        draft = Draft(command, out, out, inputs, seconds or {}, note or _silent, *_found(out))
+        draft = Draft(command, out, out, inputs, seconds or {}, note or _silent, read_manifest(out) or Manifest({}))
         refuse_foreign(draft, names)
         draft.depends_on = _sources(draft, made_from or {})
         draft.folder, started = new_draft(out, stack), datetime.now(UTC)
@@ -77,7 +76,7 @@ def withdraw(out: Path, command: str, *, keep: Iterable[str] = ()) -> None:
         command: Name of the entry.
         keep: Files of the entry that stay: they may be the input.
     """
-    if out.is_dir() and (read_manifest(out) or files_of_older_versions(out)):
+    if out.is_dir() and read_manifest(out):
         with writing(out, command) as draft:
             for name in keep:
                 draft.keep(name)
@@ -128,15 +127,6 @@ def _folder(out: Path) -> Iterator[None]:
         with suppress(OSError):
             for place in missing:
                 place.rmdir()
-
-
-def _found(out: Path) -> tuple[Manifest, tuple[str, ...]]:
-    """What the folder holds, and which files of it an older version left without a manifest."""
-    manifest = read_manifest(out)
-    if manifest is not None:
-        return manifest, ()
-    legacy = files_of_older_versions(out)
-    return Manifest({}, legacy), legacy
 
 
 def _sources(draft: Draft, made_from: Mapping[str, str]) -> tuple[str, ...]:
@@ -209,44 +199,3 @@ def _is_at(handle: int, path: Path) -> bool:
         return os.path.samestat(os.fstat(handle), path.stat())
     except FileNotFoundError:
         return False
-
-
-class _OldFiles(NamedTuple):
-    """Files that were written together."""
-
-    signs: tuple[str, ...]
-    """One of these shows that a command has written here."""
-    names: tuple[str, ...]
-
-
-FAMILIES = (
-    _OldFiles(
-        ("candidates.parquet", "plan.json", "rehearsal.json"),
-        (
-            *("candidates.parquet", "certificate.json", "map.png", "scene.png", "report.html", "timings.json"),
-            *("plan.json", "plan.script", "plan.ros2.yaml", "plan.csv"),
-            *("rehearsal.json", "rehearsal.mp4", "rehearsal.gif"),
-        ),
-    ),
-    _OldFiles(
-        ("place.json",), ("placements.csv", "place.json", "placements.png", "map_best_place.png", "timings.json")
-    ),
-    _OldFiles(("calibration.json",), ("calibration.json", "report.html", "bmode.png", "room.png", "timings.json")),
-    _OldFiles(("servo.html",), ("servo.html", "convergence.png", "camera_1.png", "camera_2.png", "timings.json")),
-    _OldFiles(("batch.csv",), ("batch.csv", "timings.json")),
-)
-"""``recording.csv`` is not among them: it may be somebody's own."""
-
-BATCH_FOLDERS = "[0-9][0-9][0-9][0-9]/candidates.parquet"
-"""What a batch wrote beside its ``batch.csv``."""
-
-
-def files_of_older_versions(folder: Path) -> tuple[str, ...]:
-    """The files in a folder without a manifest that an older version has written, sorted."""
-    found = set()
-    for family in FAMILIES:
-        if any((folder / sign).is_file() for sign in family.signs):
-            found |= {name for name in family.names if (folder / name).is_file()}
-    if (folder / "batch.csv").is_file():
-        found |= {path.relative_to(folder).as_posix() for path in folder.glob(BATCH_FOLDERS)}
-    return tuple(sorted(found))

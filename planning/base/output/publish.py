@@ -155,9 +155,6 @@ def _report_removed(draft: Draft, others: set[str]) -> None:
     if others:
         named = ", ".join(sorted(others))
         draft.note(f"{draft.out}: the files of {named} were removed: {draft.command} has replaced a part of them")
-    if draft.legacy:
-        named = ", ".join(draft.legacy)
-        draft.note(f"{draft.out}: files of an older version, without a manifest, were replaced or removed: {named}")
 
 
 @contextmanager
@@ -223,7 +220,6 @@ class Draft:
         seconds: How long each stage took, for ``timings.json``; read at the end.
         note: Told what was removed that nobody might expect.
         old: What the output folder holds.
-        legacy: Files in it that an older version left without a manifest.
     """
 
     command: str
@@ -233,7 +229,6 @@ class Draft:
     seconds: Mapping[str, float]
     note: Callable[[str], None]
     old: Manifest
-    legacy: tuple[str, ...]
     depends_on: tuple[str, ...] = ()
     parts: dict[str, str] = field(default_factory=dict)
 

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.twin.jobs.experiment.scan_beside import parse_beside
+from puncture_twin.twin.jobs.experiment.scan_job import parse_beside
 from puncture_twin.twin.plant.outside_objects import Outline, OutsideObjects, drawn, place_outside_objects, tube
 from tools.phantoms.drawn.trunk import draw_trunk
 

@@ -99,6 +99,8 @@ def case(*obstacles: Obstacle) -> Case:
         rehearsal=RehearsalSection(),
         files=InputFiles(Path()),
         volumes=CaseVolumes(InputFiles(Path()), Path("case.toml")),
+        stated_structures=1,
+        region="other",
     )
 
 
@@ -145,6 +147,7 @@ def make_plan() -> Plan:
         approach=Trajectory(np.linspace(0, 3, 61), HOME + (line[0] - HOME) * ease),
         insertion=Trajectory(np.linspace(0, 6, 101), np.array(line)),
         clearance_mm={},
+        warnings=(),
     )
 
 

@@ -13,7 +13,8 @@ HU = {"spine": 350.0, "rib": 500.0}
 CUT = 'cut = ["feet", "head"]\n'
 """Of the skin: there a drawn trunk goes on beyond its mesh."""
 
-CASE = """schema = 1
+CASE = """schema = 2
+region = "other"
 name = "{name}"
 space = "LPS"
 
@@ -48,6 +49,7 @@ def write_trunk_case(folder: Path, trunk: Trunk, name: str) -> Path:
     for one, organ in trunk.organs.items():
         (folder / f"{one}.ply").write_bytes(ply_bytes(organ.mesh))
         text += _structure(one, organ.role, organ.margin_mm, HU.get(one.split("_")[0]))
+    text += f"\n[end]\nstructures = {len(trunk.organs) + 1}\n"
     (folder / "case.toml").write_text(text, encoding="utf-8")
     return folder
 

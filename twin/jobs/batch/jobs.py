@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -142,26 +142,26 @@ class Where:
     limits: Limits
 
 
-def run_part(out: Path, where: Where, watcher: Watcher, environment: Mapping[str, str] = os.environ) -> RunCounts:
+def run_part(out: Path, where: Where, watcher: Watcher) -> RunCounts:
     """Run what has no final row yet.
 
     Raises:
         InputError: See `run_cohort`; or a part that cannot be told.
     """
-    part = _part(where.part, watcher, environment)
+    part = _part(where.part, watcher)
     write_page = write_case_page if where.pages else None
     request = Request(part, where.jobs, where.limits, write_page)
     return run_cohort(out, request, watcher, _elsewhere(where.scheduler))
 
 
-def _part(typed: str | None, watcher: Watcher, environment: Mapping[str, str]) -> Part:
+def _part(typed: str | None, watcher: Watcher) -> Part:
     """As typed, else as SLURM's array says it, which is told."""
     if typed is not None:
         return parse_part(typed)
-    part = slurm_part(environment)
+    part = slurm_part(os.environ)
     if part is None:
         return WHOLE
-    watcher.note(f"part {part.text}, from SLURM's array ({TASK}={environment[TASK]}); --part i/n overrides it")
+    watcher.note(f"part {part.text}, from SLURM's array ({TASK}={os.environ[TASK]}); --part i/n overrides it")
     return part
 
 

@@ -101,10 +101,14 @@ def _failures(rows: Sequence[Row]) -> Markup:
     return table(("cases", "reason", "which"), lines)
 
 
-def _cases_of(rows: Iterable[Row], reason: str, most: int = 5) -> str:
+MOST_CASES = 5
+"""Named of one reason."""
+
+
+def _cases_of(rows: Iterable[Row], reason: str) -> str:
     names = [str(row["case"]) for row in rows if row["reason"] == reason]
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    more = f" and {len(names) - MOST_CASES} more" if len(names) > MOST_CASES else ""
+    return ", ".join(names[:MOST_CASES]) + more
 
 
 def _values(rows: Sequence[Row], column: str) -> list[float]:

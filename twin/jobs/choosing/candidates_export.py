@@ -21,7 +21,7 @@ from puncture_twin.planning.base.provenance import Input, inputs_document, read_
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.search.candidates import ANGLE_DIGITS
 from puncture_twin.planning.search.choice import BEST, Choice
-from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
+from puncture_twin.twin.jobs.patient.main_job import is_plan
 
 TABLE = "candidates.parquet"
 ALLOWED = "a case, or the candidates.parquet of a search, or its folder"

@@ -15,18 +15,19 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, parse_choice
-from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
 from puncture_twin.planning.search.windows import Window, find_windows, nearest_row
 from puncture_twin.twin.jobs.patient.answers import explain_choice
-from puncture_twin.twin.jobs.patient.case_or_plan import is_plan
+from puncture_twin.twin.jobs.patient.main_job import is_plan
 from puncture_twin.twin.jobs.patient.summaries import plan_summary
 
 SAME_DIRECTION = 1e-9
@@ -36,6 +37,9 @@ MOST_ROLES = 4
 """Of inputs that differ, so many are named."""
 
 BEST_OF_ALL = Choice(rank=1)
+
+
+Stated = tuple[Sequence[float], Sequence[float], Sequence[int], Sequence[int], Sequence[str]]
 
 
 def parse_two(
@@ -80,6 +84,26 @@ def two_plans(source: Path, other: Path | None, case: Path | None, chosen: bool)
     if other is None or not is_plan(other) or chosen:
         raise InputError("a plan is compared with a plan", where=source, allowed=allowed)
     return source, other
+
+
+def compare_source(
+    source: Path, other: Path | None, case: Path | None, stated: Stated, arm: bool | None, watcher: Watcher
+) -> Comparison:
+    """Two plans, or two choices of a case: see the functions below.
+
+    Args:
+        source: A plan, or a case.
+        other: The other plan.
+        case: Of two plans.
+        stated: What names choices, as `parse_two` takes it.
+        arm: Whether the arm must reach a choice; None where the case says where its base is.
+        watcher: Is told how far the work is.
+    """
+    plans = two_plans(source, other, case, any(stated))
+    if plans is None:
+        choices = parse_two(*stated)
+        return compare_choices(prepare(source, arm=arm, watcher=watcher), choices)
+    return compare_plans(plans, None if case is None else prepare(case, watcher=watcher))
 
 
 def compare_choices(context: CaseContext, choices: tuple[Choice, Choice]) -> Comparison:

@@ -62,16 +62,15 @@ class DrawnRuns:
         )
 
 
-def drawn_runs(context: CaseContext, tour: Tour, ended: Iterable[int], first_seed: int) -> DrawnRuns:
+def drawn_runs(context: CaseContext, tour: Tour, ended: Iterable[int]) -> DrawnRuns:
     """Draw the truths of many seeds.
 
     Args:
         context: As of the physical runs.
         tour: Theirs.
         ended: Seeds of those that ended.
-        first_seed: Of the draws.
     """
-    error_mm = {seed: _error_mm(context, tour, seed) for seed in range(first_seed, first_seed + DRAWS)}
+    error_mm = {seed: _error_mm(context, tour, seed) for seed in range(DRAWS)}
     alike = [error_mm[seed] if seed in error_mm else _error_mm(context, tour, seed) for seed in ended]
     return DrawnRuns(_rms(alike), _rms(error_mm.values()), DRAWS)
 
@@ -168,29 +167,28 @@ class PhysicalRuns:
         return "\n".join(lines)
 
 
-def physical_runs(context: CaseContext, out: Path, runs: int, first_seed: int = 0) -> PhysicalRuns:
+def physical_runs(context: CaseContext, out: Path, runs: int) -> PhysicalRuns:
     """Run the experiment of a case's best candidate, each run with a truth of its own.
 
     Args:
         context: Of a case with declared errors, markers and an arm.
         out: Holds the folder of the runs that are kept.
         runs: How many.
-        first_seed: Of the first one.
 
     Raises:
         InputError: The case declares no errors, or has no markers.
         NoAnswerError: Nothing is safe, or too few markers can be touched.
     """
-    tour = plan_tour(context, BEST, seed=first_seed)
+    tour = plan_tour(context, BEST, seed=0)
     key = _key(context, tour)
     found, kept = [], 0
     for number in range(runs):
-        path = out / FOLDER / f"{first_seed + number}.json"
+        path = out / FOLDER / f"{number}.json"
         run = _read(path, key)
         kept += run is not None
-        found.append(run or _kept(path, key, _run(context, tour, first_seed + number)))
+        found.append(run or _kept(path, key, _run(context, tour, number)))
         context.watcher.count("runs", number + 1, runs)
-    drawn = drawn_runs(context, tour, [run.seed for run in found if not run.refused], first_seed)
+    drawn = drawn_runs(context, tour, [run.seed for run in found if not run.refused])
     return PhysicalRuns(tour.plan.expected_mm, tuple(found), kept, drawn)
 
 

@@ -31,7 +31,7 @@ from puncture_twin.planning.touch.pivot_planner import LEAST_POSES, MOST_POSES, 
 from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers
 from puncture_twin.planning.touch.tour_motions import TouchTour
 from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, check_one_place, pivot_calibration
-from puncture_twin.twin.jobs.experiment.result_file import write_result
+from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.plant.true_needle import TouchTruth, draw_pivot_truth
 from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
 
@@ -71,6 +71,16 @@ class PivotRun:
             "misses_mm": dict(zip(self.names, pivot.misses_mm.tolist(), strict=True)),
             "inputs": inputs_document(self.inputs),
         }
+
+
+def refuse_of_twin(*options: object) -> None:
+    """Refuse options of the twin beside touches that were read.
+
+    Raises:
+        InputError: One of them is stated.
+    """
+    if any(option is not None for option in options):
+        raise InputError("touches that were read", where="pivot", allowed="JOINTS.csv alone, or the twin's options")
 
 
 def pivot_case(case: Case, joints: Path) -> PivotRun:

@@ -1,35 +1,39 @@
 """The job ``scan``: a case scanned, its markers, its lesion and a needle found again, and how far off each was.
 
 What ``scan`` prints: how it scanned, both readings of each marker beside the truth, and the next command.
+
+What `scan` lays beside the patient: as the user asks for it, and its surfaces as files, in the scan's frame.
+
+One axial slice of a scan: through the target, or as near to it as the field of view comes.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.output.manifest import FORMAT, read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.strict_json import array, fitting, parse_json
-from puncture_twin.planning.formats.points import write_points
+from puncture_twin.planning.formats.meshes.ply import ply_bytes
+from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.guidance.ct.markers import METAL_HU, READING_MM, Markers, find_markers, read_lesion
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
-from puncture_twin.twin.jobs.experiment.result_file import write_result
-from puncture_twin.twin.jobs.experiment.scan_beside import beside_summary, write_beside
-from puncture_twin.twin.jobs.experiment.scan_picture import Shown, draw_scan
-from puncture_twin.twin.plant.outside_objects import OutsideObjects
+from puncture_twin.twin.jobs.terminal import write_result
+from puncture_twin.twin.plant.outside_objects import Arms, Bed, OutsideObjects, Part
 from puncture_twin.twin.plant.scanner.case_scene import (
     CaseScene,
     MarkerKind,
@@ -367,3 +371,115 @@ def _thin_lines(thin: dict[str, int]) -> list[str]:
 
 def _vector(numbers: list[float]) -> str:
     return " ".join(f"{one:+6.2f}" for one in numbers)
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FOLDER = "beside"
+LIST = "manifest.json"
+"""`init` passes a folder whose list says that this program wrote it: the truth is no segmentation."""
+
+
+def parse_beside(arms: str, bed: str, lines: int) -> OutsideObjects | None:
+    """What shall lie beside the patient; None for nothing.
+
+    Args:
+        arms: One of `Arms`.
+        bed: One of `Bed`.
+        lines: How many.
+
+    Raises:
+        InputError: A word that is not known.
+    """
+    for option, word, known in (("--arms", arms, get_args(Arms)), ("--bed", bed, get_args(Bed))):
+        if word not in known:
+            raise InputError(f"'{word[:40]}' is not known", where=option, allowed=", ".join(known))
+    wanted = OutsideObjects(
+        next(k for k in get_args(Arms) if k == arms), next(k for k in get_args(Bed) if k == bed), lines
+    )
+    return None if wanted == OutsideObjects() else wanted
+
+
+def beside_summary(parts: Sequence[Part]) -> list[dict[str, Any]]:
+    """Plain values for JSON: name, what it is made of (HU), where it lies, and its file."""
+    return [{"name": one.name, "hu": one.hu, "place": one.place, "file": f"{FOLDER}/{one.name}.ply"} for one in parts]
+
+
+def write_beside(parts: Sequence[Part], folder: Path) -> Iterator[Path]:
+    """Each part as a PLY in the scan's frame, LPS mm, and the list of them; nothing where there are none."""
+    if not parts:
+        return
+    (folder / FOLDER).mkdir()
+    for one in parts:
+        path = folder / FOLDER / f"{one.name}.ply"
+        path.write_bytes(ply_bytes(one.mesh))
+        yield path
+    listed = {"part_of": FORMAT, "schema": 1, "unit": "mm", "space": "LPS", "parts": beside_summary(parts)}
+    (folder / FOLDER / LIST).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
+    yield folder / FOLDER / LIST
+
+
+WINDOW_HU = (-160.0, 240.0)
+"""What abdomens are read in: 400 wide about 40."""
+NEAR_MM = 6.0
+"""A marker so near to the slice is named in it."""
+INCHES, DPI = 9.0, 100
+GREEN, YELLOW = "#38d39f", "#ffd34d"
+
+
+class Shown(NamedTuple):
+    """What is drawn over a slice, LPS mm.
+
+    Attributes:
+        target: Shape (3,).
+        markers: As they were found, or None.
+        needle: As it was found, or None.
+        length_mm: Of the needle.
+    """
+
+    target: Floats
+    markers: NamedPoints | None
+    needle: FoundNeedle | None
+    length_mm: float
+
+
+def draw_scan(image: CtImage, shown: Shown, path: Path) -> Path:
+    """Draw it; the patient's right is on the left, as radiologists look at it."""
+    T, (nx, ny, nz), (dx, dy, _) = image.grid.T_ct_index, image.grid.shape, image.grid.spacing_mm
+    index = apply(np.linalg.inv(T), shown.target)
+    k = int(np.clip(round(float(index[2])), 0, nz - 1))
+    x0, y0, z = apply(T, np.array([-0.5, -0.5, k]))
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(INCHES, INCHES * ny * dy / (nx * dx) + 0.6), dpi=DPI)
+    ax = figure.add_axes((0.09, 0.1, 0.89, 0.82))
+    extent = (x0, x0 + nx * dx, y0 + ny * dy, y0)
+    low, high = WINDOW_HU
+    ax.imshow(image.hu[:, :, k].T, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="nearest")
+    ax.plot(*shown.target[:2], "+", color=GREEN, markersize=12, label="target")
+    if shown.needle is not None:
+        _draw_needle(ax, shown.needle, shown.length_mm)
+    if shown.markers is not None:
+        _draw_markers(ax, shown.markers, z)
+    ax.legend(loc="upper left", fontsize=8)
+    ax.set(xlabel="x, mm (patient's left to the right)", ylabel="y, mm (front above)")
+    ax.set_title(f"slice {k + 1} of {nz}, z {z:.1f} mm; simulated", fontsize=10)
+    ax.set_xlim(extent[:2])
+    ax.set_ylim(extent[2:])
+    figure.savefig(path)
+    return path
+
+
+def _draw_markers(ax: Axes, markers: NamedPoints, z: float) -> None:
+    """The names of those that the slice shows."""
+    for name, point in zip(markers.names, markers.points, strict=True):
+        if abs(point[2] - z) <= NEAR_MM:
+            ax.annotate(name, point[:2], xytext=(0, 8), textcoords="offset points", color=YELLOW, ha="center")
+
+
+def _draw_needle(ax: Axes, needle: FoundNeedle, length_mm: float) -> None:
+    """Its axis as found, of which the slice shows a cut."""
+    ends = np.stack([needle.tip_ct, needle.tip_ct - length_mm * needle.forward_ct])
+    ax.plot(ends[:, 0], ends[:, 1], "--", color=YELLOW, linewidth=0.8, label="needle as found, projected")
+    ax.plot(*needle.tip_ct[:2], "x", color=YELLOW, label="its tip")

@@ -17,7 +17,8 @@ from puncture_twin.planning.search.choice import Choice, choose, chosen_angles
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.sweep.sweep_planner import SweepPlan, plan_sweep
-from puncture_twin.twin.jobs.experiment.result_file import write_result
+from puncture_twin.twin.jobs.patient.main_job import is_plan
+from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.rehearsal.rehearsal import Swept, execute_sweep
 
 SWEEP = "sweep.json"
@@ -95,6 +96,25 @@ def sweep_case(context: CaseContext, out: Path, choice: Choice, to: Angles | Non
         run = SweepRun(case.name, case.inputs, case.rehearsal.control, plan, swept, files)
         write_result(run.summary(), draft.folder / SWEEP, out)
     return run
+
+
+def sweep_end(source: Path, to: str | None, *, sweep: bool, alone: bool) -> Angles | None:
+    """Where a sweep shall end; None leaves it open.
+
+    Args:
+        source: What is swept.
+        to: "THETA,BETA" in degrees.
+        sweep: Whether a sweep is wanted: without one nothing ends.
+        alone: Whether nothing else is asked of the source.
+
+    Raises:
+        InputError: No sweep, or none of one case.
+    """
+    if not sweep:
+        raise InputError("a sweep ends there", where="--to", allowed="--sweep --to THETA,BETA")
+    if is_plan(source) or not alone:
+        raise InputError("a sweep is of one case", where="--sweep", allowed="a case, no plan, no --seeds")
+    return parse_angles(to)
 
 
 def parse_angles(text: str | None) -> Angles | None:

@@ -28,7 +28,7 @@ from puncture_twin.planning.touch.touch_planner import (
     registered,
 )
 from puncture_twin.planning.touch.tour_motions import TouchPlan, registered_joints
-from puncture_twin.twin.jobs.experiment.result_file import write_result
+from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.plant.true_needle import (
     AtTarget,
     TouchTruth,

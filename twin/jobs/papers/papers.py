@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.twin.experiment.chen2019 import (
     AS_FOUND,
@@ -46,10 +47,10 @@ class ExperimentReport:
         return self.stated.rejected and self.found.agrees
 
 
-def reproduce_experiment(draws: int = DRAWS, seed: int = SEED) -> ExperimentReport:
+def reproduce_experiment(draws: int = DRAWS) -> ExperimentReport:
     """Draw the experiment under both declarations."""
-    stated, found = (run_draws(one, draws, np.random.default_rng(seed)) for one in (AS_STATED, AS_FOUND))
-    return ExperimentReport(seed, stated, found, dict(paper_strains()), find_skew())
+    stated, found = (run_draws(one, draws, np.random.default_rng(SEED)) for one in (AS_STATED, AS_FOUND))
+    return ExperimentReport(SEED, stated, found, dict(paper_strains()), find_skew())
 
 
 def experiment_summary(report: ExperimentReport) -> dict[str, Any]:
@@ -180,6 +181,23 @@ def chen2019_experiment(out_dir: Path, draws: int | None, runs: int, watcher: Wa
     done = physical_runs(prepare(folder() / SETUP_2, watcher=watcher), out_dir, runs)
     summary = {**result.summary, "physical": done.summary()}
     return PaperResult(result.passed, summary, f"{result.text}\n{done.text()}")
+
+
+def reproduced(
+    paper: str, out_dir: Path, seeds: int | None, watcher: Watcher, *, experiment: bool, runs: int
+) -> PaperResult:
+    """A paper's numbers beside ours, or its experiment drawn anew.
+
+    Raises:
+        InputError: A paper that is not known, or has no such experiment; a folder that cannot be written to.
+    """
+    if paper not in PAPERS:
+        raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))
+    if experiment and paper != "chen2019":
+        raise InputError(f"{paper} has no such experiment", where="--experiment", allowed="reproduce chen2019")
+    if runs and not experiment:
+        raise InputError("--runs are of the experiment", where="--runs", allowed="reproduce chen2019 --experiment")
+    return chen2019_experiment(out_dir, seeds, runs, watcher) if experiment else PAPERS[paper](out_dir, seeds)
 
 
 SETUP_2 = "carton/case_m_setup2.toml"

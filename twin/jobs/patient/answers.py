@@ -69,6 +69,21 @@ def explain_choice(context: CaseContext, choice: Choice, candidates: Candidates 
     return replace(explained, read=choice.read)
 
 
+def register_report(
+    source: Path, markers_base: Path | None, target: str | None, space: Space, fle_mm: float | None
+) -> dict[str, Any]:
+    """The report of a case's markers, or of two lists of markers; see the functions below.
+
+    Raises:
+        InputError: Two lists without a target, or see there.
+    """
+    if markers_base is None:
+        return registration_report(source)
+    if target is None:
+        raise InputError("two lists of markers need a target", where="register", allowed="--target X,Y,Z in mm")
+    return lists_report(source, markers_base, target, space, fle_mm)
+
+
 def registration_report(path: Path) -> dict[str, Any]:
     """Everything known about a case's registration, as plain values.
 

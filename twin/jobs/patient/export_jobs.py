@@ -7,21 +7,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.export.exporter import Exported
+from puncture_twin.planning.export.exporter import FORMATS, Exported
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
 from puncture_twin.planning.export.slicer import NAMES, SLICER, SceneContent, entry_area, slicer_files
 from puncture_twin.planning.plan.plan_check import with_case_arm
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
-from puncture_twin.planning.plan.recheck import check_plan, with_case_warnings
+from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.choice import Choice, choose, choose_stated, with_file_read
-from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.twin.jobs.patient.main_job import plan_case
+from puncture_twin.planning.search.context import CaseContext, prepare
+from puncture_twin.twin.jobs.choosing.candidates_export import CANDIDATE_FORMATS, TABLE, export_candidates, table_of
+from puncture_twin.twin.jobs.patient.main_job import case_of, export, export_case, is_plan, plan_case, search_case
+from puncture_twin.twin.jobs.patient.summaries import export_summary
+from puncture_twin.twin.jobs.patient.text import export_text
 
 NOTES = (
     "scene, goals, arm with needle and a sender: read the sender before it is run; it asks before each phase",
@@ -53,7 +58,7 @@ def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, ch
         note(f"warning: {found.note}")
     source, plan = found.input("plan"), parse_plan(found.data, plan_path)
     check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
-    plan = with_case_warnings(with_case_arm(plan, context.case), context)
+    plan = with_case_arm(plan, context.case)
     names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
     texts = moveit_files(plan, context.case, context.anatomy, source=plan_path)
     made_from = {source.path: source.sha256}
@@ -63,6 +68,68 @@ def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, ch
                 temporary.write_text(text, encoding="ascii")
     path = draft.final(tuple(draft.folder / name for name in names))[0]
     return Exported(path, MOVEIT, NOTES, inputs, plan)
+
+
+class Export(NamedTuple):
+    """What was written: as it is found, for ``--json`` and for a person."""
+
+    found: Any
+    summary: dict[str, Any]
+    text: str
+
+
+def refuse_format(name: str) -> None:
+    """Refuse a format that nothing writes.
+
+    Raises:
+        InputError: Names those that are.
+    """
+    known = (*FORMATS, MOVEIT, SLICER, *CANDIDATE_FORMATS)
+    if name not in known:
+        raise InputError(f"format '{name}' is not known", where="--format", allowed=", ".join(known))
+
+
+def export_source(
+    source: Path, case: Path | None, format_name: str, out: Path, choice: Choice, watcher: Watcher
+) -> Export:
+    """Write a case's plan, or a plan that is there, or what else of a case a format holds.
+
+    Args:
+        source: A case, a plan or, for tables, a table or its folder.
+        case: Of a plan.
+        format_name: See `refuse_format`.
+        out: Where it goes.
+        choice: Which candidate.
+        watcher: Is told how far the work is.
+
+    Raises:
+        InputError: A source of which the format is not, or see the functions that write.
+        NoAnswerError: No plan.
+    """
+    if format_name in CANDIDATE_FORMATS:
+        table = table_of(source, choice)
+        if table is None:
+            search_case(prepare(source, watcher=watcher), out, pictures=False)
+            table = out / TABLE
+        written = export_candidates(table, format_name, out, watcher.note)
+        return Export(written, written.summary(), written.text())
+    planned_case = case_of(source, case, choice)
+    if format_name == SLICER:
+        if is_plan(source):
+            allowed = "a case, with --rank, --window, --theta or --entry"
+            raise InputError("slicer shows a case", where=source, allowed=allowed)
+        shown = export_to_slicer(prepare(source, watcher=watcher), out, choice)
+        return Export(shown, shown.summary(), shown.text())
+    if format_name == MOVEIT and planned_case is None:
+        raise InputError("moveit's scene is the case's", where=source, allowed="export plan.json --case CASE")
+    context = None if planned_case is None else prepare(planned_case, watcher=watcher)
+    if format_name == MOVEIT and context is not None:
+        done = export_to_moveit(context, source if is_plan(source) else None, out, choice)
+    elif context is None or is_plan(source):
+        done = export(source, format_name, out, context, watcher.note)
+    else:
+        done = export_case(context, format_name, out, choice)
+    return Export(done, export_summary(done, context is not None), export_text(done, context is not None))
 
 
 NO_APPROACH = "the directions were checked; no approach of the arm was planned"

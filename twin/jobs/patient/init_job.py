@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from puncture_twin.planning.base.cache.array_cache import Memory, user_cache
 from puncture_twin.planning.base.errors import InputError
@@ -14,9 +14,9 @@ from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.toml_file import parse_toml
-from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.case_file import CaseFile, Region
 from puncture_twin.planning.case.read_case import ALLOWED_CASE
-from puncture_twin.planning.geometry.spaces import to_lps
+from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.case_text import with_image_seen
 from puncture_twin.planning.init.overrides import WAYS, with_keys
 from puncture_twin.planning.init.start import ALLOWED, Request, Start, start_case
@@ -75,6 +75,7 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     Raises:
         InputError: Everything that keeps the case from being searched, in one line.
     """
+    _refuse_options(request)
     folder, path = request.folder, request.folder / CASE
     if not is_folder(folder):
         raise InputError("is no folder", where=str(folder)[:200], allowed=ALLOWED)
@@ -101,6 +102,16 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     if picture is not None:
         write_sheet(draw_slices(Subject(context.case, context.anatomy, None)), picture)
     return InitRun(path, replace(start, text=text), context, (*start.notes, *found), picture)
+
+
+def _refuse_options(request: Request) -> None:
+    region, radius = request.region, request.hit_radius_mm
+    if region is not None and region not in get_args(Region):
+        raise InputError(f"region '{region[:40]}' is not known", where="--region", allowed=", ".join(get_args(Region)))
+    if request.wanted.space is Space.LOCAL:
+        raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
+    if radius is not None and (request.target is None or not 0 < radius <= 100):
+        raise InputError(f"{radius:g}", where="--hit-radius", allowed="mm, above 0, at most 100, beside --target")
 
 
 def _with_seen(start: Start, request: Request, context: CaseContext) -> str:

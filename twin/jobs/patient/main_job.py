@@ -1,6 +1,8 @@
 """The main job, stage by stage: search, plan, rehearse, and the files that show each.
 
 A stage loads what it needs itself: a search without pictures waits for no planner, simulator or plotter.
+
+What a command works on that takes a case, or a plan beside its case.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,13 +28,16 @@ from puncture_twin.planning.search.choice import BEST, Choice, Pick, choose, cho
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
-from puncture_twin.twin.jobs.second_process import Beside, Here
 
 if TYPE_CHECKING:
     from puncture_twin.planning.export.exporter import Exported
-    from puncture_twin.twin.jobs.patient.rehearsed import Begun
+    from puncture_twin.twin.jobs.patient.rehearsed import PendingRehearsal
+
 
 CERTIFICATE = "certificate.json"
+
+CERTIFY_DEG = 0.25
+"""Smallest cell of a certificate where nobody says."""
 
 NO_PLAN = "no plan: "
 """Before the reason, whoever gives it: the choice, or the planner."""
@@ -41,29 +46,47 @@ DEMO_ROOMS = 1000
 """What a stranger sees first is a distribution, where the case declares what it may be off by."""
 
 
+class CertifyOptions(NamedTuple):
+    """Of a certificate: the smallest cell, and how often a structure may be touched."""
+
+    size_deg: float
+    touch: float | None
+
+
+def certify_options(wanted: bool, size_deg: float | None, touch: float | None) -> CertifyOptions | None:
+    """What is asked of a certificate; None where none is.
+
+    Raises:
+        InputError: Options of a certificate that nobody asked for.
+    """
+    for option, value in (("--certify-touch", touch), ("--certify-size", size_deg)):
+        if value is not None and not wanted:
+            raise InputError("of a certificate that nobody asked for", where=option, allowed="beside --certify")
+    return CertifyOptions(CERTIFY_DEG if size_deg is None else size_deg, touch) if wanted else None
+
+
 def search_case(
     context: CaseContext,
     out: Path,
     *,
     pictures: bool = True,
     checked: CrossChecked | None = None,
-    certify_deg: float | None = None,
-    certify_touch: float | None = None,
+    certify: CertifyOptions | None = None,
 ) -> Run:
     """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page.
 
     Raises:
         InputError: A certificate that the case cannot have; before anything is searched.
     """
-    if certify_deg is not None:
+    if certify is not None:
         from puncture_twin.planning.certify.question import question_of
 
         question_of(context.case, context.anatomy)
-    names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify_deg is None else (CERTIFICATE,)))
+    names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify is None else (CERTIFICATE,)))
     with _writing(out, "search", context, names) as draft:
         run = Run(context, context.search(), (), checked=checked)
-        if certify_deg is not None:
-            run = _certified(run, certify_deg, certify_touch, draft.folder)
+        if certify is not None:
+            run = _certified(run, certify, draft.folder)
         run = _with_table(run, draft.folder)
         run = _with_pictures(run, draft.folder) if pictures else run
     return _final(run, draft)
@@ -83,9 +106,7 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
     return _answered(_final(run, draft), out)
 
 
-def rehearse_case(
-    context: CaseContext, out: Path, rooms: RoomCount | None = None, choice: Choice = BEST, beside: Beside | None = None
-) -> Run:
+def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = None, choice: Choice = BEST) -> Run:
     """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
 
     Args:
@@ -93,44 +114,51 @@ def rehearse_case(
         out: The folder of the files.
         rooms: How many, beside the one that is filmed.
         choice: What is planned.
-        beside: Who executes and films the plan while the pictures are drawn; None does one after the other.
 
     Raises:
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
-    from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
-    from puncture_twin.twin.jobs.rehearser import Rehearser
+    from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
 
     _refuse_without_arm(context)
-    beside = beside or Here()
-    beside.keep(Rehearser, context.case, context.anatomy)
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
-    with _writing(out, "plan", context, names, read=choice.read) as draft:
+    with _writing(out, "plan", context, names, read=choice.read) as draft, two_stages() as begin:
         run = _searched_and_planned(context, draft.folder, choice)
         planned = run.files
-        begun = None if run.plan is None else begin_rehearsal(run, draft.folder, rooms, beside)
-        run = _pictured_and_rehearsed(run, draft.folder, begun)
+        pending = None if run.plan is None else begin_rehearsal(run, rooms, begin)
+        run = _pictured_and_rehearsed(run, draft.folder, pending)
         if run.rehearsal is not None:  # the page shows it: it goes with it
             shown = {draft.folder / name for name in PICTURES if name != PAGE}
             draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
     return _answered(_final(run, draft), out)
 
 
-def _pictured_and_rehearsed(run: Run, out: Path, begun: Begun | None) -> Run:
+def _pictured_and_rehearsed(run: Run, out: Path, pending: PendingRehearsal | None) -> Run:
     """The run with the pictures of its plan, drawn while that is rehearsed, and then with the page of all."""
     from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
 
     drawn = draw_pictures(run, out)
     paged = partial(with_page, out=out, drawn=drawn)
-    return paged(run) if begun is None else begun.ended(out, paged)
+    return paged(run) if pending is None else pending.ended(out, paged)
 
 
-def demo_case(context: CaseContext, out: Path, beside: Beside | None = None) -> Run:
+def rehearsed_case(source: Path, case: Path | None, choice: Choice) -> Path:
+    """The case of what is rehearsed; see `case_of`.
+
+    Raises:
+        InputError: A plan without its case, or see there.
+    """
+    if (found := case_of(source, case, choice)) is None:
+        raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
+    return found
+
+
+def demo_case(context: CaseContext, out: Path) -> Run:
     """`rehearse_case`, in `DEMO_ROOMS` rooms where the case declares errors and has markers."""
     rooms = None if context.chance is None else RoomCount(DEMO_ROOMS)
-    return rehearse_case(context, out, rooms, beside=beside)
+    return rehearse_case(context, out, rooms)
 
 
 def _refuse_without_arm(context: CaseContext) -> None:
@@ -212,7 +240,6 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     from puncture_twin.planning.plan.plan_check import with_case_arm
     from puncture_twin.planning.plan.recheck import check_plan
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
-    from puncture_twin.twin.jobs.rehearser import Rehearser
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
     source, plan = _read_plan(plan_path, context.watcher.note)
@@ -220,10 +247,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     plan = with_case_arm(plan, context.case)
     with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
-        beside = Here()
-        beside.keep(Rehearser, context.case, context.anatomy)
-        begun = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), draft.folder, rooms, beside)
-        run = begun.ended(draft.folder)
+        run = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), rooms, partial).ended(draft.folder)
         if not draft.source_has("scene.png"):
             with context.stages.time("scene"):
                 draw_scene(context.case, context.anatomy, candidates, plan, draft.folder / "scene.png")
@@ -260,12 +284,11 @@ def export(
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     from puncture_twin.planning.export.exporter import export_name, export_plan
-    from puncture_twin.planning.plan.recheck import check_plan, with_case_warnings
+    from puncture_twin.planning.plan.recheck import check_plan
 
     source, plan = _read_plan(plan_path, note)
     if context is not None:
         check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
-        plan = with_case_warnings(plan, context)
     checker = None if context is None or context.reach is None else context.reach.checker
     name = export_name(plan_path, format_name)
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
@@ -274,15 +297,15 @@ def export(
     return replace(done, path=draft.final((done.path,))[0], inputs=inputs)
 
 
-def _certified(run: Run, size_deg: float, touch: float | None, out: Path) -> Run:
+def _certified(run: Run, wanted: CertifyOptions, out: Path) -> Run:
     """Certify the cap to a cell size, and a chance to touch, and rank again with the safe cones."""
     from puncture_twin.planning.certify.certificate import with_safe_cone, write_certificate
     from puncture_twin.planning.certify.subdivision import certify
 
     context = run.context
     with context.stages.time("certify"):
-        error, size = context.pose_error, float(np.radians(size_deg))
-        certificate = certify(context.case, context.anatomy, size=size, touch=touch, error=error)
+        error, size = context.pose_error, float(np.radians(wanted.size_deg))
+        certificate = certify(context.case, context.anatomy, size=size, touch=wanted.touch, error=error)
     with context.stages.time("safe cones"):
         found = with_safe_cone(context.case, run.candidates, certificate)
     write_certificate(certificate, out / CERTIFICATE)
@@ -316,3 +339,28 @@ def _with_pictures(run: Run, out: Path) -> Run:
     from puncture_twin.twin.jobs.patient.pictures import with_pictures
 
     return with_pictures(run, out)
+
+
+def is_plan(source: Path) -> bool:
+    """Whether a file is a plan rather than a case: by its name."""
+    return source.suffix == ".json"
+
+
+def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
+    """The case of a command: its source, or what is named beside a plan; None of a plan without its case.
+
+    Args:
+        source: A case, or a plan.
+        case: The option ``--case``.
+        choice: Which candidate is wanted.
+
+    Raises:
+        InputError: A plan with a choice, since it has its direction, or two cases.
+    """
+    if is_plan(source):
+        if choice != BEST:
+            raise InputError("a plan has its direction", where=source, allowed="a case, where one is to be chosen")
+        return case
+    if case is not None:
+        raise InputError("two cases", where="--case", allowed="CASE alone, or plan.json --case CASE")
+    return source

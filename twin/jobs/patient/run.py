@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
@@ -42,6 +43,17 @@ class RoomCount(NamedTuple):
 
     rooms: int
     physics: int = 0
+
+
+def room_count(rooms: int | None, physics: int) -> RoomCount | None:
+    """How many rooms are wanted; None for none beside the one that is executed.
+
+    Raises:
+        InputError: More in the simulator than there are.
+    """
+    if physics > (rooms or 0):
+        raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
+    return None if rooms is None else RoomCount(rooms, physics)
 
 
 @dataclass(frozen=True, eq=False)

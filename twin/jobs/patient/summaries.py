@@ -163,7 +163,7 @@ def export_summary(done: Exported, case_checked: bool) -> dict[str, Any]:
         "theta_deg": float(np.degrees(done.plan.theta)),
         "beta_deg": float(np.degrees(done.plan.beta)),
         "notes": list(done.notes),
-        "warnings": None if done.plan.warnings is None else list(done.plan.warnings),
+        "warnings": list(done.plan.warnings),
         "case_checked": case_checked,
         "inputs": inputs_document(done.inputs),
         "files": [str(done.path)],

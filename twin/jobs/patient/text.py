@@ -35,8 +35,6 @@ LEAST_SHOWN = 5e-5
 """A chance or share below it rounds to nothing in what people read."""
 
 
-NO_WARNINGS_STATED = "the plan's file is older than the statement of warnings: name its case with --case, or plan again"
-
 CONE_TEXT = {"grid": "as far as the grid tells", "certificate": "proven by the certificate", "": "not known"}
 
 
@@ -222,8 +220,6 @@ def export_text(done: Exported, case_checked: bool) -> str:
     notes = [note for note in (*done.notes, checked) if note]
     direction = f"theta {np.degrees(done.plan.theta):g} deg, beta {np.degrees(done.plan.beta):g} deg"
     lines = [f"{done.format_name}: {done.path}", f"  direction: {direction}", *(f"  {note}" for note in notes)]
-    if done.plan.warnings is None:
-        return "\n".join([*lines, f"warning: {NO_WARNINGS_STATED}"])
     return "\n".join([*lines, *(f"warning: {one}" for one in done.plan.warnings)])
 
 

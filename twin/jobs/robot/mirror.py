@@ -218,6 +218,37 @@ class RecordedJoints:
         return unfinished_warnings(self.data, self.path.name)
 
 
+class Readings(NamedTuple):
+    """The states of an arm, the inputs of what is shown of them, and what they leave open."""
+
+    states: Iterable[RecordedState]
+    inputs: tuple[Input, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def readings_of(
+    host: str | None, recording: Path | None, case: Case, *, period_s: float, seconds: float | None
+) -> Readings:
+    """The readings of a running arm, or of a recording.
+
+    Args:
+        host: Address of the arm.
+        recording: The file, in its place.
+        case: Whose patient the arm stands at.
+        period_s: Of the running arm's readings.
+        seconds: How long it is read; None until it is interrupted.
+
+    Raises:
+        InputError: Not one of the two, an arm that does not answer, or a file that cannot be used.
+    """
+    if recording is None and host is not None:
+        return Readings(live_states(connect(host), period_s=period_s, seconds=seconds), case.inputs)
+    if recording is None or host is not None:
+        raise InputError("one arm at a time", where="mirror", allowed="either HOST or --from joints.csv")
+    read = RecordedJoints.read(recording)
+    return Readings(read.states(case), (read.input, *case.inputs), read.warnings())
+
+
 def told(time_s: float, q: list[float]) -> RecordedState:
     """A controller's word, if it is a time and six angles that an arm can have; else an `InputError`."""
     if not np.isfinite(time_s):

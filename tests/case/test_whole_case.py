@@ -1,4 +1,4 @@
-"""Schema 2 of the case: a file or a list that was cut is refused wherever it was cut; schema 1 is read as before."""
+"""A case file or a list that was cut is refused wherever it was cut."""
 
 from types import SimpleNamespace
 
@@ -10,22 +10,21 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.named_files import NOT_LAST_NOTE, SCHEMA_ONE_NOTE, TOP_COUNT_NOTE
+from puncture_twin.planning.case.named_files import NOT_LAST_NOTE, TOP_COUNT_NOTE
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.evidence.checks import ignored_organs
 from puncture_twin.planning.formats.labels.naming import V2
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.exit_codes import BAD_INPUT, OK
+from puncture_twin.twin.jobs.exit_codes import BAD_INPUT
 
-TWO = CASE.replace("schema = 1", 'schema = 2\nregion = "other"') + "[end]\nstructures = 4\n"
-TOP = CASE.replace("schema = 1", 'schema = 2\nstructures = 4\nregion = "other"')
+TOP = CASE.replace("schema = 2", "schema = 2\nstructures = 4").replace("[end]\nstructures = 4\n", "")
 BOX = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0, 150, 0]\nsize_mm = [400, 20, 400]\n'
 
 
 def test_a_case_that_states_its_structures_is_read_without_a_note(tmp_path):
     """The count includes the skin; region and count are the case's."""
-    case = load_case(write_case(tmp_path, text=TWO))
+    case = load_case(write_case(tmp_path))
     assert (case.stated_structures, case.region, case.warnings) == (4, "other", ())
     (outside, unknown, base) = prepare(tmp_path, arm=False).anatomy.warnings
     assert "'organ', a name that the table of default roles does not know" in unknown
@@ -35,7 +34,7 @@ def test_a_case_that_states_its_structures_is_read_without_a_note(tmp_path):
 @pytest.mark.parametrize(
     "name", ["abdomen/case.toml", "carton/case_l.toml", "carton/case_m.toml", "carton/case_h.toml"]
 )
-def test_the_embedded_cases_are_of_schema_two(name):
+def test_the_embedded_cases_are_whole(name):
     """No note, and no usual organ is missing."""
     context = prepare(folder() / name, arm=False)
     assert context.case.region in {"abdomen", "phantom"}
@@ -44,7 +43,7 @@ def test_the_embedded_cases_are_of_schema_two(name):
 
 def test_a_case_cut_anywhere_is_refused(tmp_path):
     """Every shorter file, byte by byte, with an obstacle behind the structures: none is read as a smaller case."""
-    text = TWO.replace("[end]", BOX + "[end]")
+    text = CASE.replace("[end]", BOX + "[end]")
     path = write_case(tmp_path, text=text)
     load_case(path)
     whole = text.rstrip("\n")
@@ -68,7 +67,7 @@ def test_the_abdomen_cut_at_a_line_is_refused(tmp_path):
 def test_a_lost_structure_is_refused_with_a_count_at_the_top_too(kept, tmp_path, capfd):
     """structures = N at the top: the command says both numbers, in one line, exit code 2."""
     pieces = TOP.split("[[structure]]")
-    path = write_case(tmp_path, text="[[structure]]".join(pieces[: kept + 1]))
+    path = write_case(tmp_path, text="[[structure]]".join(pieces[: kept + 1]), listed=None)
     assert main(["check", str(path), "--theta", "0", "--beta", "0", "--no-arm"]) == BAD_INPUT
     said = capfd.readouterr()
     assert said.out == ""
@@ -78,16 +77,8 @@ def test_a_lost_structure_is_refused_with_a_count_at_the_top_too(kept, tmp_path,
 
 def test_what_a_count_at_the_top_does_not_show_is_said(tmp_path):
     """A margin on the last line, an obstacle behind: one note, and the case is read."""
-    assert load_case(write_case(tmp_path, text=TOP)).warnings == (TOP_COUNT_NOTE,)
-    assert load_case(write_case(tmp_path, text=TWO + BOX)).warnings == (NOT_LAST_NOTE,)
-
-
-def test_schema_one_is_read_as_before_with_one_note(tmp_path, capfd):
-    """Never refused for its schema: also where it was cut between two tables."""
-    path = write_case(tmp_path)
-    assert load_case(path).warnings == (SCHEMA_ONE_NOTE,)
-    assert main(["check", str(path), "--theta", "0", "--beta", "0", "--no-arm"]) == OK
-    assert capfd.readouterr().out.count("schema = 1") == 1
+    assert load_case(write_case(tmp_path, text=TOP, listed=None)).warnings == (TOP_COUNT_NOTE,)
+    assert load_case(write_case(tmp_path, text=CASE + BOX, listed=None)).warnings == (NOT_LAST_NOTE,)
 
 
 @pytest.mark.parametrize(
@@ -100,14 +91,14 @@ def test_schema_one_is_read_as_before_with_one_note(tmp_path, capfd):
         (("structures = 4", "structures = 0"), "end.structures"),
         (("structures = 4", "structures = true"), "end.structures"),
         (("schema = 2", "schema = 2\nstructures = 5"), r"structures = 5 at the top and 4 in \[end\]; keep one"),
-        (('schema = 2\nregion = "other"', "schema = 1"), r"region and \[end\] belong to schema = 2"),
+        (("schema = 2", "schema = 1"), r"schema 1 is not known; write schema = 2, region = .* and last \[end\] with"),
         (("schema = 2", "schema = true"), "schema True is not known"),
     ],
 )
-def test_what_schema_two_states_must_be_right(change, message, tmp_path):
+def test_what_a_case_states_of_itself_must_be_right(change, message, tmp_path):
     """Each defect in one line that says what is allowed."""
     with pytest.raises(InputError, match=message):
-        load_case(write_case(tmp_path, change, text=TWO))
+        load_case(write_case(tmp_path, change, listed=None))
 
 
 def test_labels_that_rules_name_count_each(tmp_path):
@@ -119,7 +110,7 @@ def test_labels_that_rules_name_count_each(tmp_path):
     for number, at in enumerate((60, 64, 68), start=1):
         labels[40:60, at, at] = number
     (tmp_path / "names.csv").write_text("id,name\n1,vein_left\n2,vein_right\n3,fold\n")
-    path = write_case(tmp_path, ("[end]\nstructures = 4", many + "[end]\nstructures = 6"), text=TWO)
+    path = write_case(tmp_path, ("[end]", many + "[end]"), listed=2)
     write_labels(tmp_path / "many.nrrd", labels)
     assert prepare(path, arm=False).anatomy.ignored == ("fold",)
     path.write_text(path.read_text().replace("structures = 6", "structures = 7"))
@@ -128,34 +119,28 @@ def test_labels_that_rules_name_count_each(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["touch.csv", "markers_ct.csv", "targets.csv"])
-def test_a_list_that_ends_within_a_line_is_a_warning_and_in_schema_two_a_refusal(name, tmp_path):
+def test_a_list_that_ends_within_a_line_is_refused(name, tmp_path):
     """Cut within its last number a list is whole CSV with another number: 70 became 7."""
     target = ("position_mm = [0.0, 0.0, 0.0]", 'points = "targets.csv"')
-    for text, refused in ((CASE, False), (TWO, True)):
-        path = write_case(tmp_path, target, text=text)
-        (tmp_path / "targets.csv").write_text("name,x_mm,y_mm,z_mm\ntarget,0,0,10\n")
+    path = write_case(tmp_path, target)
+    (tmp_path / "targets.csv").write_text("name,x_mm,y_mm,z_mm\ntarget,0,0,10\n")
+    load_case(path)
+    (tmp_path / name).write_text((tmp_path / name).read_text().rstrip("\n")[:-1])
+    with pytest.raises(InputError, match=f"{name}: its last line does not end with a line break; was the file cut"):
         load_case(path)
-        (tmp_path / name).write_text((tmp_path / name).read_text().rstrip("\n")[:-1])
-        said = f"{name}: its last line does not end with a line break; was the file cut?"
-        if refused:
-            with pytest.raises(InputError, match="its last line does not end") as caught:
-                load_case(path)
-            assert said in str(caught.value)
-        else:
-            assert said in load_case(path).warnings
 
 
 @pytest.mark.parametrize("content", [MARKERS, MARKERS.replace("\n", "\r\n"), MARKERS + "  \n", MARKERS + " \t"])
 def test_a_list_whose_last_line_ends_is_whole(content, tmp_path):
     """Line breaks of every system; spaces after the last one are no line."""
-    path = write_case(tmp_path, text=TWO)
+    path = write_case(tmp_path)
     (tmp_path / "touch.csv").write_bytes(content.encode())
     assert load_case(path).warnings == ()
 
 
 def test_usual_organs_that_are_absent_are_listed_once(tmp_path):
     """By name, with the side of a paired organ; those that the case ignores are named, not forgotten."""
-    path = write_case(tmp_path, ('region = "other"', 'region = "pelvis"'), text=TWO)
+    path = write_case(tmp_path, ('region = "other"', 'region = "pelvis"'))
     found = [warning for warning in prepare(path, arm=False).anatomy.warnings if "region" in warning]
     assert len(found) == 1
     assert found[0].startswith(
