@@ -29,7 +29,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, Search, Spot
+from puncture_twin.twin.guidance.stereo.detection import Detection, Detector, LocatedPair, Search
 from puncture_twin.twin.guidance.stereo.experiment import needle_statistics
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, adjust
 from puncture_twin.twin.guidance.stereo.joint.needle_error import (
@@ -66,10 +66,10 @@ class RoomOutcome(NamedTuple):
 def pixel_detector(room: StereoWorkcell, sigma_px: float, rng: np.random.Generator) -> Detector:
     """True pixels with normal errors of a standard deviation per axis."""
 
-    def see(number: int, ball: LocatedPair, search: Search) -> Spot:
+    def see(number: int, ball: LocatedPair, search: Search) -> Detection:
         del search
         pixel = room.cameras[number].project(ball.center_c) + rng.normal(0.0, sigma_px, 2)
-        return Spot(pixel, max(sigma_px, 1e-6) ** 2 * np.eye(2))
+        return Detection(pixel, max(sigma_px, 1e-6) ** 2 * np.eye(2))
 
     return see
 

@@ -35,7 +35,7 @@ from puncture_twin.planning.base.cache.entry_file import check_own_folder
 from puncture_twin.planning.base.cache.source_stamp import files_unedited, library_versions, sources_with, stamp_of
 from puncture_twin.planning.base.errors import CacheWarning
 
-__all__ = ["allocation_free", "is_compiled", "nb"]
+__all__ = ["allocation_free", "nb"]
 
 config: Any = nb.config
 """It makes its attributes when it is loaded."""
@@ -136,13 +136,6 @@ def _remove_if_edited(folder: Path, sources: tuple[str, ...]) -> None:
     """Remove the folder at the end of a process whose sources were edited meanwhile: which of them did it load?"""
     if not files_unedited(sources):
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def is_compiled(kernel: Any) -> bool:
-    """Whether a kernel of this project was compiled for anything, now or earlier, or is never compiled and kept."""
-    if config.DISABLE_JIT:
-        return True
-    return bool(kernel.signatures or list(Path(kernel.stats.cache_path).glob(f"*{kernel.__name__}-*.nbi")))
 
 
 _use_folder()

@@ -204,16 +204,6 @@ def test_old_folders_go_when_a_new_one_is_made(tmp_path):
     assert left == {"beside", f"{PREFIX}new", *(f"{PREFIX}{number}" for number in range(KEPT_FOLDERS + 2))}
 
 
-def test_it_is_known_whether_a_kernel_is_compiled(project):
-    """Of today's sources: not before its first call; afterwards in other processes too, until an edit."""
-    asked = "from puncture_twin.planning.base.numba_kernels import is_compiled\n"
-    asked += "from puncture_twin.planning.caller import add\nprint(is_compiled(add))\n"
-    assert answer(project, asked + "add(1); print(is_compiled(add))") == ["False", "True"]
-    assert answer(project, asked) == ["True"]
-    write(project, size="SIZE = 1 + 1\n")
-    assert answer(project, asked) == ["False"]
-
-
 def test_two_processes_at_once(project):
     """Both compile, or one finds what the other has just kept."""
     both = [process(project) for _ in range(2)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.twin.guidance.stereo.ball.ball_edges import Circle, cone, consensus, refit
-from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, Picture, _paint, render
+from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, GreyImage, _paint, render
 from puncture_twin.twin.guidance.stereo.ball.tracker import DetectedBall, LostBall, find_ball
 from puncture_twin.twin.guidance.stereo.cameras.camera import stereo_pair, tangent_axes
 
@@ -193,10 +193,10 @@ def test_a_ball_that_cannot_be_believed_is_lost(rng, changes, reasons):
 
 def test_a_prediction_out_of_view_is_named(rng):
     """Behind the camera, beside the picture, and beside the part given."""
-    picture = Picture(np.full((960, 1280), 60, dtype=np.uint8))
+    picture = GreyImage(np.full((960, 1280), 60, dtype=np.uint8))
     for predicted in ([0.0, 0.0, -3000.0], [400.0, 0.0, 0.0]):
         assert find_ball(picture, CAMERA, np.array(predicted), 4.0, search_px=12).reason == "not_in_view"
-    part = Picture(picture.grey[:50, :50], (0, 0))
+    part = GreyImage(picture.grey[:50, :50], (0, 0))
     assert find_ball(part, CAMERA, np.zeros(3), 4.0, search_px=12).reason == "not_in_view"
 
 
