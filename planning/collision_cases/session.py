@@ -13,15 +13,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Decimal
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-import tomlkit
 
 from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.context import CaseContext, prepare
+
+if TYPE_CHECKING:
+    from puncture_twin.planning.search.candidates import Candidates
+    from puncture_twin.planning.search.context import CaseContext
 
 
 @dataclass
@@ -44,6 +45,8 @@ class Session:
         Raises:
             InputError: It cannot be read, or the arm is to be checked in a case that does not say where its base is.
         """
+        from puncture_twin.planning.search.context import prepare  # here: every run of pytest loads this module
+
         key = (path.resolve(), arm)
         if key not in self._contexts:
             self._contexts[key] = prepare(path, arm=arm)
@@ -169,6 +172,8 @@ def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
 
 
 def _rewritten(text: str, path: Path, changes: Sequence[Change]) -> tuple[str, list[str]]:
+    import tomlkit  # here: few runs rewrite
+
     document, expected, lines = tomlkit.parse(text), tomllib.loads(text), []
     for change in changes:
         tables: tuple[str | int, ...] = (change.kind, change.at, *change.number.keys[:-1])

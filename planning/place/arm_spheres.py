@@ -178,10 +178,10 @@ def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
 def _is_clear(arm, surroundings, T_ct_base, frames, last):
     """Whether one state is clear: first the sphere ``last`` (body, sphere), then far bodies before near ones."""
     centres, radii, starts, body_frames = arm
-    body, sphere = last
-    if sphere >= 0:
+    body, ball = last
+    if ball >= 0:
         T, first = frames[body_frames[body]], starts[body]
-        if _touches(surroundings, T_ct_base, T, centres[sphere], radii[sphere]) and _touches(
+        if _touches(surroundings, T_ct_base, T, centres[ball], radii[ball]) and _touches(
             surroundings, T_ct_base, T, centres[first], radii[first]
         ):
             return False
@@ -189,9 +189,9 @@ def _is_clear(arm, surroundings, T_ct_base, frames, last):
         T = frames[body_frames[body]]
         first = starts[body]
         if _touches(surroundings, T_ct_base, T, centres[first], radii[first]):
-            for sphere in range(first + 1, starts[body + 1]):
-                if _touches(surroundings, T_ct_base, T, centres[sphere], radii[sphere]):
-                    last[0], last[1] = body, sphere
+            for ball in range(first + 1, starts[body + 1]):
+                if _touches(surroundings, T_ct_base, T, centres[ball], radii[ball]):
+                    last[0], last[1] = body, ball
                     return False
     return True
 

@@ -27,6 +27,8 @@ tolerance_mm = 0.02
 @pytest.fixture(autouse=True, scope="module")
 def kernels_loaded():
     """Run compiled code once: pytester forgets modules that it saw imported, and numba's register only once."""
+    import puncture_twin.planning.collision_cases.collector  # noqa: F401  # and OMPL, which loads once too
+
     prepare(CARTON, arm=False).check(0.0, 0.0)
 
 

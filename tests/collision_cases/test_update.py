@@ -41,6 +41,8 @@ clearance_mm = {{ bolt_h = 5.2 }}
 @pytest.fixture(autouse=True, scope="module")
 def kernels_loaded():
     """Run compiled code once: pytester forgets modules that it saw imported, and numba's register only once."""
+    import puncture_twin.planning.collision_cases.collector  # noqa: F401  # and OMPL, which loads once too
+
     prepare(CARTON, arm=False).check(0.0, 0.0)
 
 
