@@ -21,10 +21,9 @@ from puncture_twin.planning.base.cache.kernel_cache import host_features
 
 DRAW = """
 import numba, numpy as np
-from puncture_twin.twin.report.canvas import Canvas
-canvas = Canvas(8, 8)
-canvas.fill(np.array([(1.0, 1.0), (6.0, 1.0), (1.0, 6.0)]), (0, 0, 0))
-print(canvas.pixels.sum(), numba.core.config.CPU_NAME)
+from puncture_twin.twin.report.map_view import MapCells
+cells = MapCells(np.arange(2), np.array([0.0, 3.0]), np.array([0, 1, 2]), np.array([0.0, 1.0]), 0.5, np.full(2, 0.5))
+print(cells.rows(np.array([0.1, 0.9, 3.0]), np.array([0.2, 3.1, 3.0])).sum(), numba.core.config.CPU_NAME)
 """
 """A use of one small kernel: all of them would take minutes."""
 

@@ -81,11 +81,10 @@ def _err_once() -> None:
 
 
 def draw_once() -> None:
-    """A body in another that is see-through, and one that moves; a map, a line and an area."""
+    """A body in another that is see-through, and one that moves; a map."""
     import numpy as np
 
     from puncture_twin.planning.reach.reach import TARGET, octahedron
-    from puncture_twin.twin.report.canvas import Canvas
     from puncture_twin.twin.report.map_view import MapCells, MapView
     from puncture_twin.twin.report.raster.camera import ViewCamera
     from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
@@ -97,6 +96,3 @@ def draw_once() -> None:
     opaque.sees(camera.eye, TARGET[None])
     cells = MapCells(np.arange(1), np.zeros(1), np.array([0, 1]), np.zeros(1), 0.5, np.full(1, np.pi))
     cells.picture(MapView(turn=0.0, theta_max=1.0, rim=(), centre=""), size=8)
-    canvas, corners = Canvas(8, 8), np.array([(1.0, 1.0), (6.0, 1.0), (1.0, 6.0)])
-    canvas.line(corners, 1.0, (0, 0, 0))
-    canvas.fill(corners, (0, 0, 0))

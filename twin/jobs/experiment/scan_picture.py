@@ -14,6 +14,7 @@ from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle
 from puncture_twin.twin.plant.scanner.image import CtImage
+from puncture_twin.twin.report.figures import write_png
 
 WINDOW_HU = (-160.0, 240.0)
 """What abdomens are read in: 400 wide about 40."""
@@ -60,7 +61,7 @@ def draw_scan(image: CtImage, shown: Shown, path: Path) -> Path:
     ax.set_title(f"slice {k + 1} of {nz}, z {z:.1f} mm; simulated", fontsize=10)
     ax.set_xlim(extent[:2])
     ax.set_ylim(extent[2:])
-    figure.savefig(path)
+    write_png(figure, path)
     return path
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
@@ -22,6 +21,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
 from puncture_twin.twin.guidance.stereo.session import Reached, Session
 from puncture_twin.twin.report.annotate import INK, write
+from puncture_twin.twin.report.figures import write_png
 from puncture_twin.twin.world.workcell import load_ball, open_workcell, pinhole_picture
 
 BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)
@@ -138,8 +138,7 @@ def _inset(picture: Image.Image, session: Session, reached: Reached, number: int
 
 def draw_convergence(session: Session, path: Path) -> None:
     """Write the plot: true distance from ball to estimated target at each look, and what the cameras saw."""
-    figure = Figure(figsize=(9.0, 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(9.0, 5.2), dpi=120, layout="constrained")
     axes = figure.add_subplot()
     axes.set_prop_cycle(color=[colormaps["tab20"](k) for k in range(20)])
     longest = 1
@@ -153,8 +152,7 @@ def draw_convergence(session: Session, path: Path) -> None:
         (line,) = axes.plot(looks, true, "-", linewidth=1.2, label=one.target)
         axes.plot(looks, one.servoed.errors_mm, "o", color=line.get_color(), markersize=4)
     _finish(axes, session, longest)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    write_png(figure, path)
 
 
 def _finish(axes: Axes, session: Session, longest: int) -> None:

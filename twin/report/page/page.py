@@ -27,6 +27,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.planning.search.doubt import Doubt
 from puncture_twin.planning.search.windows import find_windows
+from puncture_twin.twin.report.error_pictures import budget_png
 from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.numbers import (
@@ -335,8 +336,6 @@ def budget_section(facts: Mapping[str, Any]) -> Markup:
     Args:
         facts: As ``register --json`` has them under ``budget``, of the direction that is shown.
     """
-    from puncture_twin.twin.report.error_pictures import budget_png  # with matplotlib, only where there is a budget
-
     now, best = facts["expected_mm"], facts["best"]
     won = now - best["expected_mm"]
     head = f"Expected tip error of this insertion: {now:.2f} mm (rms)"

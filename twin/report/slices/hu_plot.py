@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
+from matplotlib.axes import Axes
 from PIL import Image
 
-from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.search.bending import BEYOND_SKIN_MM, Stretch, stretches
-from puncture_twin.twin.report.canvas import BLACK, Canvas, Words, ticks
+from puncture_twin.twin.report.figures import figure_of, pixels
 from puncture_twin.twin.report.palette import TARGET_POINT
 from puncture_twin.twin.report.slices.subject import Subject
 
@@ -25,37 +23,14 @@ SHOWN_HU = (-1050.0, 500.0)
 BAR = 0.74
 """Height of a structure's bar, of its row."""
 
-LEFT, RIGHT = 0.2 * WIDTH, 0.985 * WIDTH
-"""Edges of the plot in the picture; names stand to the left."""
+LEFT, RIGHT, BOTTOM, TOP, BETWEEN = 0.2, 0.985, 0.14, 0.98, 0.02
+"""Edges of the plot in the picture, names stand to the left; and what lies between the units and the bars."""
 
-TOP, BOTTOM, BETWEEN = 7.0, 284.0, 7.0
-"""Pixels: upper edge of the units, lower edge of the bars, and what lies between both."""
+ROW, MOST_BARS = 20.5 / HEIGHT, 0.5
+"""Of the picture: height of a structure's row, and of all of them together at most."""
 
-ROW, LEAST_ROW, MOST_BARS = 20.5, 8.0, 165.0
-"""Pixels: height of a structure's row; of many, and of all of them together."""
-
-INK: Rgb = (38, 38, 38)
-GRID: Rgb = (230, 230, 230)
-SMALL, AXIS = Words(11), Words(12)
-
-
-class _Frame(NamedTuple):
-    """Where the plot lies: its upper and lower edge in pixels, and what they and the two sides stand for."""
-
-    top: float
-    bottom: float
-    across: tuple[float, float]
-    upward: tuple[float, float]
-
-    def x(self, mm: float | Floats) -> Floats:
-        """Columns of depths."""
-        first, last = self.across
-        return np.asarray(LEFT + (np.asarray(mm) - first) / (last - first) * (RIGHT - LEFT))
-
-    def y(self, value: float | Floats) -> Floats:
-        """Rows of values."""
-        low, high = self.upward
-        return np.asarray(self.bottom - (np.asarray(value) - low) / (high - low) * (self.bottom - self.top))
+LETTERS, LEAST_LETTERS = 11.0, 8.0
+"""Pixels: names of many structures are smaller."""
 
 
 def draw_hu_plot(subject: Subject) -> Image.Image | None:
@@ -65,66 +40,42 @@ def draw_hu_plot(subject: Subject) -> Image.Image | None:
         return None
     shown = (name for part in reversed(parts) for name in part.structures)
     names = tuple(dict.fromkeys(name for name in shown if name in subject.colours))
-    split = BOTTOM - min(MOST_BARS, ROW * max(1, len(names)))
+    row = min(ROW, MOST_BARS / max(1, len(names)))
+    split = BOTTOM + row * max(1, len(names))
+    figure = figure_of(WIDTH, HEIGHT)
+    units = figure.add_axes((LEFT, split + BETWEEN, RIGHT - LEFT, TOP - split - BETWEEN))
+    bars = figure.add_axes((LEFT, BOTTOM, RIGHT - LEFT, split - BOTTOM), sharex=units)
+    _units(units, subject)
+    _bars(bars, subject, parts, names, min(LETTERS, max(LEAST_LETTERS, BAR * row * HEIGHT)))
+    for axes in (units, bars):
+        axes.axvline(0.0, color=css(TARGET_POINT), linewidth=1.9)
+        axes.axvline(subject.path_mm, color="black", linewidth=1.3, linestyle="--")
+    return Image.fromarray(pixels(figure)).convert("RGB")
+
+
+def _units(axes: Axes, subject: Subject) -> None:
+    """A step a sample; nothing where the image has ended."""
     depths = np.arange(-BEYOND_TARGET_MM, subject.path_mm + BEYOND_SKIN_MM, STEP_MM)
     hu = subject.anatomy.scan.hu_at(subject.case.target_ct + depths[:, None] * subject.outward_ct)
-    across = float(depths[-1]), float(depths[0])
-    units = _Frame(TOP, split - BETWEEN, across, (SHOWN_HU[0], max(SHOWN_HU[1], 1.05 * np.nanmax(hu, initial=0.0))))
-    bars = _Frame(split, BOTTOM, across, (max(1, len(names)) - 0.5, -0.5))
-    canvas = Canvas(WIDTH, HEIGHT)
-    _grid(canvas, units, bars)
-    _units(canvas, units, depths, hu)
-    _bars(canvas, bars, subject, parts, names)
-    for frame in (units, bars):
-        _mark(canvas, frame, subject.path_mm)
-        canvas.rectangle((LEFT, frame.top, RIGHT, frame.bottom), None, 1.0)
+    axes.step(depths, hu, where="mid", color="0.15", linewidth=1.7)
+    axes.set_xlim(depths[-1], depths[0])
+    axes.set_ylim(SHOWN_HU[0], max(SHOWN_HU[1], 1.05 * np.nanmax(hu, initial=0.0)))
+    axes.set_ylabel("HU", fontsize=LETTERS + 1)
+    axes.tick_params(labelsize=LETTERS, labelbottom=False, length=0)
+    axes.grid(visible=True, color="0.9")
     for mm, text in ((0.0, "target"), (subject.path_mm, "skin")):
-        canvas.write((float(units.x(mm)) + 5, units.bottom - 9), text, SMALL)
-    return canvas.image.convert("RGB")
+        axes.annotate(text, (mm, SHOWN_HU[0]), (5, 6), textcoords="offset points", fontsize=LETTERS)
 
 
-def _grid(canvas: Canvas, units: _Frame, bars: _Frame) -> None:
-    """Lines at round numbers, with the numbers, and what they are."""
-    for value in ticks(*units.upward, most=8).tolist():
-        row = float(units.y(value))
-        canvas.line(np.array([(LEFT, row), (RIGHT, row)]), 1.0, GRID)
-        canvas.write((LEFT - 7, row), _said(value), SMALL, anchor="rm")
-    for mm in ticks(units.across[1], units.across[0], most=8).tolist():
-        column = float(units.x(mm))
-        canvas.line(np.array([(column, units.top), (column, units.bottom)]), 1.0, GRID)
-        canvas.line(np.array([(column, bars.bottom), (column, bars.bottom + 5)]), 1.0, BLACK)
-        canvas.write((column, bars.bottom + 8), _said(mm), SMALL, anchor="ma")
-    text = "mm from the target along the needle (left: outside; right of the target: deeper)"
-    canvas.write(((LEFT + RIGHT) / 2, HEIGHT - 8), text, AXIS, anchor="ms")
-    canvas.write((LEFT - 58, (units.top + units.bottom) / 2), "HU", AXIS, anchor="mm", turned=1)
-
-
-def _said(value: float) -> str:
-    return f"{value:.0f}".replace("-", "−")
-
-
-def _units(canvas: Canvas, frame: _Frame, depths: Floats, hu: Floats) -> None:
-    """A step a sample; nothing where the image has ended."""
-    edges = frame.x(np.append(depths, depths[-1] + STEP_MM) - STEP_MM / 2)
-    rows = frame.y(hu)
-    points = np.stack([np.repeat(edges, 2)[1:-1], np.repeat(rows, 2)], axis=-1)
-    points[:, 0] = np.clip(points[:, 0], LEFT, RIGHT)
-    segments = np.stack([points[:-1], points[1:]], axis=1)
-    canvas.segments(segments[np.isfinite(segments).all(axis=(1, 2))], 1.7, INK)
-
-
-def _bars(canvas: Canvas, frame: _Frame, subject: Subject, parts: tuple[Stretch, ...], names: tuple[str, ...]) -> None:
+def _bars(axes: Axes, subject: Subject, parts: tuple[Stretch, ...], names: tuple[str, ...], letters: float) -> None:
+    """A row for each structure that the needle passes, with a bar where it is in it."""
     for row, name in enumerate(names):
-        top, bottom = frame.y(np.array([row - BAR / 2, row + BAR / 2])).tolist()
-        for part in (part for part in parts if name in part.structures):
-            left, right = np.clip(frame.x(np.array([part.end_mm, part.start_mm])), LEFT, RIGHT).tolist()
-            canvas.rectangle((left, top, right, bottom), subject.colours[name], 0.6)
-        size = min(SMALL.size, max(LEAST_ROW, bottom - top))
-        canvas.write((LEFT - 7, (top + bottom) / 2), name.replace("_", " "), Words(size), anchor="rm")
-
-
-def _mark(canvas: Canvas, frame: _Frame, path_mm: float) -> None:
-    """Where target and skin are."""
-    target, skin = (float(frame.x(mm)) for mm in (0.0, path_mm))
-    canvas.line(np.array([(target, frame.top), (target, frame.bottom)]), 1.9, TARGET_POINT)
-    canvas.line(np.array([(skin, frame.top), (skin, frame.bottom)]), 1.3, BLACK, dashes=(5.0, 2.2))
+        inside = [(part.start_mm, part.end_mm - part.start_mm) for part in parts if name in part.structures]
+        colour = css(subject.colours[name])
+        axes.broken_barh(inside, (row - BAR / 2, BAR), facecolors=colour, edgecolors="black", linewidths=0.6)
+    axes.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=letters)
+    axes.set_ylim(max(1, len(names)) - 0.5, -0.5)
+    axes.tick_params(axis="y", length=0)
+    axes.tick_params(axis="x", labelsize=LETTERS)
+    text = "mm from the target along the needle (left: outside; right of the target: deeper)"
+    axes.set_xlabel(text, fontsize=LETTERS + 1)
