@@ -279,7 +279,7 @@ def _regions(codes: NDArray[np.int64], names: Sequence[str]) -> list[tuple[Float
 
 
 def _half_size(text: str, size: int) -> tuple[int, int]:
-    """Half the height and half the width of a name, with half a letter beside it, in pixels of a square picture of the disc."""
+    """Half the height and half the width of a name with some white, in pixels of a square picture of the disc."""
     scale, lines = size / (2 * RADIUS), text.split("\n")
     return round(LETTER_HIGH * len(lines) * scale), round(LETTER_WIDE * (max(map(len, lines)) + 1) * scale)
 

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
@@ -95,8 +94,10 @@ def _line(axes: Axes, points: Floats, width: float, colour: Rgb, style: str = "-
 
 
 def _segments(axes: Axes, segments: Floats, width: float, colour: Rgb) -> None:
-    """Lines from point to point, each alone, shape (n, 2, 2), mm."""
-    axes.add_collection(LineCollection(list(segments), linewidths=width, colors=css(colour), capstyle="round"))
+    """Lines from point to point, each alone, shape (n, 2, 2), mm: one path, with gaps between."""
+    gaps = np.full((len(segments), 1, 2), np.nan)
+    points = np.concatenate([segments, gaps], axis=1).reshape(-1, 2)
+    axes.plot(*points.T, color=css(colour), linewidth=width, solid_capstyle="round")
 
 
 def _outlines(axes: Axes, subject: Subject, plane: Plane) -> None:
