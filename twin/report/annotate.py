@@ -12,10 +12,12 @@ from typing import Literal
 import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont
 
+from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report.map_view import body_directions
+from puncture_twin.twin.report.palette import PNG_LEVEL
 from puncture_twin.twin.report.raster.camera import ViewCamera
 
 INK: Rgb = (25, 27, 32)
@@ -40,6 +42,12 @@ def font(size: float, bold: bool = False) -> ImageFont.FreeTypeFont:
     """A font of a height in pixels."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(mpl.get_data_path(), "fonts", "ttf", name)), size)
+
+
+def write_image(image: Image.Image, path: Path) -> None:
+    """Write a picture as a PNG; the file appears whole or not at all."""
+    with atomic(Path(path)) as temporary:
+        image.save(temporary, format="PNG", compress_level=PNG_LEVEL)
 
 
 def write(

@@ -13,14 +13,13 @@ from PIL import Image, ImageDraw
 
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.twin.guidance.stereo.ball.ball_image import render
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
 from puncture_twin.twin.guidance.stereo.session import Reached, Session
-from puncture_twin.twin.report.annotate import INK, write
+from puncture_twin.twin.report.annotate import INK, write, write_image
 from puncture_twin.twin.report.figures import write_png
 from puncture_twin.twin.world.workcell import load_ball, open_workcell, pinhole_picture
 
@@ -47,8 +46,7 @@ def draw_cameras(session: Session, path_of: Path) -> list[Path]:
         picture = picture.resize((WIDTH_PX, round(camera.height * scale)), Image.Resampling.LANCZOS)
         _annotate(picture, session, reached, number, scale)
         path = path_of / f"camera_{number + 1}.png"
-        with atomic(path) as temporary:
-            picture.save(temporary)
+        write_image(picture, path)
         paths.append(path)
     return paths
 

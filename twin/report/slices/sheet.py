@@ -9,13 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from PIL import Image, ImageDraw
 
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.planning.search.bending import BEYOND_SKIN_MM, Stretch, stretches
-from puncture_twin.twin.report.annotate import FAINT, legend, write
+from puncture_twin.twin.report.annotate import FAINT, legend, write, write_image
 from puncture_twin.twin.report.figures import figure_of, pixels
 from puncture_twin.twin.report.numbers import number, target_text
-from puncture_twin.twin.report.palette import PNG_LEVEL, TARGET_POINT
+from puncture_twin.twin.report.palette import TARGET_POINT
 from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, TONES, Panel, Tone, draw_panel
 from puncture_twin.twin.report.slices.planes import body_planes, needle_planes
 from puncture_twin.twin.report.slices.subject import Subject
@@ -182,5 +181,4 @@ def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
         write(draw, (GAP, row), line, size=14, colour=FAINT)
         row += 20
     sheet = sheet.crop((0, 0, size[0], min(size[1], int(row) + GAP)))
-    with atomic(Path(path)) as temporary:
-        sheet.save(temporary, format="PNG", compress_level=PNG_LEVEL)
+    write_image(sheet, path)
