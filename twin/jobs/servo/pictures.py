@@ -20,7 +20,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
 from puncture_twin.twin.guidance.stereo.session import Reached, Session
 from puncture_twin.twin.report.annotate import INK, write, write_image
-from puncture_twin.twin.report.figures import write_png
+from puncture_twin.twin.report.figures import halo, write_png
 from puncture_twin.twin.world.workcell import load_ball, open_workcell, pinhole_picture
 
 BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)
@@ -156,7 +156,8 @@ def draw_convergence(session: Session, path: Path) -> None:
 def _finish(axes: Axes, session: Session, longest: int) -> None:
     tolerance = session.workcell.case.file.servo.tolerance_mm
     axes.axhline(tolerance, color="#d6001e", linewidth=1)
-    axes.annotate(f"tolerance {tolerance:g} mm", (longest, tolerance), ha="right", va="bottom", color="#d6001e")
+    text, look = f"tolerance {tolerance:g} mm", {"ha": "right", "va": "bottom"}
+    axes.text(longest, tolerance, text, look, color="#d6001e", path_effects=halo(3))
     axes.set_yscale("log")
     for axis_format in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         axis_format("{x:g}")

@@ -109,7 +109,7 @@ def _panel(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any,
         axes.add_patch(Rectangle((x - step / 2, y - step / 2), step, step, facecolor=colour, edgecolor="none"))
     space = str(case.space)
     text = mounting_text(regions[0], found.T_ct_bed, space) if len(regions) == 1 else regions[0].mount
-    axes.set_title(text, fontsize=11.5, fontweight="bold")
+    axes.set_title(text, fontsize=10.5, fontweight="bold")
     axes.set_aspect("equal")
     axes.tick_params(labelsize=8)
     axes.xaxis.set_major_locator(MultipleLocator(TICKS_MM))
