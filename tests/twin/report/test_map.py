@@ -10,6 +10,7 @@ from matplotlib.text import Text
 from puncture_twin.planning.base.reasons import REASON_TEXT, UNSEEN_AIR_TEXT, Reason
 from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.planning.search.explain import reason_text
+from puncture_twin.twin.report.map.map_disc import RINGS_CLEAR, ring_labels
 from puncture_twin.twin.report.map.map_picture import map_figure
 from puncture_twin.twin.report.map.map_raster import (
     HATCH,
@@ -91,6 +92,18 @@ def test_one_clearance_is_one_shade_and_no_scale(case, candidates, clearance, sa
     assert said in texts and not [text for text in texts if text.endswith("by least clearance")]
     texts = written(candidates, case)
     assert {"5.0 mm", "11.5 mm", "safe, by least clearance"} <= set(texts)
+
+
+def test_no_mark_stands_on_the_angle_of_a_ring(case, candidates):
+    """Where a mark lies on one, all are written along another azimuth; where marks are everywhere, as usual."""
+    view = map_view(case, candidates)
+    usual = ring_labels(view, np.zeros((0, 2)))
+    mark = np.array([[usual[1].x + 0.02, usual[1].y]])
+    moved = ring_labels(view, mark)
+    assert [label.text for label in moved] == [label.text for label in usual]
+    assert min(np.hypot(label.x - mark[0, 0], label.y - mark[0, 1]) for label in moved) > RINGS_CLEAR
+    everywhere = np.stack(np.meshgrid(*[np.linspace(-1, 1, 60)] * 2), axis=-1).reshape(-1, 2)
+    assert ring_labels(view, everywhere) == usual
 
 
 def front_of(found, rows):

@@ -32,8 +32,9 @@ RADIUS = 412
 DPI = 130
 """Dots an inch of the map; letters and lines are in points."""
 
-RINGS_AT = np.radians(67.5)
-"""Where the rings' angles are written, counter-clockwise from the right."""
+RINGS_AT, RINGS_CLEAR = np.radians((67.5, 52.5, 22.5, 112.5, 127.5)), 0.09
+"""Where the rings' angles may be written, counter-clockwise from the right: the first at which every mark keeps so far
+from them, in the disc's radii."""
 
 RIM_LABEL = 0.95
 """Of the disc's radii: the angle of a ring at the rim stands there, not over the line."""
@@ -75,20 +76,23 @@ def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRast
     _frame(axes, view)
     _chances(axes, candidates, raster.rows)
     bests = [window.best for window in find_windows(candidates).windows[:MOST_WINDOWS]]
-    rings = _ring_labels(view)
-    about_bests = [Label(x, y, "OO") for x, y in view.place(candidates.theta[bests], candidates.beta[bests])]
+    marked = view.place(candidates.theta[bests], candidates.beta[bests])
+    chosen = np.zeros((0, 2)) if pick is None else view.place(*_angles(pick))
+    rings = ring_labels(view, np.concatenate([marked, chosen]))
+    about_bests = [Label(x, y, "OO") for x, y in marked]
     for x, y, text in rings:
         _write(axes, x, y, text)
     for x, y, text in region_labels(codes, names, [*rings, *about_bests]):
         _write(axes, x, y, text, style="italic")
     axes.plot([0], [0], "+", ms=9, mew=1.2, color="black")
-    for rows, mark in ((shown_front(candidates, view).rows, FRONT), (bests, BEST)):
-        axes.plot(*view.place(candidates.theta[rows], candidates.beta[rows]).T, ls="none", clip_on=False, **mark)
-    if pick is not None:
-        found, row = pick
-        axes.plot(*view.place(found.theta[[row]], found.beta[[row]]).T, clip_on=False, **CHOSEN)
-    for number, line in enumerate(axes.lines[-4:]):
-        line.set_zorder(4 + number)  # over all words
+    front = shown_front(candidates, view).rows
+    dots = view.place(candidates.theta[front], candidates.beta[front])
+    for places, mark in ((dots, FRONT), (marked, BEST), (chosen, CHOSEN)):
+        axes.plot(*places.T, ls="none", clip_on=False, zorder=4, **mark)  # over all words
+
+
+def _angles(pick: Pick) -> tuple[Floats, Floats]:
+    return pick.candidates.theta[[pick.row]], pick.candidates.beta[[pick.row]]
 
 
 def _write(axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
@@ -149,11 +153,13 @@ def ring_radii(view: MapView) -> list[tuple[int, float]]:
     return [(ring, ring / top) for ring in range(spacing, int(top) + 1, spacing)]
 
 
-def _ring_labels(view: MapView) -> list[Label]:
-    """The rings' angles; that of a ring at the rim stands within it."""
-    cosine, sine = float(np.cos(RINGS_AT)), float(np.sin(RINGS_AT))
-    radii = [(ring, min(radius, RIM_LABEL)) for ring, radius in ring_radii(view)]
-    return [Label(radius * cosine, radius * sine, f"θ {ring}°") for ring, radius in radii]
+def ring_labels(view: MapView, marks: Floats) -> list[Label]:
+    """The rings' angles, off the marks (n, 2) where that is possible; that of a ring at the rim stands within it."""
+    radii = np.array([min(radius, RIM_LABEL) for _, radius in ring_radii(view)])
+    lines = [radii[:, None] * (np.cos(angle), np.sin(angle)) for angle in RINGS_AT]
+    clear = [np.linalg.norm(line[:, None] - marks, axis=2).min(initial=2.0) for line in lines]
+    line = next((line for line, far in zip(lines, clear, strict=True) if far > RINGS_CLEAR), lines[0])
+    return [Label(x, y, f"θ {ring}°") for (x, y), (ring, _) in zip(line.tolist(), ring_radii(view), strict=True)]
 
 
 LEVELS = (0.5, 0.9, 0.99)
