@@ -14,14 +14,15 @@ from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle
 from puncture_twin.twin.plant.scanner.image import CtImage
-from puncture_twin.twin.report.figures import write_png
+from puncture_twin.twin.report.figures import halo, write_png
 
 WINDOW_HU = (-160.0, 240.0)
 """What abdomens are read in: 400 wide about 40."""
 NEAR_MM = 6.0
 """A marker so near to the slice is named in it."""
 INCHES, DPI = 9.0, 100
-GREEN, YELLOW = "#38d39f", "#ffd34d"
+GREEN, YELLOW, RIM = "#38d39f", "#ffd34d", halo(3, "black")
+"""On black and on grey; the rim makes them seen on bone."""
 
 
 class Shown(NamedTuple):
@@ -51,7 +52,7 @@ def draw_scan(image: CtImage, shown: Shown, path: Path) -> Path:
     extent = (x0, x0 + nx * dx, y0 + ny * dy, y0)
     low, high = WINDOW_HU
     ax.imshow(image.hu[:, :, k].T, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="nearest")
-    ax.plot(*shown.target[:2], "+", color=GREEN, markersize=12, label="target")
+    ax.plot(*shown.target[:2], "+", color=GREEN, markersize=12, label="target", path_effects=RIM)
     if shown.needle is not None:
         _draw_needle(ax, shown.needle, shown.length_mm)
     if shown.markers is not None:
@@ -69,7 +70,8 @@ def _draw_markers(ax: Axes, markers: NamedPoints, z: float) -> None:
     """The names of those that the slice shows."""
     for name, point in zip(markers.names, markers.points, strict=True):
         if abs(point[2] - z) <= NEAR_MM:
-            ax.annotate(name, point[:2], xytext=(0, 8), textcoords="offset points", color=YELLOW, ha="center")
+            text = ax.annotate(name, point[:2], (0, 8), textcoords="offset points", color=YELLOW, ha="center")
+            text.set_path_effects(RIM)
 
 
 def _draw_needle(ax: Axes, needle: FoundNeedle, length_mm: float) -> None:
