@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import report_world as world
 from matplotlib.text import Text
+from PIL import Image
 
 from puncture_twin.planning.base.reasons import REASON_TEXT, UNSEEN_AIR_TEXT, Reason
 from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.twin.report.map.map_disc import RINGS_CLEAR, ring_labels
-from puncture_twin.twin.report.map.map_picture import map_figure
+from puncture_twin.twin.report.map.map_picture import draw_map, map_figure
 from puncture_twin.twin.report.map.map_raster import (
     HATCH,
     HATCH_AIR,
@@ -55,6 +56,14 @@ def with_clearance(found, mm):
 def written(found, case):
     """All that the picture of these directions says."""
     return [text.get_text() for text in map_figure(found, case).findobj(Text)]
+
+
+def test_the_same_map_is_the_same_file(case, candidates, tmp_path):
+    """Sets of files are known by their hashes: no date, and no name of a program that may be a newer one tomorrow."""
+    for name in ("one.png", "two.png"):
+        draw_map(candidates, case, tmp_path / name)
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    assert Image.open(tmp_path / "one.png").info.keys() <= {"dpi"}
 
 
 def test_where_nobody_looked_is_not_the_skin(case, candidates):
