@@ -29,8 +29,8 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
 from puncture_twin.planning.geometry.rigid import exp_rotation
-from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, plan_approach
-from puncture_twin.planning.motion.path_check import MAX_SWEEP_MM, dense_states, path_length
+from puncture_twin.planning.motion.approach import plan_approach
+from puncture_twin.planning.motion.path_check import FINER, MAX_SWEEP_MM, RESOLUTION_RAD, dense_states, path_length
 
 TOOL = Tool(needle_length_mm=200.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
 DENSER = 10

@@ -22,7 +22,7 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker, halving_order
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.motion.follow import follow, rounded
-from puncture_twin.planning.motion.path_check import dense_states, first_contact
+from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
 from puncture_twin.planning.motion.rrt_connect import CLEARANCE_MM, Connected, SegmentContact
 from puncture_twin.planning.motion.shortest import (
     MAX_SAMPLES,
@@ -35,13 +35,6 @@ from puncture_twin.planning.motion.shortest import (
     shortest_path,
 )
 from puncture_twin.planning.motion.trajectory import Trajectory
-
-RESOLUTION_RAD = 0.05
-"""Joint distance of the states at which FCL alone checks a segment: up to 50 mm at a metre, never the last word."""
-
-FINER = 10
-"""The check of the finished trajectory is this many times finer, and no body moves more than ``MAX_SWEEP_MM`` between
-its states."""
 
 ATTEMPTS = 6
 """Ways that the finer check may refuse; for FCL alone each next one is planned at half the resolution."""

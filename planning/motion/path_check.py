@@ -11,6 +11,13 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import DISTANCE_PAIRS, Contact, Distances, Nearest, StateChecker
 
+RESOLUTION_RAD = 0.05
+"""Joint distance of the states at which FCL alone checks a segment: up to 50 mm at a metre, never the last word."""
+
+FINER = 10
+"""The check of the finished trajectory is this many times finer, and no body moves more than ``MAX_SWEEP_MM`` between
+its states."""
+
 MAX_SWEEP_MM = 2.0
 """So fine that no body point moves farther between two checked states."""
 

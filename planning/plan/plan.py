@@ -21,8 +21,7 @@ from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.text import Facts, brief, card, never_raises
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.state_checker import StateChecker
-from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD
-from puncture_twin.planning.motion.path_check import dense_states, least_clearance
+from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, least_clearance
 from puncture_twin.planning.motion.trajectory import Trajectory
 
 

@@ -21,9 +21,9 @@ from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
-from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, plan_approach
+from puncture_twin.planning.motion.approach import plan_approach
 from puncture_twin.planning.motion.follow import follow_smoothly
-from puncture_twin.planning.motion.path_check import dense_states
+from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.reach.reach import approach_goals
 from puncture_twin.planning.reach.standoff import standoffs

@@ -8,9 +8,7 @@ import pytest
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.progress import Silent, Stages
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.report.pace import rate_text
-from puncture_twin.twin.report.progress import LineDisplay
-from puncture_twin.twin.report.progress_bars import BarDisplay
+from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, rate_text
 
 
 def test_stages_are_announced_when_they_begin_and_added_up():

@@ -17,8 +17,7 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED
 from puncture_twin.twin.jobs.patient.main_job import rehearse_case
-from puncture_twin.twin.report.progress import LineDisplay, progress_display
-from puncture_twin.twin.report.progress_bars import BarDisplay
+from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, progress_display
 from puncture_twin.twin.report.scene.film import FilmTimes
 
 

@@ -26,7 +26,7 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import Contact
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD, Approach, plan_approach
+from puncture_twin.planning.motion.approach import Approach, plan_approach
 from puncture_twin.planning.motion.follow import (
     LENGTH_SLACK,
     MAX_JERK,
@@ -40,7 +40,9 @@ from puncture_twin.planning.motion.follow import (
 )
 from puncture_twin.planning.motion.path_check import (
     CLEARANCE_STEP_MM,
+    FINER,
     MAX_SWEEP_MM,
+    RESOLUTION_RAD,
     dense_states,
     least_clearance,
     path_length,

@@ -1,14 +1,23 @@
-"""Writing on pictures with Pillow: text with a halo, the body's axes, a scale bar, a legend."""
+"""Words on pictures of pixels with Pillow: text with a halo, the body's axes, a scale bar, a legend.
+
+The font is matplotlib's own DejaVu Sans, so that no system font is needed and all pictures have one.
+"""
 
 from __future__ import annotations
 
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
+from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
-from puncture_twin.twin.report.canvas import Anchor, Face, font
 from puncture_twin.twin.report.map_view import body_directions
+from puncture_twin.twin.report.palette import PNG_LEVEL
 from puncture_twin.twin.report.raster.camera import ViewCamera
 
 INK: Rgb = (25, 27, 32)
@@ -24,6 +33,22 @@ LEGEND_SIZE = 15
 
 SCALE_BARS_MM = (5, 10, 20, 50, 100, 200, 500)
 
+Anchor = Literal["lm", "rm", "mm", "la", "ra", "ma", "lb", "mb", "ls", "rs", "ms"]
+"""Which point of a line of text stands at its place, as Pillow names it."""
+
+
+@cache
+def font(size: float, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """A font of a height in pixels."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(mpl.get_data_path(), "fonts", "ttf", name)), size)
+
+
+def write_image(image: Image.Image, path: Path) -> None:
+    """Write a picture as a PNG; the file appears whole or not at all."""
+    with atomic(Path(path)) as temporary:
+        image.save(temporary, format="PNG", compress_level=PNG_LEVEL)
+
 
 def write(
     draw: ImageDraw.ImageDraw,
@@ -37,11 +62,7 @@ def write(
     halo: int = 0,
 ) -> None:
     """One line of text; ``halo`` is the width of a white rim in pixels."""
-    draw.text(at, text, fill=colour, font=font(size, _face(bold)), anchor=anchor, stroke_width=halo, stroke_fill=WHITE)
-
-
-def _face(bold: bool) -> Face:
-    return "bold" if bold else "plain"
+    draw.text(at, text, fill=colour, font=font(size, bold), anchor=anchor, stroke_width=halo, stroke_fill=WHITE)
 
 
 def width_of(text: str, size: int) -> float:
@@ -86,13 +107,13 @@ def body_axes(
         at = end[0] + out[0] * 6, end[1] + out[1] * (size * 0.75)
         short = name.removeprefix("patient's ")
         anchor: Anchor = "lm" if out[0] > 0.35 else "rm" if out[0] < -0.35 else "mm"
-        box = draw.textbbox(at, short, font=font(size, _face(not far)), anchor=anchor)
+        box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
         for side in (1, -1, 2, -2, 3, -3):  # beside words that already stand there: above them it would read as one
             if not any(_overlap(box, other) for other in taken):
                 break
             at = end[0] + side * size * 0.6, end[1]
             anchor = "lm" if side > 0 else "rm"
-            box = draw.textbbox(at, short, font=font(size, _face(not far)), anchor=anchor)
+            box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
         taken.append(box)
         write(draw, at, short, size=size, bold=not far, colour=colour, anchor=anchor, halo=2)
 

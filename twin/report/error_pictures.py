@@ -6,21 +6,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from io import BytesIO
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.special import chdtri
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
-from puncture_twin.twin.report.palette import PNG_LEVEL
+from puncture_twin.twin.report.figures import png, write_png
 
 WIDTH_INCHES, HEAD_INCHES, ROW_INCHES, DPI = 13.2, 1.6, 0.25, 110
 LEAST_ROWS = 16
@@ -42,16 +39,15 @@ def draw_budget(facts: Mapping[str, Any], path: Path) -> None:
         facts: As ``register --json`` has them under ``budget``.
         path: The PNG to write; it appears whole or not at all.
     """
-    with atomic(path) as temporary:
-        temporary.write_bytes(budget_png(facts))
+    write_png(_budget(facts), path)
 
 
 def budget_png(facts: Mapping[str, Any]) -> bytes:
-    """The picture as a PNG.
+    """The picture as a PNG, of facts as of `draw_budget`."""
+    return png(_budget(facts))
 
-    Args:
-        facts: As of `draw_budget`.
-    """
+
+def _budget(facts: Mapping[str, Any]) -> Figure:
     inches = (WIDTH_INCHES, HEAD_INCHES + ROW_INCHES * max(LEAST_ROWS, len(facts["changes"])))
     figure = Figure(figsize=inches, dpi=DPI, facecolor="white", layout="constrained")
     sources, what_if = figure.subplots(1, 2)
@@ -63,10 +59,7 @@ def budget_png(facts: Mapping[str, Any]) -> bytes:
         f"{best['expected_mm']:.2f} mm",
         fontsize=11.5,
     )
-    FigureCanvasAgg(figure)
-    held = BytesIO()
-    figure.savefig(held, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
-    return held.getvalue()
+    return figure
 
 
 def _sources(axes: Axes, facts: Mapping[str, Any]) -> None:
@@ -158,9 +151,7 @@ def draw_rooms_picture(found: Any, path: Path) -> None:
         f"ellipsoid; rms {found.realised_rms_mm:.2f} mm, predicted {found.predicted_rms_mm:.2f} mm",
         fontsize=11.5,
     )
-    with atomic(Path(path)) as temporary:
-        FigureCanvasAgg(figure)
-        figure.savefig(temporary, format="png", pil_kwargs={"compress_level": PNG_LEVEL})
+    write_png(figure, path)
 
 
 def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int, int], names: tuple[str, str]) -> None:

@@ -7,10 +7,8 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TextIO
 
-from puncture_twin.twin.report.pace import Pace, duration_text, step_text
-
 if TYPE_CHECKING:
-    from puncture_twin.twin.report.progress_bars import BarDisplay
+    from rich.progress import TaskID
 
 LINE_EVERY_S = 5.0
 """In a log one line in this time says enough."""
@@ -21,11 +19,7 @@ LONG_S = 3.0
 def progress_display(stream: TextIO | None = None) -> BarDisplay | LineDisplay:
     """Bars where a person watches, lines where a file does."""
     stream = stream or sys.stderr
-    if not stream.isatty():
-        return LineDisplay(stream)
-    from puncture_twin.twin.report.progress_bars import BarDisplay  # here: a log does not wait for its library
-
-    return BarDisplay(stream)
+    return BarDisplay(stream) if stream.isatty() else LineDisplay(stream)
 
 
 class LineDisplay:
@@ -67,3 +61,100 @@ class LineDisplay:
             self._last = time.monotonic()
             self._stream.write(line + "\n")
             self._stream.flush()
+
+
+class BarDisplay:
+    """A `puncture_twin.planning.base.progress.Watcher` that draws bars with rate and remaining time."""
+
+    def __init__(self, stream: TextIO) -> None:
+        from rich.console import Console  # here: a log does not wait for it
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[far]}"),
+            TimeElapsedColumn(),
+            console=Console(file=stream),
+            transient=True,
+        )
+        self._tasks: dict[str, TaskID] = {}
+        self._pace = Pace()
+
+    def __enter__(self) -> Self:
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def step(self, stage: str, what: str) -> None:
+        """Name what a stage is at."""
+        self._bars.update(self._task(stage, None), advance=1, description=f"{stage}: {step_text(what)}")
+
+    def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
+        """Show how far a stage is."""
+        far = self._pace.text(stage, done, total, failed)
+        self._bars.update(self._task(stage, total), completed=done, total=total, far=far)
+
+    def note(self, line: str) -> None:
+        """Write a line above the bars."""
+        self._bars.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    def _task(self, stage: str, total: int | None) -> TaskID:
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task(stage, total=total, far="")
+        return self._tasks[stage]
+
+
+LEAST_TIME_S = 0.5
+"""Of a rate: with less behind it, it says nothing."""
+
+USUALLY_S = {"map": 1.0, "scene": 1.0, "slices": 1.0, "page": 1.0, "rehearsal": 2.0, "film": 3.0}
+"""Stages that take about as long for every case, on two cores; others count, or depend on what there is to read."""
+
+
+def rate_text(per_second: float) -> str:
+    """A rate in the unit in which it is at least 1, if any is."""
+    for seconds, unit in ((1.0, "s"), (60.0, "min")):
+        if per_second * seconds >= 1.0:
+            return f"{per_second * seconds:,.0f}/{unit}"
+    return f"{per_second * 3600.0:,.1f}/h"
+
+
+def duration_text(seconds: float) -> str:
+    """How long something takes, in the unit that a person would choose."""
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
+
+
+class Pace:
+    """How fast a stage is, since its first count, or since it began anew."""
+
+    def __init__(self) -> None:
+        self._since: dict[str, tuple[float, int, int]] = {}
+        self._last: dict[str, int] = {}
+
+    def text(self, stage: str, done: int, total: int, failed: int) -> str:
+        """How many are done of how many, how many of them failed; rate and time left, with time behind them."""
+        began, first, of = self._since.get(stage, (0.0, 0, -1))
+        if of != total or done < self._last[stage]:
+            began, first = time.monotonic(), done
+            self._since[stage] = began, first, total
+        self._last[stage] = done
+        failures = f", {failed} failed" if failed else ""
+        return f"{done:,}/{total:,}{failures}{_rate_text(done - first, time.monotonic() - began, total - done)}"
+
+
+def _rate_text(done: int, seconds: float, left: int) -> str:
+    if done <= 0 or seconds < LEAST_TIME_S:
+        return ""
+    return f", {rate_text(done / seconds)}, {duration_text(left * seconds / done)} left"
+
+
+def step_text(what: str) -> str:
+    """A thing that a stage has come to, with what it usually takes where no count tells how far it is."""
+    return f"{what}, usually {duration_text(USUALLY_S[what])}" if what in USUALLY_S else what

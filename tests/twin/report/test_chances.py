@@ -12,7 +12,7 @@ from puncture_twin.planning.search.uncertainty_breakdown import Goal, Remedy, Un
 from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
 from puncture_twin.twin.report.error_pictures import draw_rooms_picture, needle_frame
-from puncture_twin.twin.report.map.chance_layer import chance_raster, touch_nothing
+from puncture_twin.twin.report.map.map_disc import chance_raster, touch_nothing
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import map_raster
 from puncture_twin.twin.report.map_view import map_view

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import report_world as world
+from matplotlib.text import Text
 from PIL import Image
 
 from puncture_twin.planning.base.reasons import REASON_TEXT, UNSEEN_AIR_TEXT, Reason
 from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.twin.report.canvas import Canvas
-from puncture_twin.twin.report.map.map_picture import draw_map
+from puncture_twin.twin.report.map.map_disc import RINGS_CLEAR, ring_labels
+from puncture_twin.twin.report.map.map_picture import draw_map, map_figure
 from puncture_twin.twin.report.map.map_raster import (
     HATCH,
     HATCH_AIR,
@@ -52,30 +53,30 @@ def with_clearance(found, mm):
     return replace(found, clearance=replace(found.clearance, distance=distance, least=distance.min(axis=1)))
 
 
-def written(monkeypatch, found, case, path):
+def written(found, case):
     """All that the picture of these directions says."""
-    said, write = [], Canvas.write
-    monkeypatch.setattr(
-        Canvas,
-        "write",
-        lambda canvas, at, text, *look, **more: said.append(text) or write(canvas, at, text, *look, **more),
-    )
-    draw_map(found, case, path)
-    assert Image.open(path).size[0] > 1000
-    return said
+    return [text.get_text() for text in map_figure(found, case).findobj(Text)]
 
 
-def test_where_nobody_looked_is_not_the_skin(monkeypatch, case, candidates, tmp_path):
+def test_the_same_map_is_the_same_file(case, candidates, tmp_path):
+    """Sets of files are known by their hashes: no date, and no name of a program that may be a newer one tomorrow."""
+    for name in ("one.png", "two.png"):
+        draw_map(candidates, case, tmp_path / name)
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    assert Image.open(tmp_path / "one.png").info.keys() <= {"dpi"}
+
+
+def test_where_nobody_looked_is_not_the_skin(case, candidates):
     """The region says that it is unknown and not seen; the rib beside it is named as it was."""
-    said = written(monkeypatch, candidates, case, tmp_path / "map.png")
+    said = written(candidates, case)
     assert "unknown:\nnot seen" in said and "rib right 9" in said and "skin" not in said
 
 
-def test_an_unknown_structure_says_that_it_is_unknown(monkeypatch, case, candidates, tmp_path):
+def test_an_unknown_structure_says_that_it_is_unknown(case, candidates):
     """One that nobody named is written as unknown, not as an organ that forbids."""
     rib = candidates.verdict.reason == "too_close"
     verdict = replace(candidates.verdict, reason=np.where(rib, "unknown_region", candidates.verdict.reason))
-    said = written(monkeypatch, replace(candidates, verdict=verdict), case, tmp_path / "map.png")
+    said = written(replace(candidates, verdict=verdict), case)
     assert "unknown:\nrib right 9" in said and "rib right 9" not in said
 
 
@@ -92,14 +93,26 @@ def test_text_and_page_say_that_it_was_not_seen(case, candidates):
     ("clearance", "said"),
     [(68.5, "safe, least clearance 68.5 mm everywhere"), (np.inf, "safe, no structure has a margin")],
 )
-def test_one_clearance_is_one_shade_and_no_scale(monkeypatch, case, candidates, tmp_path, clearance, said):
+def test_one_clearance_is_one_shade_and_no_scale(case, candidates, clearance, said):
     """No bar from 68.5 to 68.5 mm, and none from 0 to 1 where nothing has a margin."""
     even = with_clearance(candidates, clearance)
     assert len(np.unique(row_colours(even)[even.safe], axis=0)) == 1
-    texts = written(monkeypatch, even, case, tmp_path / "map.png")
+    texts = written(even, case)
     assert said in texts and not [text for text in texts if text.endswith("by least clearance")]
-    texts = written(monkeypatch, candidates, case, tmp_path / "map.png")
+    texts = written(candidates, case)
     assert {"5.0 mm", "11.5 mm", "safe, by least clearance"} <= set(texts)
+
+
+def test_no_mark_stands_on_the_angle_of_a_ring(case, candidates):
+    """Where a mark lies on one, all are written along another azimuth; where marks are everywhere, as usual."""
+    view = map_view(case, candidates)
+    usual = ring_labels(view, np.zeros((0, 2)))
+    mark = np.array([[usual[1].x + 0.02, usual[1].y]])
+    moved = ring_labels(view, mark)
+    assert [label.text for label in moved] == [label.text for label in usual]
+    assert min(np.hypot(label.x - mark[0, 0], label.y - mark[0, 1]) for label in moved) > RINGS_CLEAR
+    everywhere = np.stack(np.meshgrid(*[np.linspace(-1, 1, 60)] * 2), axis=-1).reshape(-1, 2)
+    assert ring_labels(view, everywhere) == usual
 
 
 def front_of(found, rows):
@@ -131,10 +144,10 @@ def test_one_direction_is_one_dot(case, candidates):
     assert len(shown.rows) == 1 and shown.text == "Pareto front"
 
 
-def test_a_needle_through_a_structure_crosses_it(monkeypatch, case, candidates, tmp_path):
+def test_a_needle_through_a_structure_crosses_it(case, candidates):
     """Nobody reads of a distance below zero: not beside the map, and not in the reason; a touch is none yet."""
     through = with_clearance(candidates, -0.6)
-    texts = written(monkeypatch, through, case, tmp_path / "map.png")
+    texts = written(through, case)
     box = next(text for text in texts if text.startswith("Best"))
     assert "\ncrosses rib right 9" in box and "nearest" not in box
     row = int(np.flatnonzero(candidates.verdict.reason == "too_close")[0])
@@ -147,21 +160,15 @@ def test_a_needle_through_a_structure_crosses_it(monkeypatch, case, candidates, 
     )
 
 
-def test_a_legends_text_ends_before_its_number(monkeypatch, case, candidates, tmp_path):
+def test_a_legends_text_ends_before_its_number(monkeypatch, case, candidates):
     """A long name ran into 27,164: whatever the words and the count, there is white between them."""
-    drawn, write = [], Canvas.write
-    monkeypatch.setattr(
-        Canvas,
-        "write",
-        lambda canvas, at, text, look, **more: drawn.append((*at, text, look)) or write(canvas, at, text, look, **more),
-    )
-    monkeypatch.setattr("puncture_twin.twin.report.map.map_side.reason_counts", lambda _: LONG_LEGEND)
-    draw_map(candidates, case, tmp_path / "map.png")
+    monkeypatch.setattr("puncture_twin.twin.report.map.map_picture.reason_counts", lambda _: LONG_LEGEND)
+    drawn = map_figure(candidates, case).findobj(Text)
     for entry in LONG_LEGEND:
-        number = next(item for item in drawn if item[2] == f"{entry.count:,}")
-        words = next(item for item in drawn if item[2].replace("\n", " ") == entry.text)
-        assert words[1] == number[1]
-        assert words[0] + words[3].width(words[2]) + 5 < number[0] - number[3].width(number[2])
+        number = next(text for text in drawn if text.get_text() == f"{entry.count:,}")
+        words = next(text for text in drawn if text.get_text().replace("\n", " ") == entry.text)
+        assert words.get_position()[1] == number.get_position()[1]
+        assert words.get_window_extent().x1 + 5 < number.get_window_extent().x0
 
 
 LONG_LEGEND = (

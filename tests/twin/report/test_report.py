@@ -25,8 +25,8 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import ring_weights
 from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate
-from puncture_twin.twin.report.map.map_picture import draw_map
-from puncture_twin.twin.report.map.map_raster import HATCH, disc_pixels, map_raster
+from puncture_twin.twin.report.map.map_picture import DISC, draw_map
+from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
 from puncture_twin.twin.report.numbers import reason_counts
 from puncture_twin.twin.report.page import page as page_slices, page_scene as lighter_mesh
@@ -200,7 +200,9 @@ def test_a_pixel_has_the_colour_of_its_reason(case, theta_max):
 
 def map_pixel(image, view, theta_deg, beta_deg):
     """The colour of the finished picture at a direction, found from the layout of the figure."""
-    column, line = disc_pixels(view.place(np.radians(theta_deg), np.radians(beta_deg)))
+    left, low, wide, high = DISC
+    x, y = (view.place(np.radians(theta_deg), np.radians(beta_deg)) + 1) / 2
+    column, line = (left + x * wide) * image.width, (1 - low - y * high) * image.height
     return image.getpixel((int(column), int(line)))
 
 

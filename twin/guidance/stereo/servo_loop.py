@@ -15,8 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
-from puncture_twin.planning.motion.approach import FINER, RESOLUTION_RAD
-from puncture_twin.planning.motion.path_check import dense_states, first_contact
+from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ServoStop, StepLimits, servo_step
 
 DIVERGING_RATIO = 1.5

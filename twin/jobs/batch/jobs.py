@@ -54,7 +54,6 @@ from puncture_twin.planning.batch.workers import Limits
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.jobs.batch.page import write_cohort_page
-from puncture_twin.twin.jobs.patient.pictures import with_pictures
 from puncture_twin.twin.jobs.patient.run import Run
 
 PLAN_ENTRY = "batch plan"
@@ -175,6 +174,8 @@ def _elsewhere(scheduler: str | None) -> RunTasks | None:
 
 def write_case_page(context: CaseContext, candidates: Candidates, folder: Path) -> None:
     """A case's map, scene, slices and page, as `search` writes them."""
+    from puncture_twin.twin.jobs.patient.pictures import with_pictures  # with matplotlib
+
     with_pictures(Run(context, candidates, ()), folder)
 
 

@@ -1,12 +1,12 @@
 """``cohort.html``: failures first, then distributions, then a sortable table; one page that needs no network.
 
-How one number is distributed over the cases, as a small picture of lines and text that a page holds.
+How one number is distributed over the cases, as a small picture that the page holds.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ from puncture_twin.planning.batch.merge import NO_SAFE, NOT_RUN
 from puncture_twin.planning.search.candidates import ARM_CHECKED
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.report.numbers import number
-from puncture_twin.twin.report.page.page_tables import inputs_table, joined, table
-from puncture_twin.twin.report.page.template import Card, packed, script_json, write_html
+from puncture_twin.twin.report.page.page_tables import inputs_table, table
+from puncture_twin.twin.report.page.template import Card, packed, png_address, script_json, write_html
 
 Row = Mapping[str, Any]
 
@@ -148,53 +148,35 @@ def _shown(value: float | None, digits: int) -> str:
 
 
 BARS = 30
-WIDTH, HEIGHT, LEFT, TOP, BOTTOM = 460, 220, 46, 34, 36
-"""Of the picture and its edges, in its own units."""
+WIDTH, HEIGHT, SHARP = 460, 220, 2
+"""Of the picture on the page, and how much finer it is, for sharp screens."""
 
 
 def histogram(values: Sequence[float], text: str) -> Markup:
-    """An SVG with the count of cases over a number.
+    """A picture of the count of cases over a number.
 
     Args:
         values: At least one, finite.
         text: What it is, with its unit.
     """
-    counts, edges = np.histogram(np.asarray(values, dtype=np.float64), BARS)
+    from matplotlib.ticker import MaxNLocator  # here: a cohort is searched without it
+
+    from puncture_twin.twin.report.figures import PIXEL_DPI, figure_of, png
+
     head = f"{text}: {len(values)} case{'s' if len(values) != 1 else ''}, median {_plain(float(np.median(values)))}"
-    bars = joined(
-        '<rect x="{}" y="{}" width="{}" height="{}" fill="#00684a"><title>{}</title></rect>', _bars(counts, edges)
-    )
-    form = (
-        '<svg viewBox="0 0 {} {}" role="img" aria-label="{}"><text x="{}" y="18" font-weight="600">{}</text>{}{}</svg>'
-    )
-    return Markup(form).format(WIDTH, HEIGHT, head, LEFT, head, _axes(int(counts.max()), edges), bars)
+    figure = figure_of(WIDTH * SHARP, HEIGHT * SHARP, dpi=PIXEL_DPI * SHARP)
+    axes = figure.add_axes((0.1, 0.19, 0.87, 0.68))
+    axes.hist(values, BARS, color="#00684a", rwidth=0.92)
+    axes.set_title(head, fontsize=11, weight="bold", loc="left")
+    axes.set_xlabel(text, fontsize=10)
+    axes.set_ylabel("cases", fontsize=10)
+    axes.tick_params(labelsize=9)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.ticklabel_format(style="plain", useOffset=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    return Markup('<img src="{}" alt="{}" style="width:100%">').format(png_address(png(figure)), head)
 
 
 def _plain(value: float) -> str:
     """A number without an exponent, to three digits or more."""
     return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
-
-
-def _bars(counts: np.ndarray, edges: np.ndarray) -> Iterator[tuple[str, ...]]:
-    step, high = (WIDTH - LEFT) / BARS, HEIGHT - TOP - BOTTOM
-    for bar, count in enumerate(counts):
-        tall = high * count / counts.max()
-        label = f"{_plain(edges[bar])} to {_plain(edges[bar + 1])}: {count}"
-        left, top = LEFT + bar * step + 0.5, HEIGHT - BOTTOM - tall
-        yield f"{left:.1f}", f"{top:.1f}", f"{step - 1:.1f}", f"{tall:.1f}", label
-
-
-def _axes(most: int, edges: np.ndarray) -> Markup:
-    """The base line with three numbers, and the greatest count."""
-    base = HEIGHT - BOTTOM
-    line = Markup('<line x1="{}" y1="{}" x2="{}" y2="{}" stroke="#5b616b"/>').format(LEFT, base, WIDTH, base)
-    middle = (edges[0] + edges[-1]) / 2
-    marks = [
-        (LEFT, base + 18, "start", _plain(edges[0])),
-        ((LEFT + WIDTH) // 2, base + 18, "middle", _plain(middle)),
-        (WIDTH, base + 18, "end", _plain(edges[-1])),
-        (LEFT - 6, TOP + 10, "end", str(most)),
-        (LEFT - 6, base, "end", "0"),
-    ]
-    cells = ((str(x), str(y), anchor, text) for x, y, anchor, text in marks)
-    return line + joined('<text x="{}" y="{}" text-anchor="{}" fill="#5b616b">{}</text>', cells)

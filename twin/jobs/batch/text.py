@@ -12,7 +12,7 @@ import numpy as np
 from puncture_twin.planning.batch.merge import CaseChange, Comparison
 from puncture_twin.planning.batch.run import CohortState, RunCounts
 from puncture_twin.twin.jobs.batch.jobs import Merged, PlanRun, estimate_summary
-from puncture_twin.twin.report.pace import duration_text
+from puncture_twin.twin.report.progress import duration_text
 
 MOST_LINES = 10
 """Of a list; the rest is counted. ``--json`` has all."""

@@ -452,30 +452,34 @@ def draw_scan(image: CtImage, shown: Shown, path: Path) -> Path:
     x0, y0, z = apply(T, np.array([-0.5, -0.5, k]))
     from matplotlib.figure import Figure
 
+    from puncture_twin.twin.report.figures import halo, write_png
+
+    rim = halo(3, "black")  # on bone the marks are seen by it
     figure = Figure(figsize=(INCHES, INCHES * ny * dy / (nx * dx) + 0.6), dpi=DPI)
     ax = figure.add_axes((0.09, 0.1, 0.89, 0.82))
     extent = (x0, x0 + nx * dx, y0 + ny * dy, y0)
     low, high = WINDOW_HU
     ax.imshow(image.hu[:, :, k].T, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="nearest")
-    ax.plot(*shown.target[:2], "+", color=GREEN, markersize=12, label="target")
+    ax.plot(*shown.target[:2], "+", color=GREEN, markersize=12, label="target", path_effects=rim)
     if shown.needle is not None:
         _draw_needle(ax, shown.needle, shown.length_mm)
     if shown.markers is not None:
-        _draw_markers(ax, shown.markers, z)
+        _draw_markers(ax, shown.markers, z, rim)
     ax.legend(loc="upper left", fontsize=8)
     ax.set(xlabel="x, mm (patient's left to the right)", ylabel="y, mm (front above)")
     ax.set_title(f"slice {k + 1} of {nz}, z {z:.1f} mm; simulated", fontsize=10)
     ax.set_xlim(extent[:2])
     ax.set_ylim(extent[2:])
-    figure.savefig(path)
+    write_png(figure, path)
     return path
 
 
-def _draw_markers(ax: Axes, markers: NamedPoints, z: float) -> None:
+def _draw_markers(ax: Axes, markers: NamedPoints, z: float, rim: list[Any]) -> None:
     """The names of those that the slice shows."""
     for name, point in zip(markers.names, markers.points, strict=True):
         if abs(point[2] - z) <= NEAR_MM:
-            ax.annotate(name, point[:2], xytext=(0, 8), textcoords="offset points", color=YELLOW, ha="center")
+            text = ax.annotate(name, point[:2], (0, 8), textcoords="offset points", color=YELLOW, ha="center")
+            text.set_path_effects(rim)
 
 
 def _draw_needle(ax: Axes, needle: FoundNeedle, length_mm: float) -> None:

@@ -23,8 +23,6 @@ from puncture_twin.planning.init.start import ALLOWED, Request, Start, start_cas
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.sides import grid_of, sides_text
 from puncture_twin.twin.jobs.patient.run import SLICES
-from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
-from puncture_twin.twin.report.slices.subject import Subject
 
 CASE = "case.toml"
 
@@ -100,6 +98,9 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
     picture = None if context.anatomy.scan is None else folder / SLICES
     if picture is not None:
+        from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet  # with matplotlib
+        from puncture_twin.twin.report.slices.subject import Subject
+
         write_sheet(draw_slices(Subject(context.case, context.anatomy, None)), picture)
     return InitRun(path, replace(start, text=text), context, (*start.notes, *found), picture)
 

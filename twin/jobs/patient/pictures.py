@@ -21,6 +21,7 @@ from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.budget import budget_facts
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
+from puncture_twin.twin.report.error_pictures import draw_budget
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map_view import map_view
@@ -101,8 +102,6 @@ def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:
     Raises:
         InputError: Not a PNG's name, no budget to draw, or a folder or file that cannot be written.
     """
-    from puncture_twin.twin.report.error_pictures import draw_budget  # with matplotlib
-
     _check_png(path)
     budget = report.get("budget")
     if budget is None:

@@ -28,8 +28,6 @@ from puncture_twin.planning.search.constraints import ArmReach, with_reach
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.search import organ_candidates
-from puncture_twin.twin.report.map.map_picture import draw_map
-from puncture_twin.twin.report.map.placement_picture import draw_placements
 from puncture_twin.twin.report.numbers import direction_text, mounting_text
 
 
@@ -96,10 +94,14 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> Place
     write_place_document(document, out / "place.json")
     files = [out / "placements.csv", out / "place.json"]
     if pictures:
+        from puncture_twin.twin.report.map.placement_picture import draw_placements  # with matplotlib
+
         with stages.time("pictures"):
             draw_placements(found, case, context.anatomy.skin.mesh, out / "placements.png")
             files.append(out / "placements.png")
     if pictures and any(one.verdict.reached for one in found.rated):
+        from puncture_twin.twin.report.map.map_picture import draw_map
+
         T_base_ct = mount_pose(found.rated[0].mount, case.space, case.path)
         with stages.time("map"):
             reach = ArmReach(case_checker(case, context.anatomy, T_base_ct), np.asarray(T_base_ct))

@@ -13,7 +13,6 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.base.arrays import Floats, Pixels
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import pose
@@ -25,7 +24,7 @@ from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.summaries import SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import head_pose, needle_tool, phantom_mesh, probe_tool, table_box
 from puncture_twin.twin.report import palette
-from puncture_twin.twin.report.annotate import width_of, write
+from puncture_twin.twin.report.annotate import width_of, write, write_image
 from puncture_twin.twin.report.raster.camera import camera_around
 from puncture_twin.twin.report.raster.compositing import compose
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, shells_of
@@ -77,8 +76,7 @@ def detection_sheet(case: SelfcalCase, trial: SelfcalTrial, path: Path) -> Path:
         corner = ((i % columns) * cell[0] + MARGIN, (i // columns) * cell[1] + MARGIN)
         _draw_panel(sheet, draw, panel, imager, corner, (width, height))
     _draw_legend(draw, rows * cell[1])
-    with atomic(path) as temporary:
-        sheet.save(temporary)
+    write_image(sheet, path)
     return path
 
 
@@ -199,8 +197,7 @@ def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path:
     for text, point in anchors.items():
         column, row, _ = camera.project(point[None])[0]
         write(draw, (column, row + 26), text, size=17, bold=True, anchor="mm", halo=3)
-    with atomic(path) as temporary:
-        picture.save(temporary)
+    write_image(picture, path)
     return path
 
 

@@ -7,21 +7,20 @@ from pathlib import Path
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.twin.guidance.stereo.ball.ball_image import render
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
 from puncture_twin.twin.guidance.stereo.session import Reached, Session
-from puncture_twin.twin.report.annotate import INK, write
+from puncture_twin.twin.report.annotate import INK, write, write_image
+from puncture_twin.twin.report.figures import halo, write_png
 from puncture_twin.twin.world.workcell import load_ball, open_workcell, pinhole_picture
 
 BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)
@@ -47,8 +46,7 @@ def draw_cameras(session: Session, path_of: Path) -> list[Path]:
         picture = picture.resize((WIDTH_PX, round(camera.height * scale)), Image.Resampling.LANCZOS)
         _annotate(picture, session, reached, number, scale)
         path = path_of / f"camera_{number + 1}.png"
-        with atomic(path) as temporary:
-            picture.save(temporary)
+        write_image(picture, path)
         paths.append(path)
     return paths
 
@@ -138,8 +136,7 @@ def _inset(picture: Image.Image, session: Session, reached: Reached, number: int
 
 def draw_convergence(session: Session, path: Path) -> None:
     """Write the plot: true distance from ball to estimated target at each look, and what the cameras saw."""
-    figure = Figure(figsize=(9.0, 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(9.0, 5.2), dpi=120, layout="constrained")
     axes = figure.add_subplot()
     axes.set_prop_cycle(color=[colormaps["tab20"](k) for k in range(20)])
     longest = 1
@@ -153,14 +150,14 @@ def draw_convergence(session: Session, path: Path) -> None:
         (line,) = axes.plot(looks, true, "-", linewidth=1.2, label=one.target)
         axes.plot(looks, one.servoed.errors_mm, "o", color=line.get_color(), markersize=4)
     _finish(axes, session, longest)
-    with atomic(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+    write_png(figure, path)
 
 
 def _finish(axes: Axes, session: Session, longest: int) -> None:
     tolerance = session.workcell.case.file.servo.tolerance_mm
     axes.axhline(tolerance, color="#d6001e", linewidth=1)
-    axes.annotate(f"tolerance {tolerance:g} mm", (longest, tolerance), ha="right", va="bottom", color="#d6001e")
+    text, look = f"tolerance {tolerance:g} mm", {"ha": "right", "va": "bottom"}
+    axes.text(longest, tolerance, text, look, color="#d6001e", path_effects=halo(3))
     axes.set_yscale("log")
     for axis_format in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         axis_format("{x:g}")

@@ -1,57 +1,73 @@
-"""``map.png``: every entry direction, seen from outside, with the reason for each refusal."""
+"""``map.png``: every entry direction, seen from outside, with the reason for each refusal.
+
+Beside the disc a column: what its colours and marks mean, and the chosen direction in numbers.
+"""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
-from scipy import ndimage
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.text import Text
 
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
-from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.search.candidates import Candidates, Verdict
+from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, Reason, Rgb, css
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
-from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
-from puncture_twin.twin.report.canvas import BLACK, Canvas, Halo, Words, circle
-from puncture_twin.twin.report.map.chance_layer import chance_picture, mark_dot, mark_ring, mark_star
-from puncture_twin.twin.report.map.map_raster import (
-    HEIGHT,
-    MIDDLE,
-    POINT,
+from puncture_twin.planning.search.uncertainty_breakdown import chance_text
+from puncture_twin.twin.report.figures import figure_of, write_png
+from puncture_twin.twin.report.map.map_disc import (
+    BEST,
+    CHOSEN,
+    DPI,
+    FRONT,
+    HATCH_INK,
+    HATCHES,
+    LEVELS,
     RADIUS,
-    RINGS_AT,
-    Label,
+    STYLES,
+    draw_disc,
+    touch_nothing,
+)
+from puncture_twin.twin.report.map.map_raster import (
+    HATCH,
+    HATCH_AIR,
+    SCALE_DIGITS,
+    ClearanceScale,
     MapRaster,
-    disc_pixels,
+    clearance_scale,
     map_raster,
-    ring_radii,
     shown_front,
 )
-from puncture_twin.twin.report.map.map_side import draw_side
 from puncture_twin.twin.report.map_view import BEYOND, MapView, map_view, step_of
-from puncture_twin.twin.report.numbers import needle_text, target_text
-from puncture_twin.twin.report.palette import PNG_LEVEL
+from puncture_twin.twin.report.numbers import (
+    ReasonCount,
+    arm_text,
+    nearest_text,
+    needle_text,
+    number,
+    percent,
+    reason_counts,
+    target_text,
+)
+from puncture_twin.twin.report.palette import safe_shades
 
-WIDTH = 1690
+WIDTH, HEIGHT = 1690, 1222
 
-BORDER_OPACITY = 0.45
-"""Of the lines between regions of different structures."""
+DISC = ((583 - RADIUS) / WIDTH, 1 - (642 + RADIUS) / HEIGHT, 2 * RADIUS / WIDTH, 2 * RADIUS / HEIGHT)
+SIDE_WIDE, SIDE_HIGH = 515, 1039
+SIDE = (1158 / WIDTH, 1 - (122 + SIDE_HIGH) / HEIGHT, SIDE_WIDE / WIDTH, SIDE_HIGH / HEIGHT)
+"""Of the picture: left, lower edge, width and height of the disc and of the column beside it; labels stand around the
+disc."""
 
-RIM_LABEL = 0.95
-"""Of the disc's radii: the angle of a ring at the rim stands there, not over the line."""
-
-RIM_HALO = Halo(1.6 * POINT)
-NAME = Words(9 * POINT, "slanted", halo=RIM_HALO)
-RING = Words(9 * POINT, halo=RIM_HALO)
-AZIMUTH = Words(9 * POINT, colour=(64, 64, 64))
-DIRECTION = Words(14 * POINT, "bold")
-TITLE, SUBTITLE = Words(19 * POINT, "bold"), Words(12 * POINT, colour=(64, 64, 64))
-NOTICE = Words(9 * POINT, colour=(102, 102, 102))
+SMALL = 9.5
+"""Points: letters of the column."""
 
 
 def draw_map(
@@ -66,203 +82,209 @@ def draw_map(
         pick: The planned candidate, or the one to be shown; None shows the best.
         raster: The map's pixels where somebody has them already.
     """
+    write_png(map_figure(candidates, case, pick, raster), path)
+
+
+def map_figure(candidates: Candidates, case: Any, pick: Pick | None = None, raster: MapRaster | None = None) -> Figure:
+    """The map, arguments as of `draw_map`; the disc is the first of its axes, the column the second."""
     pick = pick or best_pick(candidates)
     view = map_view(case, candidates)
+    figure = figure_of(WIDTH, HEIGHT, dpi=DPI)
     raster = map_raster(candidates, view) if raster is None else raster
-    codes, names = region_codes(candidates.verdict, raster.rows)
-    canvas = Canvas(WIDTH, HEIGHT)
-    _disc(canvas, _lined(raster, candidates, codes))
-    _frame(canvas, view)
-    chances = chance_picture(candidates, raster.rows, 2 * RADIUS)
-    if chances is not None:
-        _disc(canvas, chances)
-    bests = [window.best for window in find_windows(candidates).windows[:MOST_WINDOWS]]
-    rings = _ring_labels(view)
-    for x, y, text in rings:
-        canvas.write(tuple(disc_pixels((x, y))), text, RING, anchor="mm")
-    for x, y, text in region_labels(codes, names, [*rings, *_best_labels(view, candidates, bests)]):
-        canvas.write(tuple(disc_pixels((x, y))), text, NAME, anchor="mm")
-    _marks(canvas, view, candidates, bests, pick)
-    _title(canvas, case, candidates)
-    draw_side(canvas, candidates, view, pick)
-    with atomic(Path(path)) as temporary:
-        canvas.image.convert("RGB").save(temporary, format="PNG", compress_level=PNG_LEVEL)
-
-
-def _disc(canvas: Canvas, rgba: NDArray[np.uint8]) -> None:
-    """Lay a picture of the disc, as fine as it may be, where the disc is."""
-    size = 2 * RADIUS
-    shown = rgba if len(rgba) == size else _smaller(rgba, size)
-    canvas.paste(shown, round(MIDDLE[0]) - RADIUS, round(MIDDLE[1]) - RADIUS)
-
-
-def _smaller(rgba: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    return np.array(Image.fromarray(rgba).resize((size, size), Image.Resampling.HAMMING))
-
-
-def _lined(raster: MapRaster, candidates: Candidates, codes: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """The raster with lines between regions of different structures, and about what is safe."""
-    rgba = raster.rgba.copy()
-    between = _edges(codes, named=True)
-    rgba[between, :3] = np.round(rgba[between, :3] * (1 - BORDER_OPACITY))
-    around = _edges(np.append(candidates.safe, False)[raster.rows].astype(np.int64))
-    rgba[around] = (*BLACK, 255)
-    return rgba
-
-
-def _edges(values: NDArray[np.int64], *, named: bool = False) -> Bools:
-    """Pixels within one of where two values lie beside each other; where ``named``, of two that are not 0."""
-    marked = np.zeros(values.shape, dtype=bool)
-    for here, there, at in (
-        (values[:-1], values[1:], marked[:-1]),
-        (values[:, :-1], values[:, 1:], marked[:, :-1]),
-    ):
-        at |= (here != there) & ((here * there != 0) | (not named))
-    wide = marked.copy()
-    wide[1:] |= marked[:-1]
-    wide[:-1] |= marked[1:]
-    wider = wide.copy()
-    wider[:, 1:] |= wide[:, :-1]
-    wider[:, :-1] |= wide[:, 1:]
-    return wider
-
-
-def _frame(canvas: Canvas, view: MapView) -> None:
-    """Rings, spokes and what lies beyond the rim."""
-    for ring, radius in ring_radii(view):
-        wide = 1.6 if ring == 90 and view.theta_max > BEYOND else 0.7
-        canvas.line(circle(MIDDLE, radius * RADIUS, 180), wide * POINT, BLACK, opacity=0.45)
-    canvas.line(circle(MIDDLE, RADIUS, 360), 1.2 * POINT, BLACK)
-    for beta in range(0, 360, 30):
-        angle = np.radians(beta) + view.turn
-        spoke = np.array([np.cos(angle), np.sin(angle)])
-        canvas.line(disc_pixels(np.outer([0.0, 1.0], spoke)), 0.5 * POINT, BLACK, opacity=0.3)
-        canvas.line(disc_pixels(np.outer([1.0, 1.02], spoke)), POINT, BLACK)
-        canvas.write(tuple(disc_pixels(spoke * (1.085, 1.07))), f"β {beta}°", AZIMUTH, anchor="mm")
-    for text, angle in view.rim:
-        # Upright at the sides, so that long words stay in the picture.
-        side = abs(np.cos(angle)) > 0.8 and len(text) > 3
-        turned = (1 if np.cos(angle) < 0 else -1) if side else 0
-        where = disc_pixels((1.215 * np.cos(angle), 1.16 * np.sin(angle)))
-        canvas.write(tuple(where), text, DIRECTION, anchor="mm", turned=turned)
-
-
-def _ring_labels(view: MapView) -> list[Label]:
-    """The rings' angles; that of a ring at the rim stands within it."""
-    cosine, sine = float(np.cos(RINGS_AT)), float(np.sin(RINGS_AT))
-    radii = [(ring, min(radius, RIM_LABEL)) for ring, radius in ring_radii(view)]
-    return [Label(radius * cosine, radius * sine, f"θ {ring}°") for ring, radius in radii]
-
-
-def _best_labels(view: MapView, candidates: Candidates, bests: list[int]) -> list[Label]:
-    """The rings around the best of each window, each as large as two letters."""
-    return [Label(x, y, "OO") for x, y in view.place(candidates.theta[bests], candidates.beta[bests])]
-
-
-def _marks(canvas: Canvas, view: MapView, candidates: Candidates, bests: list[int], pick: Pick | None) -> None:
-    """The centre, the Pareto front, the best of each window, and the chosen direction."""
-
-    def places(rows: Any, of: Candidates = candidates) -> Any:
-        return disc_pixels(view.place(of.theta[rows], of.beta[rows]))
-
-    x, y = MIDDLE
-    canvas.segments(np.array([[(x - 8, y), (x + 8, y)], [(x, y - 8), (x, y + 8)]]), 1.2 * POINT, BLACK)
-    for place in places(shown_front(candidates, view).rows):
-        mark_dot(canvas, place)
-    for place in places(bests):
-        mark_ring(canvas, place)
-    if pick is not None:
-        mark_star(canvas, places([pick.row], pick.candidates)[0], 9.1 * POINT)
-
-
-def _title(canvas: Canvas, case: Any, candidates: Candidates) -> None:
-    left = 0.02 * WIDTH
-    canvas.write((left, 0.045 * HEIGHT), f"{case.name}: entry directions to {target_text(case)}", TITLE)
+    draw_disc(figure.add_axes(DISC), candidates, view, raster, pick)
+    _column(figure.add_axes(SIDE), candidates, view, pick)
+    title = f"{case.name}: entry directions to {target_text(case)}"
+    figure.text(0.02, 0.955, title, fontsize=19, weight="bold")
     line = f"{len(candidates):,} directions, step {np.degrees(step_of(candidates)):g}°;  {needle_text(case)}"
     if not candidates.arm_checked:
         line += ";  ARM NOT CHECKED"
-    canvas.write((left, 0.082 * HEIGHT), line, SUBTITLE)
-    notice = "research software, not a medical device"
-    canvas.write((0.985 * WIDTH, 0.988 * HEIGHT), notice, NOTICE, anchor="rs")
+    figure.text(0.02, 0.918, line, fontsize=12, color="0.25")
+    figure.text(0.985, 0.012, "research software, not a medical device", fontsize=9, color="0.4", ha="right")
+    return figure
 
 
-NAMED_FRACTION = 0.006
-"""Least fraction of the disc that a rejected region needs to carry its structure's name."""
-
-NOT_SEEN_HERE = "not seen"
-"""In a region whose directions leave what was scanned; the legend says how."""
-
-LETTER_HIGH, LETTER_WIDE = 0.7 * 9 * POINT, 0.29 * 9 * POINT
-"""Pixels: half the room of a line and of a letter; no two names lie over one another while there is room."""
-
-COARSE = 4
-"""Every so manyth pixel is looked at to find a name's place."""
-
-
-def region_codes(verdict: Verdict, rows: Ints) -> tuple[NDArray[np.int64], list[str]]:
-    """What is written over each pixel, as its place in a list of names, of which the first is empty.
-
-    Args:
-        verdict: Of every direction.
-        rows: Shape (n, n), the candidate under each pixel, -1 outside.
-    """
-    written = _region_names(verdict)
-    names = ["", *sorted(set(written) - {""})]
-    place = {name: i for i, name in enumerate(names)}
-    codes = np.array([*map(place.__getitem__, written), 0])
-    return codes[rows], names
+def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None) -> None:
+    """What the colours and marks mean, the chosen direction, and how to read the map; y 0..1 runs downwards."""
+    axes.set_axis_off()
+    axes.set(xlim=(0, 1), ylim=(1, 0), autoscale_on=False)
+    y = _legend(axes, reason_counts(candidates))
+    y = _scale(axes, candidates, y + 0.01)
+    y = _chance_legend(axes, candidates, y)
+    y = _mark_legend(axes, candidates, view, y + 0.05)
+    _chosen(axes, candidates, pick, y + 0.04)
+    whole = candidates.grid is None or (candidates.grid.full_circle and candidates.theta.min() < step_of(candidates))
+    outside = "" if whole else f"White with lines: {NOT_SEARCHED_TEXT}.\n"
+    toward = f"Centre (+), θ = 0: {view.centre}.\n" if view.centre else ""
+    if view.theta_max > BEYOND:
+        toward += "Beyond the thick ring (θ 90°) it comes from the far side.\n"
+    text = (
+        "HOW TO READ\nThe target is behind the centre; you look at the body\n"
+        "from OUTSIDE, along −z of the entry frame. A point is\n"
+        "where the needle comes from: θ grows from the centre\n"
+        "to the rim, β runs counter-clockwise.\n"
+        f"{outside}{toward}{textwrap.fill(arm_text(candidates), 52)}"
+    )
+    axes.text(0.0, 1.0, text, fontsize=SMALL, va="bottom", linespacing=1.4, color="0.25")
 
 
-def region_labels(codes: NDArray[np.int64], names: Sequence[str], written: Sequence[Label]) -> list[Label]:
-    """The names of all large enough regions, deep inside them and off what is written there."""
-    coarse = codes[::COARSE, ::COARSE]
-    free = np.ones(coarse.shape, dtype=bool)
-    for x, y, text in written:
-        _take(free, *_pixel(x, y, len(coarse)), *_half_size(text, len(coarse)))
-    labels = []
-    for depth, structure in _regions(coarse, names):
-        text = structure.replace("_", " ")
-        high, wide = _half_size(text, len(coarse))
-        space = np.where(ndimage.minimum_filter(free, (2 * high + 1, 2 * wide + 1)), depth, 0.0)
-        row, column = np.unravel_index(int(np.where(space.any(), space, depth).argmax()), depth.shape)
-        _take(free, int(row), int(column), high, wide)
-        x, y = (column + 0.5) / len(coarse) * 2 - 1, 1 - (row + 0.5) / len(coarse) * 2
-        labels.append(Label(float(x), float(y), text))
-    return labels
+MOST_LEGEND, LINE, GAP = 0.45, 0.0215, 0.6
+"""Heights: of the legend's entries together, of the column's; of a line; between two entries, of a line."""
+
+PATCH = 0.06
+"""Width of a patch of colour, of the column's."""
+
+TEXT_AT, COUNT_ENDS, GRID_ENDS, ENTRY, MOST_LETTERS = 0.085, 0.62, 0.79, 10.5, 19
+"""Of the legend's entries: where text begins and the numbers end; letters in points at most, and as many in a line."""
+
+PADDING = 0.018
+"""Between a text and its number at least, of the column's width."""
 
 
-def _region_names(verdict: Verdict) -> Texts:
-    """What is written over each direction, shape (n,): the structure that forbids it, or "unknown" and why."""
-    unknown = verdict.reason == Reason.UNKNOWN_REGION.value
-    named = np.where(verdict.reason == Reason.TOO_CLOSE.value, verdict.structure, "").astype(object)
-    whys = np.where(verdict.not_seen, NOT_SEEN_HERE, verdict.structure)
-    named[unknown] = [f"unknown:\n{why}" for why in whys[unknown]]
-    return np.asarray(named)
+def _legend(axes: Axes, counts: Sequence[ReasonCount]) -> float:
+    """A patch, a text and numbers for each reason; an entry of more lines is higher."""
+    for x, text in ((COUNT_ENDS, "directions"), (GRID_ENDS, "of grid"), (1.0, "of solid\nangle")):
+        axes.text(x, 0.012, text, fontsize=9, color="0.35", ha="right", va="bottom")
+    texts = [_words(axes, one) for one in counts]
+    heights = np.array([text.get_text().count("\n") + 1 + GAP for text in texts])
+    unit = min(LINE, MOST_LEGEND / float(heights.sum()))
+    ends = 0.022 + unit * np.cumsum(heights)
+    size = min(ENTRY, unit * SIDE_HIGH / 1.08 * 72 / DPI)
+    for one, words, y in zip(counts, texts, (ends - unit * heights / 2).tolist(), strict=True):
+        words.set(y=y, fontsize=size)
+        _patch(axes, y, 0.032 * min(1.0, unit / 0.015), one)
+        numbers = (f"{one.count:,}", percent(one.fraction), percent(one.solid_angle))
+        for x, value in zip((COUNT_ENDS, GRID_ENDS, 1.0), numbers, strict=True):
+            axes.text(x, y, value, fontsize=size, weight=words.get_fontweight(), ha="right", va="center")
+    return float(ends[-1])
 
 
-def _regions(codes: NDArray[np.int64], names: Sequence[str]) -> list[tuple[Floats, str]]:
-    """Large enough regions of one name, the largest first: how deep inside each pixel lies, and the name."""
-    found = []
-    for code, name in enumerate(names):
-        labels, _ = ndimage.label((codes == code) if name else np.zeros(codes.shape, dtype=bool))
-        areas = np.bincount(labels.ravel())[1:]
-        for part in np.flatnonzero(areas > NAMED_FRACTION * codes.size * np.pi / 4) + 1:
-            depth = ndimage.distance_transform_edt(np.pad(labels == part, 1))[1:-1, 1:-1]
-            found.append((float(areas[part - 1]), depth, name))
-    return [(depth, name) for _, depth, name in sorted(found, key=lambda region: -region[0])]
+def _words(axes: Axes, one: ReasonCount) -> Text:
+    """An entry's text, folded so that it ends before its number."""
+    look: dict[str, Any] = {"fontsize": ENTRY, "weight": "bold" if one.code == "safe" else "normal"}
+    count = axes.text(0.0, 0.0, f"{one.count:,}", **look)
+    room = COUNT_ENDS - TEXT_AT - PADDING - _width(count)
+    count.remove()
+    text = axes.text(TEXT_AT, 0.0, one.text, va="center", linespacing=1.15, **look)
+    for letters in range(MOST_LETTERS, 0, -1):
+        text.set_text(textwrap.fill(one.text, letters, break_long_words=False, break_on_hyphens=False))
+        if _width(text) <= room:
+            break
+    return text
 
 
-def _half_size(text: str, size: int) -> tuple[int, int]:
-    """Half the height and half the width of a name, in pixels of a square picture of the disc."""
-    scale, lines = size / (2 * RADIUS), text.split("\n")
-    return round(LETTER_HIGH * len(lines) * scale), round(LETTER_WIDE * max(map(len, lines)) * scale)
+def _width(text: Text) -> float:
+    """Of the column's width."""
+    return float(text.get_window_extent().width) / SIDE_WIDE
 
 
-def _pixel(x: float, y: float, size: int) -> tuple[int, int]:
-    """Row and column of a point of the disc (x right, y up) in a square picture of it."""
-    return round((1 - y) / 2 * size), round((1 + x) / 2 * size)
+def _patch(axes: Axes, y: float, high: float, one: ReasonCount) -> None:
+    """A reason's colour, with the lines that the map has over it."""
+    hatch, ink = "", (0, 0, 0)
+    if one.code == Reason.UNKNOWN_REGION.value:
+        hatch, ink = ("\\\\", HATCH_AIR) if one.colour == UNSEEN_AIR else ("//", HATCH)
+    _box(axes, y - high / 2, high, one.colour, hatch=hatch, ink=css(ink))
 
 
-def _take(free: Bools, row: int, column: int, high: int, wide: int) -> None:
-    """Mark a name's box about a pixel, half so high and wide, in place."""
-    free[max(0, row - high) : row + high + 1, max(0, column - wide) : column + wide + 1] = False
+def _box(
+    axes: Axes, y: float, high: float, ground: Rgb, x: float = 0.0, *, hatch: str = "", ink: Any = "black"
+) -> None:
+    """A patch of a colour below a height, hatched with an ink, in a black edge."""
+    lines = Rectangle((x, y), PATCH, high, facecolor=css(ground), edgecolor=ink, lw=0, hatch=hatch)
+    axes.add_patch(lines)
+    axes.add_patch(Rectangle((x, y), PATCH, high, fill=False, lw=0.8, clip_on=False))
+
+
+def _scale(axes: Axes, candidates: Candidates, y: float) -> float:
+    """The shades of safe; one shade where one number says it all."""
+    if not candidates.safe.any():
+        return y
+    scale = clearance_scale(candidates)
+    safe = "" if candidates.breathing is not None else f"{candidates.safe_text}, "  # too long for one line
+    if scale.even:
+        _box(axes, y + 0.02, 0.032, _even_shade(scale))
+        axes.text(TEXT_AT, y + 0.036, f"{safe}{_even_text(scale)}", fontsize=SMALL, va="center")
+        return y + 0.06
+    shades, box = safe_shades(np.linspace(0, 1, 256))[None], (0.0, 1.0, y + 0.045, y + 0.02)
+    axes.imshow(shades, extent=box, aspect="auto", interpolation="bilinear")
+    axes.add_patch(Rectangle((0.0, y + 0.02), 1.0, 0.025, fill=False, lw=0.8, clip_on=False))
+    for x, text, ha in (
+        (0.0, number(scale.low, SCALE_DIGITS, "mm"), "left"),
+        (0.5, f"{safe}by least clearance", "center"),
+        (1.0, number(scale.high, SCALE_DIGITS, "mm"), "right"),
+    ):
+        axes.text(x, y + 0.05, text, fontsize=SMALL, ha=ha, va="top")
+    return y + 0.06
+
+
+def _even_shade(scale: ClearanceScale) -> Rgb:
+    red, green, blue = scale.shades(np.zeros(1))[0].tolist()
+    return red, green, blue
+
+
+def _even_text(scale: ClearanceScale) -> str:
+    """What one shade stands for."""
+    if not np.isfinite(scale.low):
+        return "no structure has a margin"
+    return f"least clearance {number(scale.low, SCALE_DIGITS, 'mm')} everywhere"
+
+
+PALE: Rgb = (205, 235, 220)
+"""Below the legend's hatching."""
+
+
+def _chance_legend(axes: Axes, candidates: Candidates, y: float) -> float:
+    """What lines and hatching mean; nothing without chances. Returns where the next line may stand."""
+    if touch_nothing(candidates) is None:
+        return y
+    axes.text(0.0, y + 0.034, "chance to touch nothing forbidden", fontsize=SMALL, va="center")
+    text = (f"< {LEVELS[0]:g}", *(f"{low:g}–{high:g}" for low, high in pairwise(LEVELS)), f"> {LEVELS[-1]:g}")
+    for place, (name, hatch) in enumerate(zip(text, HATCHES, strict=True)):
+        x = 0.25 * place
+        _box(axes, y + 0.05, 0.028, PALE, x, hatch=hatch, ink=HATCH_INK)
+        axes.text(x + 0.07, y + 0.064, name, fontsize=8.5, va="center")
+        if place < len(LEVELS):
+            axes.plot((x + 0.232, x + 0.232), (y + 0.05, y + 0.078), color="black", lw=1.5, ls=STYLES[place])
+    return y + 0.065
+
+
+def _mark_legend(axes: Axes, candidates: Candidates, view: MapView, y: float) -> float:
+    if not candidates.safe.any():
+        return y
+    marks = [(0.03, CHOSEN, 0.07, "chosen"), (0.225, BEST, 0.25, "best of a window")]
+    front = shown_front(candidates, view)
+    if front.of:
+        marks.append((0.575, FRONT, 0.595, front.text))
+    for x, mark, beside, text in marks:
+        axes.plot([x], [y], **mark)
+        axes.text(beside, y, text, fontsize=SMALL, va="center")
+    return y
+
+
+def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> None:
+    """The chosen direction in a box; or, in a box of warning, that there is none."""
+    box = {"boxstyle": "round,pad=0.45", "facecolor": "#eef7f2", "edgecolor": "#00684a"}
+    look: dict[str, Any] = {"fontsize": 10, "linespacing": 1.4, "va": "top", "bbox": box}
+    if pick is None:
+        text = "NOTHING IS SAFE\nEvery direction of the grid is refused."
+        box |= {"facecolor": "#ffe9e0", "edgecolor": "#b03000"}
+        look |= {"fontsize": 13, "weight": "bold", "color": "#a02000"}
+    else:
+        word = "Best" if pick == best_pick(candidates) else "Chosen"
+        found, row = pick
+        theta, beta = np.degrees(found.theta[row]), np.degrees(found.beta[row])
+        text = (
+            f"{word}: θ {theta:.4g}°, β {beta:.4g}°{_chances(found, row)}\n"
+            f"path in the body {number(found.path.length[row], 1, 'mm')}, "
+            f"skin angle {number(float(np.degrees(found.path.skin_angle[row])), 0)}°\n"
+            f"{nearest_text(found, row)}"
+        )
+    axes.text(0.017, y + 0.008, text, **look)
+
+
+def _chances(candidates: Candidates, row: int) -> str:
+    """The chosen direction's chances, to follow it; nothing where there are none."""
+    chances = candidates.chances
+    if chances is None or not np.isfinite(chances.hit[row]):
+        return ""
+    hit, touch = chance_text(float(chances.hit[row])), chance_text(float(chances.touch_any[row]))
+    return f"; p(hit) {hit}, p(touch) {touch}{'' if chances.refined[row] else ' to first order'}"

@@ -10,23 +10,21 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 from scipy.spatial import ConvexHull
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.collision.workcell import case_boxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.place.mounts import Region
 from puncture_twin.planning.place.search import PlaceSearch, RatedPlacement
+from puncture_twin.twin.report.figures import halo, write_png
 from puncture_twin.twin.report.numbers import direction_text, mounting_text, needle_text, target_text
 
 DPI = 110
@@ -47,7 +45,7 @@ TICKS_MM = 500.0
 ALL_OF_IT = 1.0 - 5e-4
 """A share that is not told from the whole."""
 
-HALO = [withStroke(linewidth=2.5, foreground="white")]
+HALO = halo(2.5)
 SAME_AXIS = 0.94
 """Cosine from which the case's own base axis is a panel's (20 degrees)."""
 
@@ -81,9 +79,7 @@ def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Pat
     figure.suptitle(f"{title}\n{needle_text(case)}", fontsize=14, fontweight="bold")
     figure.tight_layout(rect=(0, 0.02, 1, 0.98))
     figure.text(0.99, 0.006, "research software, not a medical device", fontsize=9, color="0.4", ha="right")
-    with atomic(Path(path)) as temporary:
-        FigureCanvasAgg(figure)
-        figure.savefig(temporary, format="png")
+    write_png(figure, path)
 
 
 def _panels(found: PlaceSearch) -> list[list[Region]]:
@@ -113,7 +109,7 @@ def _panel(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any,
         axes.add_patch(Rectangle((x - step / 2, y - step / 2), step, step, facecolor=colour, edgecolor="none"))
     space = str(case.space)
     text = mounting_text(regions[0], found.T_ct_bed, space) if len(regions) == 1 else regions[0].mount
-    axes.set_title(text, fontsize=11.5, fontweight="bold")
+    axes.set_title(text, fontsize=10.5, fontweight="bold")
     axes.set_aspect("equal")
     axes.tick_params(labelsize=8)
     axes.xaxis.set_major_locator(MultipleLocator(TICKS_MM))

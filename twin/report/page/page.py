@@ -27,6 +27,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
 from puncture_twin.planning.search.windows import find_windows
+from puncture_twin.twin.report.error_pictures import budget_png
 from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.numbers import (
@@ -47,6 +48,7 @@ from puncture_twin.twin.report.page.page_scene import scene_figure
 from puncture_twin.twin.report.page.page_tables import PROJECT, faint, table, two
 from puncture_twin.twin.report.page.template import (
     Card,
+    image_address,
     plotly_script,
     png_address,
     rehearsal_charts,
@@ -335,8 +337,6 @@ def budget_section(facts: Mapping[str, Any]) -> Markup:
     Args:
         facts: As ``register --json`` has them under ``budget``, of the direction that is shown.
     """
-    from puncture_twin.twin.report.error_pictures import budget_png  # with matplotlib, only where there is a budget
-
     now, best = facts["expected_mm"], facts["best"]
     won = now - best["expected_mm"]
     head = f"Expected tip error of this insertion: {now:.2f} mm (rms)"
@@ -389,7 +389,7 @@ def _direction(one: Slices) -> dict[str, Any]:
     return {
         **({} if pick is None else pick.candidates.at(pick.row)),
         "panels": [_panel(panel) for panel in one.panels],
-        "units": "" if one.units is None else _png(one.units.quantize(COLOURS)),
+        "units": "" if one.units is None else image_address(one.units.quantize(COLOURS), OVERLAY_LEVEL),
         "legend": [[name.replace("_", " "), css(colour)] for name, colour in one.legend],
         "notes": list(one.notes),
     }
@@ -401,10 +401,5 @@ def _panel(panel: Panel) -> dict[str, str]:
         stream = io.BytesIO()
         Image.fromarray(stored(panel.hu)).save(stream, format="JPEG", quality=QUALITY)
         ct = "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-    return {"name": panel.plane.name, "ct": ct, "over": _png(Image.fromarray(panel.overlay).quantize(COLOURS))}
-
-
-def _png(image: Image.Image) -> str:
-    stream = io.BytesIO()
-    image.save(stream, format="PNG", compress_level=OVERLAY_LEVEL)
-    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+    over = image_address(Image.fromarray(panel.overlay).quantize(COLOURS), OVERLAY_LEVEL)
+    return {"name": panel.plane.name, "ct": ct, "over": over}

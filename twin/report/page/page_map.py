@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import shlex
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from puncture_twin.planning.search.choice import Pick
 from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.map.map_raster import PIXELS as FINE, MapRaster, map_raster, shown_front
 from puncture_twin.twin.report.map_view import map_view
+from puncture_twin.twin.report.page.template import image_address
 from puncture_twin.twin.report.palette import PNG_LEVEL, reason_of
 
 PIXELS = FINE // 2
@@ -55,7 +54,7 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
     reasons = [str(r) for r in np.unique(candidates.verdict.reason)]
     return {
         "size": PIXELS,
-        "image": _png(raster.rgba),
+        "image": image_address(Image.fromarray(raster.rgba), PNG_LEVEL),
         "runs": rows,
         "theta_max_deg": round(float(np.degrees(view.theta_max)), 4),
         "turn_deg": round(float(np.degrees(view.turn)), 4),
@@ -138,12 +137,6 @@ def _nearest(candidates: Candidates) -> tuple[list[str], Any]:
     columns = demanding[np.argmin(np.nan_to_num(clearance.distance[:, demanding], nan=np.inf), axis=1)]
     nearest = clearance.distance[np.arange(len(candidates)), columns]
     return [clearance.structures[column] for column in columns], nearest
-
-
-def _png(rgba: Any) -> str:
-    stream = io.BytesIO()
-    Image.fromarray(rgba).save(stream, format="PNG", compress_level=PNG_LEVEL)
-    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 
 def _rounded(values: Any, digits: int) -> list[float | None]:

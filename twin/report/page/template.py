@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import io
 import json
 import math
 from functools import cache
@@ -20,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
+from PIL import Image
 
 from puncture_twin.planning.base.files import atomic
 
@@ -94,6 +96,13 @@ def data_address(picture: Path) -> str:
 def png_address(picture: bytes) -> str:
     """The same of a PNG that is no file."""
     return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
+
+
+def image_address(image: Image.Image, compress_level: int) -> str:
+    """The same of a picture that is no PNG yet."""
+    stream = io.BytesIO()
+    image.save(stream, format="PNG", compress_level=compress_level)
+    return png_address(stream.getvalue())
 
 
 MOST_STRUCTURES = 6

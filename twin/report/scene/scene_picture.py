@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
@@ -93,8 +92,7 @@ def draw_scene(
     _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
     bottom = _text(draw, case, candidates, plan, bool(arm), bodies, pick, failed)
     image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
-    with atomic(Path(path)) as temporary:
-        image.save(temporary, format="PNG", compress_level=palette.PNG_LEVEL)
+    annotate.write_image(image, path)
 
 
 def render_bodies(bodies: Sequence[SceneBody], camera: ViewCamera) -> NDArray[np.uint8]:

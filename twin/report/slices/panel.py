@@ -9,12 +9,13 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.twin.report.annotate import SCALE_BARS_MM
-from puncture_twin.twin.report.canvas import BLACK, WHITE, Anchor, Canvas, Halo, Words
+from puncture_twin.twin.report.figures import figure_of, halo, pixels
 from puncture_twin.twin.report.palette import SKIN, TARGET_POINT
 from puncture_twin.twin.report.slices.planes import Plane, capsule, ellipse, letters, outline
 from puncture_twin.twin.report.slices.subject import Subject
@@ -29,17 +30,14 @@ BENT_COLOUR: Rgb = (182, 255, 0)
 STRONG, WEAK, OF_SKIN, OF_BEAD = 2.5, 1.1, 1.6, 4.0
 """Pixels: how wide outlines are, and how large a bead is."""
 
-RIM = Halo(0.9, BLACK)
-"""Under thin lines, so that they show on bright tissue too."""
+RIM = 1.8
+"""Pixels of black under thin lines, both sides together, so that they show on bright tissue too."""
 
-LETTERS = Words(16, "bold", WHITE, Halo(1.6, BLACK))
-SMALL = Words(12, "plain", WHITE, Halo(1.6, BLACK))
+LETTERS, SMALL, LETTERS_RIM = 16, 12, halo(3.2, "black")
+"""Pixels: of the directions and of the scale, in white with a black rim."""
 
 IN_PLANE = 1e-3
 """A needle whose direction has less than this along a plane's normal lies in it."""
-
-DASHED, DOTTED = (5.0, 2.2), (1.5, 2.4)
-"""Pixels drawn and left out: about the needle with the greatest margin, and along its shadow."""
 
 BEADS = 0.025
 """Between two beads, of half a picture's side."""
@@ -48,9 +46,6 @@ MOST_BEADS = 1 << 20
 
 SCALE_FRACTION = 0.34
 """Of a picture's side, the scale bar at most."""
-
-BAR_HEIGHT = 4.0
-"""Of the scale, pixels."""
 
 EDGE = 7.0
 """Pixels between a picture's edge and the letters there."""
@@ -77,56 +72,46 @@ def draw_panel(subject: Subject, plane: Plane) -> Panel:
     """Draw one plane, with the needle of the direction if there is one."""
     scan = subject.anatomy.scan
     hu = None if scan is None else scan.hu_at(plane.points_ct(PIXELS)).reshape(PIXELS, PIXELS)
-    sheet = _Sheet(plane)
-    _outlines(sheet, subject, plane)
+    figure = figure_of(PIXELS, PIXELS, ground="none")
+    axes = figure.add_axes((0, 0, 1, 1))  # in the plane's mm
+    axes.set_axis_off()
+    axes.set_xlim(plane.centre[0] - plane.half_mm, plane.centre[0] + plane.half_mm)
+    axes.set_ylim(plane.centre[1] - plane.half_mm, plane.centre[1] + plane.half_mm)
+    axes.set_autoscale_on(False)
+    _outlines(axes, subject, plane)
     if subject.pick is not None:
-        _needle(sheet, subject, plane)
-    _target(sheet, plane)
-    _directions(sheet, subject, plane)
-    _scale(sheet, plane)
-    return Panel(plane, hu, sheet.canvas.pixels)
+        _needle(axes, subject, plane)
+    _target(axes, plane)
+    _directions(axes, subject, plane)
+    _scale(axes, plane)
+    return Panel(plane, hu, pixels(figure))
 
 
-class _Sheet:
-    """What one draws on in a plane's mm.
-
-    Args:
-        plane: The plane.
-    """
-
-    def __init__(self, plane: Plane) -> None:
-        self.canvas = Canvas(PIXELS, PIXELS, None)
-        self._corner = plane.centre + plane.half_mm * np.array([-1.0, 1.0])
-        self._per_mm = PIXELS / (2 * plane.half_mm) * np.array([1.0, -1.0])
-
-    def pixels(self, points: Any) -> Floats:
-        """Columns and rows of points (..., 2), mm."""
-        return np.asarray((np.asarray(points, dtype=float) - self._corner) * self._per_mm)
-
-    def line(self, points: Floats, width: float, colour: Rgb, **look: Any) -> None:
-        """A line through points (n, 2), mm."""
-        self.canvas.line(self.pixels(points), width, colour, **look)
-
-    def segments(self, segments: Floats, width: float, colour: Rgb) -> None:
-        """Lines from point to point, each alone, shape (n, 2, 2), mm."""
-        self.canvas.segments(self.pixels(segments), width, colour)
-
-    def area(self, outline_mm: Floats, colour: Rgb) -> None:
-        """What a closed line (n, 2), mm, holds."""
-        self.canvas.fill(self.pixels(outline_mm), colour)
+def _line(axes: Axes, points: Floats, width: float, colour: Rgb, style: str = "-", rim: float = 0.0) -> None:
+    """A line through points (n, 2), mm, later ones over earlier ones."""
+    effects = halo(width + rim, "black") if rim else None
+    axes.plot(*points.T, color=css(colour), linewidth=width, linestyle=style, path_effects=effects)
 
 
-def _outlines(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
+def _segments(axes: Axes, segments: Floats, width: float, colour: Rgb) -> None:
+    """Lines from point to point, each alone, shape (n, 2, 2), mm: one path, with gaps between."""
+    if len(segments) == 0:
+        return
+    gaps = np.full((len(segments), 1, 2), np.nan)
+    points = np.concatenate([segments, gaps], axis=1).reshape(-1, 2)
+    axes.plot(*points.T, color=css(colour), linewidth=width, solid_capstyle="round")
+
+
+def _outlines(axes: Axes, subject: Subject, plane: Plane) -> None:
     """Every structure that the plane cuts: the near ones and the target's strongly, unknown ones as beads."""
     strong = {one.name for one in subject.near} | {subject.case.target_structure}
     for one in subject.anatomy.checked:
         segments, colour = outline(one.mesh, plane), subject.colours[one.name]
         if str(one.role) == "unknown":
-            beads = _beads(segments, plane)
-            sheet.segments(np.stack([beads, beads], axis=1), OF_BEAD, colour)
+            axes.plot(*_beads(segments, plane).T, "o", markersize=OF_BEAD, color=css(colour), markeredgewidth=0)
         else:
-            sheet.segments(segments, STRONG if one.name in strong else WEAK, colour)
-    sheet.segments(outline(subject.anatomy.skin.mesh, plane), OF_SKIN, SKIN)
+            _segments(axes, segments, STRONG if one.name in strong else WEAK, colour)
+    _segments(axes, outline(subject.anatomy.skin.mesh, plane), OF_SKIN, SKIN)
 
 
 def _beads(segments: Floats, plane: Plane) -> Floats:
@@ -144,72 +129,76 @@ def _beads(segments: Floats, plane: Plane) -> Floats:
     return np.asarray(points[np.unique(column * MOST_BEADS + row, return_index=True)[1]])
 
 
-def _needle(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
+def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:
     """The needle as thick as it is where the plane holds it, else its cut and, dotted, its shadow; the tip's region."""
     outward, radius = subject.outward_ct, subject.needle_radius_mm
     shaft = subject.case.needle.shaft_mm
     end, across = plane.place(plane.at_ct + shaft * outward), abs(float(outward @ plane.normal))
     path = subject.path_mm if np.isfinite(subject.path_mm) else shaft
     if subject.margin_mm > 0:
-        wide = capsule(outward, path, radius + subject.margin_mm, plane)
-        sheet.line(wide, 1.3, NEEDLE_COLOUR, dashes=DASHED)
+        _line(axes, capsule(outward, path, radius + subject.margin_mm, plane), 1.3, NEEDLE_COLOUR, "--")
     if IN_PLANE < across < 1 - IN_PLANE:
-        sheet.line(np.stack([np.zeros(2), end]), 1.5, NEEDLE_COLOUR, dashes=DOTTED, halo=RIM)
+        _line(axes, np.stack([np.zeros(2), end]), 1.5, NEEDLE_COLOUR, ":", RIM)
     if subject.region_ct is not None:
-        sheet.line(ellipse(subject.region_ct, plane), 1.7, REGION_COLOUR, halo=RIM)
-    sheet.area(capsule(outward, shaft, radius, plane), NEEDLE_COLOUR)
+        _line(axes, ellipse(subject.region_ct, plane), 1.7, REGION_COLOUR, rim=RIM)
+    axes.fill(*capsule(outward, shaft, radius, plane).T, color=css(NEEDLE_COLOUR), linewidth=0, zorder=2)
     if subject.bent_mm is not None:
-        _bent(sheet, subject, plane, subject.bent_mm)
+        _bent(axes, subject, plane, subject.bent_mm)
 
 
-def _bent(sheet: _Sheet, subject: Subject, plane: Plane, bent_mm: Floats) -> None:
+def _bent(axes: Axes, subject: Subject, plane: Plane, bent_mm: Floats) -> None:
     """Where the bevel may take the needle: its line to both sides, or how far off the axis it may be at the plane."""
     outward, off = subject.outward_ct, abs(float(bent_mm[-1, 1]))
     if abs(float(outward @ plane.normal)) > IN_PLANE:
         if off > 0:
-            sheet.line(capsule(outward, subject.path_mm, off, plane), 1.3, BENT_COLOUR)
+            _line(axes, capsule(outward, subject.path_mm, off, plane), 1.3, BENT_COLOUR)
         return
     along = plane.place(plane.at_ct + outward)
     for aside in (np.array([-along[1], along[0]]), np.array([along[1], -along[0]])):
-        sheet.line(bent_mm @ np.stack([along, aside]), 1.7, BENT_COLOUR)
+        _line(axes, bent_mm @ np.stack([along, aside]), 1.7, BENT_COLOUR)
 
 
-def _target(sheet: _Sheet, plane: Plane) -> None:
+def _target(axes: Axes, plane: Plane) -> None:
     """A cross at the target."""
     near, far = 0.03 * plane.half_mm, 0.09 * plane.half_mm
-    arms = [((near, 0), (far, 0)), ((-near, 0), (-far, 0)), ((0, near), (0, far)), ((0, -near), (0, -far))]
-    sheet.segments(np.array(arms), 2.4, TARGET_POINT)
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        axes.plot((near * x, far * x), (near * y, far * y), color=css(TARGET_POINT), linewidth=2.4)
 
 
-def _directions(sheet: _Sheet, subject: Subject, plane: Plane) -> None:
+def _directions(axes: Axes, subject: Subject, plane: Plane) -> None:
     """What lies beyond each edge of the picture; beside the needle where it leaves the picture there."""
     middle, far = PIXELS / 2, PIXELS - EDGE
-    edges: tuple[tuple[float, float, Floats, Anchor], ...] = (
-        (far, middle, plane.right, "rm"),
-        (EDGE, middle, -plane.right, "lm"),
-        (middle, EDGE, plane.up, "ma"),
-        (middle, far, -plane.up, "mb"),
+    edges = (
+        (far, middle, plane.right, "right", "center"),
+        (EDGE, middle, -plane.right, "left", "center"),
+        (middle, far, plane.up, "center", "top"),
+        (middle, EDGE, -plane.up, "center", "bottom"),
     )
     shaft = np.zeros(3) if subject.pick is None else subject.case.needle.shaft_mm * subject.outward_ct
-    needle = sheet.pixels(np.linspace(0, 1, PIXELS)[:, None] * plane.place(plane.at_ct + shaft))
-    for x, y, direction, anchor in edges:
-        beside = anchor in {"rm", "lm"}
+    needle = np.linspace(0, 1, PIXELS)[:, None] * plane.place(plane.at_ct + shaft)
+    needle = ((needle - plane.centre) / plane.half_mm + 1) * middle  # pixels to the right and up
+    for x, y, direction, ha, va in edges:
+        beside = va == "center"
         near = needle[np.linalg.norm(needle - (x, y), axis=1) < 2 * CLEAR]
         off = 0.0 if len(near) == 0 else float(near[:, int(beside)].mean()) - middle
         shift = 0.0 if len(near) == 0 or abs(off) > CLEAR else off + (-CLEAR if off > 0 else CLEAR)
         at = (x, y + shift) if beside else (x + shift, y)
-        sheet.canvas.write(at, letters(subject.case.space, direction), LETTERS, anchor=anchor)
+        _write(axes, at, letters(subject.case.space, direction), LETTERS, ha=ha, va=va, weight="bold")
 
 
-def _scale(sheet: _Sheet, plane: Plane) -> None:
+def _write(axes: Axes, at: tuple[float, float], text: str, size: float, **look: Any) -> None:
+    """White words with a black rim at pixels to the right and up of the lower left corner."""
+    axes.text(*at, text, fontsize=size, color="white", path_effects=LETTERS_RIM, transform=None, **look)
+
+
+def _scale(axes: Axes, plane: Plane) -> None:
     """A bar of a round length in the lower left corner."""
     side = 2 * plane.half_mm
     length = max((mm for mm in SCALE_BARS_MM if mm <= SCALE_FRACTION * side), default=SCALE_BARS_MM[0])
-    left, low = sheet.pixels(plane.centre - plane.half_mm * np.array([0.94, 0.93])).tolist()
-    bar = (left, low - BAR_HEIGHT / 2, left + PIXELS * length / side, low + BAR_HEIGHT / 2)
-    sheet.canvas.rectangle((bar[0] - 1, bar[1] - 1, bar[2] + 1, bar[3] + 1), BLACK)
-    sheet.canvas.rectangle(bar, WHITE)
-    sheet.canvas.write((left, low - 9), f"{length} mm", SMALL)
+    left, low = plane.centre - plane.half_mm * np.array([0.94, 0.93])
+    bar: dict[str, Any] = {"solid_capstyle": "butt", "linewidth": 4, "path_effects": halo(6, "black")}
+    axes.plot((left, left + length), (low, low), color="white", **bar)
+    _write(axes, (0.03 * PIXELS, 0.035 * PIXELS + 8), f"{length} mm", SMALL)
 
 
 class Tone(NamedTuple):

@@ -1,0 +1,300 @@
+"""The disc of the map: verdicts as colours, rings and azimuths, the layer of chances, names of regions, and marks.
+
+The chance that a needle touches nothing that it must not touch is hatching and lines, no colours: they read over every
+shade of safe, in print, and for colour-blind people. The chance to hit hardly changes with the direction, so that it
+stands beside the map as a number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.search.candidates import Candidates, Verdict
+from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
+from puncture_twin.twin.report.figures import halo
+from puncture_twin.twin.report.map.map_raster import MapRaster, shown_front
+from puncture_twin.twin.report.map_view import BEYOND, MapView
+
+RADIUS = 412
+"""Of the disc, pixels."""
+
+DPI = 130
+"""Dots an inch of the map; letters and lines are in points."""
+
+RINGS_AT, RINGS_CLEAR = np.radians((67.5, 52.5, 22.5, 112.5, 127.5)), 0.09
+"""Where the rings' angles may be written, counter-clockwise from the right: the first at which every mark keeps so far
+from them, in the disc's radii."""
+
+RIM_LABEL = 0.95
+"""Of the disc's radii: the angle of a ring at the rim stands there, not over the line."""
+
+BORDER_OPACITY = 0.45
+"""Of the lines between regions of different structures."""
+
+LETTERS, LETTERS_RIM = 9.0, halo(3.2)
+"""Points: what is written in the disc, and the white about it."""
+
+CHOSEN: Mapping[str, Any] = MappingProxyType({"marker": "*", "ms": 19, "mew": 1.6, "mfc": "white", "mec": "black"})
+BEST: Mapping[str, Any] = MappingProxyType({"marker": "o", "ms": 6.8, "mew": 1.2, "mfc": "none", "mec": "black"})
+FRONT: Mapping[str, Any] = MappingProxyType({"marker": "o", "ms": 3.0, "mew": 0.5, "mfc": "white", "mec": "black"})
+"""The marks of directions, on the map and in its legend."""
+
+
+class Label(NamedTuple):
+    """What is written on the map, and where, in the disc's radii (x right, y up)."""
+
+    x: float
+    y: float
+    text: str
+
+
+def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRaster, pick: Pick | None) -> None:
+    """Draw it in the disc's radii; what stands at the rim lies outside of the axes.
+
+    Args:
+        axes: A square of 2 `RADIUS` pixels.
+        candidates: The grid, checked.
+        view: The map's geometry.
+        raster: Its pixels.
+        pick: The direction that gets the star.
+    """
+    axes.set_axis_off()
+    axes.set(xlim=(-1, 1), ylim=(-1, 1), autoscale_on=False)
+    codes, names = region_codes(candidates.verdict, raster.rows)
+    axes.imshow(_lined(raster, candidates, codes), extent=(-1, 1, -1, 1), interpolation="hanning")
+    _frame(axes, view)
+    _chances(axes, candidates, raster.rows)
+    bests = [window.best for window in find_windows(candidates).windows[:MOST_WINDOWS]]
+    marked = view.place(candidates.theta[bests], candidates.beta[bests])
+    chosen = np.zeros((0, 2)) if pick is None else view.place(*_angles(pick))
+    rings = ring_labels(view, np.concatenate([marked, chosen]))
+    about_bests = [Label(x, y, "OO") for x, y in marked]
+    for x, y, text in rings:
+        _write(axes, x, y, text)
+    for x, y, text in region_labels(codes, names, [*rings, *about_bests]):
+        _write(axes, x, y, text, style="italic")
+    axes.plot([0], [0], "+", ms=9, mew=1.2, color="black")
+    front = shown_front(candidates, view).rows
+    dots = view.place(candidates.theta[front], candidates.beta[front])
+    for places, mark in ((dots, FRONT), (marked, BEST), (chosen, CHOSEN)):
+        axes.plot(*places.T, ls="none", clip_on=False, zorder=4, **mark)  # over all words
+
+
+def _angles(pick: Pick) -> tuple[Floats, Floats]:
+    return pick.candidates.theta[[pick.row]], pick.candidates.beta[[pick.row]]
+
+
+def _write(axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
+    axes.text(x, y, text, fontsize=LETTERS, ha="center", va="center", path_effects=LETTERS_RIM, **look)
+
+
+def _lined(raster: MapRaster, candidates: Candidates, codes: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """The raster on white, with lines between regions of different structures, and about what is safe."""
+    opaque = raster.rgba[..., 3:] / 255.0
+    rgb = np.round(raster.rgba[..., :3] * opaque + 255.0 * (1.0 - opaque)).astype(np.uint8)
+    between = _edges(codes, named=True)
+    rgb[between] = np.round(rgb[between] * (1 - BORDER_OPACITY))
+    rgb[_edges(np.append(candidates.safe, False)[raster.rows].astype(np.int64))] = 0
+    return rgb
+
+
+def _edges(values: NDArray[np.int64], *, named: bool = False) -> Bools:
+    """Pixels within one of where two values lie beside each other; where ``named``, of two that are not 0."""
+    marked = np.zeros(values.shape, dtype=bool)
+    for here, there, at in (
+        (values[:-1], values[1:], marked[:-1]),
+        (values[:, :-1], values[:, 1:], marked[:, :-1]),
+    ):
+        at |= (here != there) & ((here * there != 0) | (not named))
+    wide = marked.copy()
+    wide[1:] |= marked[:-1]
+    wide[:-1] |= marked[1:]
+    wider = wide.copy()
+    wider[:, 1:] |= wide[:, :-1]
+    wider[:, :-1] |= wide[:, 1:]
+    return wider
+
+
+def _frame(axes: Axes, view: MapView) -> None:
+    """Rings, spokes and what lies beyond the rim."""
+    for ring, radius in ring_radii(view):
+        wide = 1.6 if ring == 90 and view.theta_max > BEYOND else 0.7
+        axes.add_patch(Circle((0, 0), radius, fill=False, lw=wide, alpha=0.45))
+    axes.add_patch(Circle((0, 0), 1, fill=False, lw=1.2, clip_on=False))
+    for beta in range(0, 360, 30):
+        angle = np.radians(beta) + view.turn
+        x, y = float(np.cos(angle)), float(np.sin(angle))
+        axes.plot((0, x), (0, y), lw=0.5, color="black", alpha=0.3)
+        axes.plot((x, 1.02 * x), (y, 1.02 * y), lw=1.0, color="black", clip_on=False)
+        axes.text(1.085 * x, 1.07 * y, f"β {beta}°", fontsize=LETTERS, ha="center", va="center", color="0.25")
+    for text, angle in view.rim:
+        # Upright at the sides, so that long words stay in the picture.
+        side = abs(np.cos(angle)) > 0.8 and len(text) > 3
+        turned = (90 if np.cos(angle) < 0 else -90) if side else 0
+        x, y = 1.215 * np.cos(angle), 1.16 * np.sin(angle)
+        axes.text(x, y, text, rotation=turned, ha="center", va="center", fontsize=14, weight="bold")
+
+
+def ring_radii(view: MapView) -> list[tuple[int, float]]:
+    """θ of the rings that are drawn, degrees, and their radius in the disc."""
+    top = float(np.degrees(view.theta_max))
+    spacing = 15 if top <= 100 else 30
+    return [(ring, ring / top) for ring in range(spacing, int(top) + 1, spacing)]
+
+
+def ring_labels(view: MapView, marks: Floats) -> list[Label]:
+    """The rings' angles, off the marks (n, 2) where that is possible; that of a ring at the rim stands within it."""
+    radii = np.array([min(radius, RIM_LABEL) for _, radius in ring_radii(view)])
+    lines = [radii[:, None] * (np.cos(angle), np.sin(angle)) for angle in RINGS_AT]
+    clear = [np.linalg.norm(line[:, None] - marks, axis=2).min(initial=2.0) for line in lines]
+    line = next((line for line, far in zip(lines, clear, strict=True) if far > RINGS_CLEAR), lines[0])
+    return [Label(x, y, f"θ {ring}°") for (x, y), (ring, _) in zip(line.tolist(), ring_radii(view), strict=True)]
+
+
+LEVELS = (0.5, 0.9, 0.99)
+STYLES = (":", "--", "-")
+"""Of the line of each level."""
+
+HATCHES = ("xxxx", "////", "..", "")
+"""Below the first level, between the levels, above the last."""
+
+HATCH_INK = (0.0, 0.0, 0.0, 0.55)
+
+COARSE = 2
+"""Every so manyth pixel is looked at: what is smoothed needs no more."""
+
+SMOOTHED = 0.006
+"""Of the picture's side: the cells' corners are rounded off, and lines move by less than half a cell."""
+
+
+def touch_nothing(candidates: Candidates) -> NDArray[np.float64] | None:
+    """1 - p_touch_any of every direction, shape (n,), NaN where there is none; None without any."""
+    if candidates.chances is None or not np.isfinite(candidates.chances.touch_any).any():
+        return None
+    return np.asarray(1.0 - candidates.chances.touch_any)
+
+
+def chance_raster(candidates: Candidates, rows: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """The chance under each pixel, smoothed within the region that has chances; NaN elsewhere; None without any.
+
+    Args:
+        candidates: The grid.
+        rows: Shape (n, n), the candidate under each pixel, -1 outside.
+    """
+    chance = touch_nothing(candidates)
+    if chance is None:
+        return None
+    picture = np.append(chance, np.nan)[rows]
+    known = np.isfinite(picture)
+    wide = SMOOTHED * len(rows)
+    weight = ndimage.gaussian_filter(known.astype(float), wide)
+    smooth = ndimage.gaussian_filter(np.where(known, picture, 0.0), wide) / np.maximum(weight, 1e-9)
+    return np.asarray(np.where(known, smooth, np.nan))
+
+
+def _chances(axes: Axes, candidates: Candidates, rows: NDArray[np.int64]) -> None:
+    """Hatching and lines over the region that has chances, where they are not all above the last level."""
+    chance = chance_raster(candidates, rows[::COARSE, ::COARSE])
+    if chance is None or not (chance < LEVELS[-1]).any():
+        return
+    axis = (np.arange(len(chance)) + 0.5) / len(chance) * 2 - 1
+    shown = np.ma.masked_invalid(chance)
+    with_ends = (-1.0, *LEVELS, 2.0)
+    hatched = axes.contourf(axis, -axis, shown, levels=with_ends, colors="none", hatches=list(HATCHES))
+    hatched.set_edgecolor(HATCH_INK)
+    hatched.set_linewidth(0.0)
+    for width, colour in ((3.4, "white"), (1.5, "black")):
+        axes.contour(axis, -axis, shown, levels=LEVELS, colors=colour, linestyles=STYLES, linewidths=width)
+
+
+NAMED_FRACTION = 0.006
+"""Least fraction of the disc that a rejected region needs to carry its structure's name."""
+
+NOT_SEEN_HERE = "not seen"
+"""In a region whose directions leave what was scanned; the legend says how."""
+
+LETTER_HIGH, LETTER_WIDE = 0.7 * LETTERS * DPI / 72, 0.29 * LETTERS * DPI / 72
+"""Pixels: half the room of a line and of a letter; no two names lie over one another while there is room."""
+
+NAMES_COARSE = 4
+"""Every so manyth pixel is looked at to find a name's place."""
+
+
+def region_codes(verdict: Verdict, rows: Ints) -> tuple[NDArray[np.int64], list[str]]:
+    """What is written over each pixel, as its place in a list of names, of which the first is empty.
+
+    Args:
+        verdict: Of every direction.
+        rows: Shape (n, n), the candidate under each pixel, -1 outside.
+    """
+    written = _region_names(verdict)
+    names = ["", *sorted(set(written) - {""})]
+    place = {name: i for i, name in enumerate(names)}
+    codes = np.array([*map(place.__getitem__, written), 0])
+    return codes[rows], names
+
+
+def region_labels(codes: NDArray[np.int64], names: Sequence[str], written: Sequence[Label]) -> list[Label]:
+    """The names of all large enough regions, deep inside them and off what is written there."""
+    coarse = codes[::NAMES_COARSE, ::NAMES_COARSE]
+    free = np.ones(coarse.shape, dtype=bool)
+    for x, y, text in written:
+        _take(free, *_pixel(x, y, len(coarse)), *_half_size(text, len(coarse)))
+    labels = []
+    for depth, structure in _regions(coarse, names):
+        text = structure.replace("_", " ")
+        high, wide = _half_size(text, len(coarse))
+        space = np.where(ndimage.minimum_filter(free, (2 * high + 1, 2 * wide + 1)), depth, 0.0)
+        row, column = np.unravel_index(int(np.where(space.any(), space, depth).argmax()), depth.shape)
+        _take(free, int(row), int(column), high, wide)
+        x, y = (column + 0.5) / len(coarse) * 2 - 1, 1 - (row + 0.5) / len(coarse) * 2
+        labels.append(Label(float(x), float(y), text))
+    return labels
+
+
+def _region_names(verdict: Verdict) -> Texts:
+    """What is written over each direction, shape (n,): the structure that forbids it, or "unknown" and why."""
+    unknown = verdict.reason == Reason.UNKNOWN_REGION.value
+    named = np.where(verdict.reason == Reason.TOO_CLOSE.value, verdict.structure, "").astype(object)
+    whys = np.where(verdict.not_seen, NOT_SEEN_HERE, verdict.structure)
+    named[unknown] = [f"unknown:\n{why}" for why in whys[unknown]]
+    return np.asarray(named)
+
+
+def _regions(codes: NDArray[np.int64], names: Sequence[str]) -> list[tuple[Floats, str]]:
+    """Large enough regions of one name, the largest first: how deep inside each pixel lies, and the name."""
+    found = []
+    for code, name in enumerate(names):
+        labels, _ = ndimage.label((codes == code) if name else np.zeros(codes.shape, dtype=bool))
+        areas = np.bincount(labels.ravel())[1:]
+        for part in np.flatnonzero(areas > NAMED_FRACTION * codes.size * np.pi / 4) + 1:
+            depth = ndimage.distance_transform_edt(np.pad(labels == part, 1))[1:-1, 1:-1]
+            found.append((float(areas[part - 1]), depth, name))
+    return [(depth, name) for _, depth, name in sorted(found, key=lambda region: -region[0])]
+
+
+def _half_size(text: str, size: int) -> tuple[int, int]:
+    """Half the height and half the width of a name with some white, in pixels of a square picture of the disc."""
+    scale, lines = size / (2 * RADIUS), text.split("\n")
+    return round(LETTER_HIGH * len(lines) * scale), round(LETTER_WIDE * (max(map(len, lines)) + 1) * scale)
+
+
+def _pixel(x: float, y: float, size: int) -> tuple[int, int]:
+    """Row and column of a point of the disc (x right, y up) in a square picture of it."""
+    return round((1 - y) / 2 * size), round((1 + x) / 2 * size)
+
+
+def _take(free: Bools, row: int, column: int, high: int, wide: int) -> None:
+    """Mark a name's box about a pixel, half so high and wide, in place."""
+    free[max(0, row - high) : row + high + 1, max(0, column - wide) : column + wide + 1] = False
