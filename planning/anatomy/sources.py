@@ -18,7 +18,7 @@ from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.tables import StructureSection, StructuresSection
-from puncture_twin.planning.formats.labels.mask_folder import check_one_grid
+from puncture_twin.planning.formats.labels.label_sources import check_one_grid
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, RuleKind, names_for, select
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS

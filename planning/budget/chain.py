@@ -16,11 +16,10 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.needle.deflection import GAUGES, Bending, Shaft
 from puncture_twin.planning.reach.standoff import own_paths
-from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty, reading_noise, touches
 from puncture_twin.planning.registration.fits import fit_triad
 from puncture_twin.planning.registration.placement import aimed_uncertainty, default_method
-from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.registration.registration import Aim, Registration
 from puncture_twin.planning.search.bending import insertion_along
 from puncture_twin.planning.uncertainty.pose_error import Bend, PoseError
 

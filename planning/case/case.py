@@ -39,7 +39,7 @@ from puncture_twin.planning.case.tables import (
     StructureSection,
     StructuresSection,
 )
-from puncture_twin.planning.formats.labels.mask_folder import structure_name
+from puncture_twin.planning.formats.labels.label_sources import structure_name
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.needle.deflection import Bending

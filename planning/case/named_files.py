@@ -22,8 +22,12 @@ from puncture_twin.planning.case.tables import StructuresSection
 from puncture_twin.planning.formats import itk_transform, points
 from puncture_twin.planning.formats.dicom.storage import is_dicom_file, is_series
 from puncture_twin.planning.formats.labels import naming
-from puncture_twin.planning.formats.labels.mask_folder import mask_files, structure_name
-from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING, parse_segments
+from puncture_twin.planning.formats.labels.label_sources import (
+    SEGMENT_ENDING,
+    mask_files,
+    parse_segments,
+    structure_name,
+)
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.formats.volumes import volume_files as volumes
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, VolumeFile, VolumeSource, data_file

@@ -27,10 +27,15 @@ from puncture_twin.planning.formats.folder import (
     structure_below,
     unaccounted,
 )
+from puncture_twin.planning.formats.labels.label_sources import (
+    MASK_ENDINGS,
+    SEGMENT_ENDING,
+    not_read,
+    refuse_one_name,
+    structure_name,
+)
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of, whole_labels
-from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, not_read, refuse_one_name, structure_name
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS
-from puncture_twin.planning.formats.labels.slicer_segments import SEGMENT_ENDING
 from puncture_twin.planning.formats.points import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume

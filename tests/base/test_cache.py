@@ -298,7 +298,7 @@ def test_the_code_that_reads_a_volume_decides_what_is_kept_of_it(tmp_path, monke
     """Readers of DICOM are handed in: the organ of the old one stayed when one was mended."""
     files = closure([f"{PROJECT}/{place_of(surfaces.READERS)}.py"])
     dicom = [f"dicom/{name}" for name in ("ct_series", "slices", "segmentation", "structure_set")]
-    assert {f"{PROJECT}/planning/formats/{name}.py" for name in (*dicom, "labels/slicer_segments")} <= files
+    assert {f"{PROJECT}/planning/formats/{name}.py" for name in (*dicom, "labels/label_sources")} <= files
     assert {"pydicom", "python-gdcm"} <= set(LIBRARIES)
     made = []
     for stamp in ("old", "old", "mended"):

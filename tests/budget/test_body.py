@@ -19,9 +19,9 @@ from puncture_twin.planning.budget.what_if import changes, source_costs
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.needle.deflection import GAUGES, Shaft
-from puncture_twin.planning.registration.aim import reached_insertion
 from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.registration import reached_insertion
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.run_twin import app
 from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials

@@ -16,9 +16,9 @@ from puncture_twin.planning.budget.what_if import MOST_MARKERS, best_change, cha
 from puncture_twin.planning.case.errors import ArmUncertainty
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.aim import reached_insertion
 from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.registration import reached_insertion
 from puncture_twin.planning.uncertainty.sources import reading_parts
 from puncture_twin.run_twin import app
 from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials

@@ -14,7 +14,7 @@ from puncture_twin.planning.base.cache.array_cache import NO_CACHE
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.dicom.recognise import choose_series
 from puncture_twin.planning.formats.folder import entries, unaccounted
-from puncture_twin.planning.formats.labels.mask_folder import MASK_ENDINGS, mask_files
+from puncture_twin.planning.formats.labels.label_sources import MASK_ENDINGS, mask_files
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.init.finder import Wanted, find
 from puncture_twin.planning.init.segmentation import Place

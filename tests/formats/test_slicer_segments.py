@@ -10,7 +10,7 @@ from case_world import ball, case_text, structure
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
-from puncture_twin.planning.formats.labels.slicer_segments import parse_segments
+from puncture_twin.planning.formats.labels.label_sources import parse_segments
 
 SHAPE = (24, 20, 16)
 AFFINE = np.array([[5.0, 0, 0, -60], [0, 0, 5.0, -40], [0, -5.0, 0, 50], [0, 0, 0, 1.0]])

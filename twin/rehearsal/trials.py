@@ -18,7 +18,6 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
-from puncture_twin.planning.registration.aim import Aim
 from puncture_twin.planning.registration.fit_uncertainty import parameter_variances
 from puncture_twin.planning.registration.fits import (
     ReadingNoise,
@@ -30,6 +29,7 @@ from puncture_twin.planning.registration.fits import (
     least_squares_map,
 )
 from puncture_twin.planning.registration.placement import aimed_fit
+from puncture_twin.planning.registration.registration import Aim
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.plant.true_needle import TrueNeedle, joints_at_points, true_needle
 

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
-from puncture_twin.twin.plant.true_arm import ArmErrors, draw_true_arm
+from puncture_twin.twin.plant.truth import ArmErrors, draw_true_arm
 
 
 @pytest.mark.parametrize("name", UR_MODELS)

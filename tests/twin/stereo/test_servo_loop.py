@@ -9,7 +9,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.collision.state_checker import Contact, FirstContact
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop, StepLimits, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen, Task, path_contact, servo
-from puncture_twin.twin.plant.true_arm import ArmErrors, draw_true_arm
+from puncture_twin.twin.plant.truth import ArmErrors, draw_true_arm
 
 Q_START = start_configurations()[12]
 T_BASE_C = np.eye(4)

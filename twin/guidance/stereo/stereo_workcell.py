@@ -24,7 +24,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pai
 from puncture_twin.twin.guidance.stereo.declared_errors import CameraErrors
 from puncture_twin.twin.guidance.stereo.joint.needle_error import TrueNeedle
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, ToolSection
-from puncture_twin.twin.plant.true_arm import ArmErrors, TrueArm, draw_true_arm
+from puncture_twin.twin.plant.truth import ArmErrors, TrueArm, draw_true_arm
 
 LINE_OF_SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
 """Where on the ball's disc a line of sight ends: fraction of the radius, and how many around."""

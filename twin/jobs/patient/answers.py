@@ -25,13 +25,13 @@ from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_coordinate, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-from puncture_twin.planning.registration.advice import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.planning.registration.checks.places import touchable_points
 from puncture_twin.planning.registration.fits import ReadingNoise, rigid_fre_mm
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.method import LEAST_FOUND_MM
 from puncture_twin.planning.registration.noise_test import INTERVAL
+from puncture_twin.planning.registration.placement import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, choose, chosen_angles, refuse_other_entry, with_file_read

@@ -24,7 +24,7 @@ from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, S
 from puncture_twin.twin.guidance.ultrasound.slips import calibrate_case, checked_calibration
 from puncture_twin.twin.guidance.ultrasound.summaries import Choice, SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
-from puncture_twin.twin.plant.true_arm import ArmErrors, draw_true_arm
+from puncture_twin.twin.plant.truth import ArmErrors, draw_true_arm
 
 TARGETS = 6
 """Punctures per seed."""

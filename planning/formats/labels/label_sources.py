@@ -1,0 +1,233 @@
+"""A folder of masks: one volume a structure, named after its file, as TotalSegmentator writes them by default.
+
+Segments of a Slicer segmentation (.seg.nrrd), which may overlap: each is a label of one layer, and becomes a mask.
+
+Source: Slicer documentation, "Segmentations", file format: ``SegmentN_Name``, ``SegmentN_LabelValue`` and, where the
+file has several layers, ``SegmentN_Layer``, counted from 0.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.files import is_folder
+from puncture_twin.planning.base.text import check_name, first_few
+from puncture_twin.planning.formats.dicom.named_masks import Mask, MaskVolume, NamedMasks, unique_names
+from puncture_twin.planning.formats.folder import FILE, Entry, entries, unaccounted
+from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL, LabelMap
+from puncture_twin.planning.formats.volumes.nrrd_header import parse_layered_header
+from puncture_twin.planning.formats.volumes.volume_files import Content
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, VolumeHeader, corner_deviation_mm
+from puncture_twin.planning.formats.volumes.voxels import decoded
+
+MASK_ENDINGS = (".nii.gz", ".nii", ".seg.nrrd", ".nrrd")
+"""Endings of files that are masks."""
+MAX_MASKS, MAX_ENTRIES = 1000, 60_000
+"""TotalSegmentator has 117 classes; the slices of a CT may lie next to them."""
+SAME_PLACE_MM = 0.1
+"""Two grids whose corners lie this close are one: headers in single precision round to 0.01 mm."""
+
+
+def structure_name(file: str) -> str:
+    """The name of the structure in a file: the file's own, without its ending.
+
+    >>> structure_name("segmentations/rib_left_7.nii.gz")
+    'rib_left_7'
+    """
+    name = file.rpartition("/")[2]
+    ending = next((one for one in MASK_ENDINGS if name.lower().endswith(one)), "")
+    return name[: len(name) - len(ending)]
+
+
+def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path) -> tuple[str, ...]:
+    """The names of the masks in a folder, sorted; nothing else may lie in it that could be an organ.
+
+    Args:
+        folder: Where they are.
+        known: Whether a path in it is something else that the case names.
+        where: The file and key that name the folder, for errors.
+
+    Raises:
+        InputError: No folder, no mask in it, too many, two of one structure, or entries that would be passed over.
+    """
+    allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one a structure"
+    if not is_folder(folder):
+        raise InputError(f"'{folder.name[:200]}' is no folder", where=where, allowed=allowed)
+    found = entries(folder, most=MAX_ENTRIES, allowed=allowed)
+    files = [one.name for one in found if is_mask(one) and not known(folder / one.name)]
+    left = unaccounted(folder, found, lambda path: path.name in files or known(path))
+    if left:
+        raise not_read(left, "masks", where)
+    if not 1 <= len(files) <= MAX_MASKS:
+        raise InputError(f"'{folder.name}' holds {len(files)} masks", where=where, allowed=allowed)
+    refuse_one_name(files, where)
+    return tuple(files)
+
+
+def refuse_one_name(files: Sequence[str], where: str | Path) -> None:
+    """Whether each mask of a folder is of another structure: ``liver.nii`` next to ``liver.nii.gz`` is not.
+
+    Raises:
+        InputError: Two are of one; names both.
+    """
+    names: dict[str, str] = {}
+    for file in files:
+        if (other := names.setdefault(structure_name(file), file)) is not file:
+            what = f"'{other}' and '{file}' are masks of one name"
+            allowed = "one mask a structure: move one of the two out of the folder"
+            raise InputError(what, where=where, allowed=allowed, code="masks_of_one_name")
+
+
+def is_mask(entry: Entry) -> bool:
+    """Whether an entry is read as a mask."""
+    return entry.what == FILE and entry.name.lower().endswith(MASK_ENDINGS)
+
+
+def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError:
+    """Entries of a folder of masks or meshes that would be passed over: their organs would count as free."""
+    return InputError(
+        f"beside the {among} lies what is not read, and may be an organ: {first_few([one.line for one in left])}",
+        where=where,
+        allowed=f"{among} in formats that are read, and nothing else: convert it, fetch it, or move it elsewhere",
+        code="entries_not_read",
+    )
+
+
+def refuse_label_map(mask: LabelMap) -> None:
+    """Whether a mask's voxels have one value besides 0, often 1 or 255, or none.
+
+    Raises:
+        InputError: Several values: a label map, not the mask of one structure.
+    """
+    present = mask.labels_present()
+    if len(present) > 1:
+        raise InputError(
+            f"is no mask: its voxels have the labels {first_few(list(map(str, present)))}",
+            where=mask.path,
+            allowed="0 and one other value; a label map is named with labelmap, outside of a folder of masks",
+        )
+
+
+def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> None:
+    """Whether all masks of a folder lie on one grid: what lies beyond a smaller one would count as free.
+
+    Args:
+        headers: File name to header.
+        where: The folder, for the error.
+
+    Raises:
+        InputError: Two differ in shape or place; names both.
+    """
+    (first, grid), *others = headers.items()
+    for name, other in others:
+        sizes = [" x ".join(map(str, one.shape)) for one in (grid, other)]
+        if other.shape != grid.shape:
+            difference = f"{sizes[1]} voxels, not {sizes[0]}"
+        elif (apart := corner_deviation_mm(grid.T_ct_index, other.T_ct_index, grid.shape)) > SAME_PLACE_MM:
+            difference = f"up to {apart:.1f} mm away"
+        else:
+            continue
+        raise InputError(
+            f"mask {name} lies on another grid than {first}: {difference}",
+            where=where,
+            allowed="masks of one CT, all on one grid; others as [[structure]] with labelmap and label",
+        )
+
+
+SEGMENT_ENDING = ".nrrd"
+"""Ending of segmentations that Slicer saves, in lower case: their header and voxels are one file."""
+ALLOWED = "a .seg.nrrd as Slicer saves it, with names, label values and layers of its segments"
+
+
+class Segment(NamedTuple):
+    """Layer and label of a segment.
+
+    Attributes:
+        layer: From 0.
+        label: Their value there.
+    """
+
+    layer: int
+    label: int
+
+
+def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
+    """The segments of a Slicer segmentation, each by its name.
+
+    Args:
+        path: Its name.
+        file: Its key in ``content``.
+        content: Gives its bytes.
+
+    Raises:
+        InputError: No such file, no segment, or segments that share a name or a label.
+    """
+    header = parse_layered_header(content(file), path)
+    if header.data_path != path:
+        raise InputError(
+            f"its voxels lie in {header.data_path.name}", where=path, allowed="header and voxels in one file"
+        )
+    if header.cells.dtype.kind not in "iu":
+        raise InputError(f"voxels of type {header.cells.dtype}", where=path, allowed="whole numbers")
+    found = listed_segments(header.fields, header.layers, path)
+    listed = frozenset(found.values())
+    masks = {
+        name: MaskVolume(path, (file,), (name,), header, partial(_mask, content, file, header, segment, listed))
+        for name, segment in found.items()
+    }
+    return NamedMasks(masks, header.notes)
+
+
+def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict[str, Segment]:
+    """Name to layer and label, of every segment that the header lists.
+
+    Args:
+        remarks: The header's ``key:=value`` lines.
+        layers: How many the file holds; the layer of a segment may be left out where it is one.
+        path: The file, for errors.
+
+    Raises:
+        InputError: No segment, or some that share a name or a voxel value of one layer, or lie in no layer.
+    """
+    numbers = sorted({int(at[1]) for key in remarks if (at := re.match(r"Segment(\d{1,6})_", key))})
+    names = [check_name(remarks.get(f"Segment{n}_Name", ""), f"segment {n}", where=path) for n in numbers]
+    unique_names(names, path)
+    segments = [_segment(remarks, number, layers, path) for number in numbers]
+    for name, segment in zip(names, segments, strict=True):
+        if segments.count(segment) > 1:
+            what = f"segment {name!r} shares label {segment.label} of layer {segment.layer}"
+            raise InputError(what, where=path, allowed="a label of its own in its layer for each segment")
+    return dict(zip(names, segments, strict=True))
+
+
+def _segment(remarks: Mapping[str, str], number: int, layers: int, path: Path) -> Segment:
+    label = _number(remarks, f"Segment{number}_LabelValue", None, path)
+    layer = _number(remarks, f"Segment{number}_Layer", "0" if layers == 1 else None, path)
+    if not (1 <= label <= MAX_LABEL and layer < layers):
+        what = f"segment {number} has label {label} in layer {layer}"
+        raise InputError(what, where=path, allowed=f"labels from 1 to {MAX_LABEL}, layers from 0 to {layers - 1}")
+    return Segment(layer, label)
+
+
+def _number(remarks: Mapping[str, str], key: str, default: str | None, path: Path) -> int:
+    text = remarks.get(key, default)
+    if text is None or not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise InputError(f"{key} is {'missing' if text is None else repr(text[:20])}", where=path, allowed=ALLOWED)
+    return int(text)
+
+
+def _mask(content: Content, file: str, header: VolumeHeader, segment: Segment, listed: frozenset[Segment]) -> Mask:
+    voxels = decoded(memoryview(content(file)), header)
+    layer = voxels[segment.layer] if header.layers > 1 else voxels
+    lost = layer[~np.isin(layer, [0, *(one.label for one in listed if one.layer == segment.layer)])]
+    if lost.size:
+        what = f"layer {segment.layer} has voxels of {np.unique(lost)[:8].tolist()}, which are no segment's"
+        raise InputError(what, where=header.data_path, allowed="a segment for each label", code="label_without_segment")
+    return np.asarray(layer == segment.label).astype(np.uint8)
