@@ -1,11 +1,20 @@
-"""For the site (mkdocs.yml): a page of the API reference for every room, made from the docstrings of its modules."""
+"""For the site (mkdocs.yml): a page of the API reference for every room, made from the docstrings of its modules.
 
+A page that would load anything from another server is an error.
+"""
+
+import re
 from pathlib import Path
 
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[1]
 PARTS = ("planning", "twin")
+
+ELSEWHERE = r"""=["'](?:https?:)?//[^"']*"""
+LOADED = re.compile(rf"<(?:script|img|iframe)[^>]*\ssrc{ELSEWHERE}|<link[^>]*\srel=\S*stylesheet[^>]*\shref{ELSEWHERE}")
+"""What a browser loads by itself; links that a reader follows are none."""
 
 
 def rooms():
@@ -39,3 +48,11 @@ def on_page_markdown(markdown, page, config, files):
     names = [room.as_posix() for room, _ in rooms()]
     links = [f"- [{name}](rooms/{name.replace('/', '-')}.md)" for name in names]
     return "\n".join([markdown, "", "## Rooms", "", *links, ""])
+
+
+def on_post_page(output, page, config):
+    """Hold that the site stands alone."""
+    found = LOADED.search(output.replace(config["site_url"] or "\0", ""))
+    if found:
+        raise PluginError(f"{page.file.src_uri} loads {found[0]}")
+    return output

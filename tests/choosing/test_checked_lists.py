@@ -75,7 +75,7 @@ def test_angles_are_a_list_of_entries_too(context, tmp_path, capsys):
     assert code == OK
     assert [row["path_length_mm"] for row in told["rows"]] == pytest.approx(found.path.length[found.ranked[:3]])
     assert main(["check", str(context.case.path), "--no-arm", "--entries", str(tmp_path / "angles.csv")]) == OK
-    assert len([line for line in capsys.readouterr().out.splitlines() if " safe " in line]) == 3
+    assert len([line for line in capsys.readouterr().out.splitlines() if line.split()[1:2] == ["safe"]]) == 3
 
 
 def test_each_target_is_what_a_case_with_that_target_says(context, tmp_path, capsys):

@@ -359,11 +359,14 @@ def test_reproduce_holds(capfd):
 
 
 def test_register_reports_residuals_and_expectation(carton, capfd):
-    """Mean error as in Eq. 16; one flag: the paper's residuals are beyond its pixels and slices."""
+    """Mean error as in Eq. 16; the paper's residuals are beyond its pixels and slices, and most of all along z."""
     code, found = run(capfd, "register", carton)
     assert code == OK
     assert found["mean_error_mm"] == pytest.approx(1.43, abs=0.005)
-    assert [flag.split(" (")[0] for flag in found["flags"]] == ["residuals do not agree with the declared errors"]
+    assert [flag.split(" (")[0] for flag in found["flags"]] == [
+        "residuals do not agree with the declared errors",
+        "markers_base look 1.0675 times as large as markers_ct along the CT's z",
+    ]
     assert len(found["expected_tre_along_shaft_mm"]) == 4
 
 

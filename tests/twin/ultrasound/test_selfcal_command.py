@@ -153,8 +153,6 @@ def test_poses_of_constant_insertion_are_refused(tmp_path, capsys):
     recording, _ = simulate_recording(np.random.default_rng(1), 30, ranges=ranges)
     write_recording(recording, tmp_path / "recording.csv")
     out = tmp_path / "out"
-    out.mkdir()
-    (out / "calibration.json").write_text("of an earlier run")
     assert main(["selfcal", "--recording", str(tmp_path), "--out", str(out)]) == BAD_INPUT
     said = capsys.readouterr().err.strip()
     assert len(said.splitlines()) == 1

@@ -23,7 +23,7 @@ from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.choice import Choice, choose, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.twin.jobs.choosing.candidates_export import CANDIDATE_FORMATS, TABLE, export_candidates, table_of
+from puncture_twin.twin.jobs.patient.candidates_export import CANDIDATE_FORMATS, TABLE, export_candidates, table_of
 from puncture_twin.twin.jobs.patient.main_job import case_of, export, export_case, is_plan, plan_case, search_case
 from puncture_twin.twin.jobs.patient.summaries import export_summary
 from puncture_twin.twin.jobs.patient.text import export_text

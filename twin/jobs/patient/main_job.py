@@ -3,29 +3,24 @@
 A stage loads what it needs itself: a search without pictures waits for no planner, simulator or plotter.
 
 What a command works on that takes a case, or a plan beside its case.
-
-A plan executed in one room or in many: what is asked of the simulator, and what is written of its answer.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.output.publish import Draft
-from puncture_twin.planning.base.processes import process_pool, worker_count
-from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
@@ -33,16 +28,10 @@ from puncture_twin.planning.search.choice import BEST, Choice, Pick, choose, cho
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
-from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
-from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
-from puncture_twin.twin.rehearsal.plan_truth import error_scale, median_truth, plan_truth
 
 if TYPE_CHECKING:
-    from puncture_twin.planning.anatomy.anatomy import Anatomy
-    from puncture_twin.planning.case.case import Case
     from puncture_twin.planning.export.exporter import Exported
-    from puncture_twin.twin.plant.truth import Truth
-    from puncture_twin.twin.rehearsal.result import Rehearsal, Scale
+    from puncture_twin.twin.jobs.patient.rehearsed import PendingRehearsal
 
 
 CERTIFICATE = "certificate.json"
@@ -130,6 +119,8 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
+    from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
+
     _refuse_without_arm(context)
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
@@ -248,6 +239,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     """
     from puncture_twin.planning.plan.plan_check import with_case_arm
     from puncture_twin.planning.plan.recheck import check_plan
+    from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
     source, plan = _read_plan(plan_path, context.watcher.note)
@@ -372,131 +364,3 @@ def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
     if case is not None:
         raise InputError("two cases", where="--case", allowed="CASE alone, or plan.json --case CASE")
     return source
-
-
-Wait = Callable[[], Any]
-"""Gives what a stage makes, once."""
-
-Begin = Callable[..., Wait]
-"""Begins a stage, a function with its arguments: in another process, or, as `partial` does, when it is waited for."""
-
-
-@contextmanager
-def two_stages() -> Iterator[Begin]:
-    """Begin stages in a process beside this one, where a core is free for it.
-
-    A demo's plan is executed and filmed while its pictures are drawn: a third less by the clock.
-    """
-    if worker_count(2, 2) == 1:
-        yield partial
-        return
-    with process_pool(1, 1) as pool:
-        pool.submit(_load_simulator)
-        yield lambda function, *arguments: pool.submit(function, *arguments).result
-
-
-def _load_simulator() -> None:
-    from puncture_twin.twin.rehearsal import rehearsal as _simulator
-    from puncture_twin.twin.report.scene import film as _film
-
-    del _simulator, _film
-
-
-def _execute(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsal:
-    """See `rehearse`; PyBullet is loaded where this is called."""
-    from puncture_twin.twin.rehearsal.rehearsal import rehearse
-
-    return rehearse(plan, case, anatomy, truth)
-
-
-def _film(rehearsal: Rehearsal, plan: Plan, case: Case, anatomy: Anatomy, path: Path) -> Path:
-    from puncture_twin.twin.report.scene.film import draw_film
-
-    return draw_film(rehearsal, plan, case, anatomy, path)
-
-
-@dataclass(frozen=True)
-class PendingRehearsal:
-    """A run whose plan is being executed: by whoever begins its stages."""
-
-    run: Run
-    begin: Begin
-    rehearsal: Wait
-    scale: Scale | None
-
-    def ended(self, out: Path, with_page: Callable[[Run], Run] | None = None) -> Run:
-        """The run with what was measured and the film, once they are there; the numbers and the rooms are written.
-
-        Args:
-            out: The folder of the files.
-            with_page: Adds the page that shows them all to a run; while the film is made, which has the usual name
-                but where no encoder can be started.
-
-        Raises:
-            InputError: See `rehearse`.
-        """
-        shown, run, time = self._rooms_drawn(out), self.run, self.run.context.stages.time
-        with time("rehearsal"):
-            rehearsal: Rehearsal = self.rehearsal()
-        scale = self.scale
-        rehearsal = replace(rehearsal, standing=None if scale is None else scale.of(rehearsal.tip_error_mm))
-        film_at = self.begin(_film, rehearsal, run.plan, run.context.case, run.context.anatomy, out / FILM)
-        document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
-        measured = replace(run, rehearsal=rehearsal).with_files(_write_json(document, out / "rehearsal.json"))
-        rooms = (out / ROOMS,) if shown else ()
-        run = measured.with_files(out / FILM, *rooms)
-        run = run if with_page is None else with_page(run)
-        with time("film"):
-            film: Path = film_at()
-        if film == out / FILM:
-            return run
-        run = measured.with_files(film, *rooms)
-        return run if with_page is None else with_page(run)
-
-    def _rooms_drawn(self, out: Path) -> dict[str, Any]:
-        """What the rehearsal's file says of many rooms, their picture being drawn; nothing where there are none."""
-        from puncture_twin.twin.report.error_pictures import draw_rooms_picture
-
-        found = self.run.distribution
-        if found is None:
-            return {}
-        with self.run.context.stages.time("rooms.png"):
-            draw_rooms_picture(found, out / ROOMS)
-        return {"distribution": found.summary()}
-
-
-def begin_rehearsal(run: Run, rooms: RoomCount | None, begin: Begin) -> PendingRehearsal:
-    """Have the run's plan executed where the truth differs, of many rooms in the median one.
-
-    Raises:
-        InputError: See `plan_truth`.
-        NoAnswerError: See `plan_truth`.
-    """
-    assert run.plan is not None
-    context, plan = run.context, run.plan
-    run = run if rooms is None else replace(run, distribution=_distribution(run, rooms))
-    found = run.distribution
-    truth = plan_truth(context, plan) if found is None else median_truth(found)
-    scale = error_scale(context, plan.insertion.q[-1], found)
-    return PendingRehearsal(run, begin, begin(_execute, plan, context.case, context.anatomy, truth), scale)
-
-
-def _distribution(run: Run, count: RoomCount) -> Distribution:
-    assert run.plan is not None
-    context = run.context
-    with context.stages.time("rooms"):
-        q = run.plan.insertion.q[-1]
-        found = rehearse_trials(context, run.plan.outward_ct, q, count.rooms, context.case.rehearsal.seed)
-    if not (count.physics and len(found)):
-        return found
-    from puncture_twin.twin.rehearsal.plan_truth import physics_trials
-
-    with context.stages.time("physics"):
-        again = partial(context.watcher.count, "rooms in the simulator")
-        return replace(found, physics=physics_trials(context, run.plan, found, count.physics, again))
-
-
-def _write_json(summary: dict[str, Any], path: Path) -> Path:
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return path

@@ -1,0 +1,154 @@
+"""A plan executed in one room or in many: what is asked of the simulator, and what is written of its answer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.processes import process_pool, worker_count
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.twin.jobs.patient.run import FILM, ROOMS, RoomCount, Run
+from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
+from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
+from puncture_twin.twin.rehearsal.plan_truth import error_scale, median_truth, plan_truth
+
+if TYPE_CHECKING:
+    from puncture_twin.planning.anatomy.anatomy import Anatomy
+    from puncture_twin.planning.case.case import Case
+    from puncture_twin.planning.plan.plan import Plan
+    from puncture_twin.twin.plant.truth import Truth
+    from puncture_twin.twin.rehearsal.result import Rehearsal, Scale
+
+
+Wait = Callable[[], Any]
+"""Gives what a stage makes, once."""
+
+Begin = Callable[..., Wait]
+"""Begins a stage, a function with its arguments: in another process, or, as `partial` does, when it is waited for."""
+
+
+@contextmanager
+def two_stages() -> Iterator[Begin]:
+    """Begin stages in a process beside this one, where a core is free for it.
+
+    A demo's plan is executed and filmed while its pictures are drawn: a third less by the clock.
+    """
+    if worker_count(2, 2) == 1:
+        yield partial
+        return
+    with process_pool(1, 1) as pool:
+        pool.submit(_load_simulator)
+        yield lambda function, *arguments: pool.submit(function, *arguments).result
+
+
+def _load_simulator() -> None:
+    from puncture_twin.twin.rehearsal import rehearsal as _simulator
+    from puncture_twin.twin.report.scene import film as _film
+
+    del _simulator, _film
+
+
+def _execute(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsal:
+    """See `rehearse`; PyBullet is loaded where this is called."""
+    from puncture_twin.twin.rehearsal.rehearsal import rehearse
+
+    return rehearse(plan, case, anatomy, truth)
+
+
+def _film(rehearsal: Rehearsal, plan: Plan, case: Case, anatomy: Anatomy, path: Path) -> Path:
+    from puncture_twin.twin.report.scene.film import draw_film
+
+    return draw_film(rehearsal, plan, case, anatomy, path)
+
+
+@dataclass(frozen=True)
+class PendingRehearsal:
+    """A run whose plan is being executed: by whoever begins its stages."""
+
+    run: Run
+    begin: Begin
+    rehearsal: Wait
+    scale: Scale | None
+
+    def ended(self, out: Path, with_page: Callable[[Run], Run] | None = None) -> Run:
+        """The run with what was measured and the film, once they are there; the numbers and the rooms are written.
+
+        Args:
+            out: The folder of the files.
+            with_page: Adds the page that shows them all to a run; while the film is made, which has the usual name
+                but where no encoder can be started.
+
+        Raises:
+            InputError: See `rehearse`.
+        """
+        shown, run, time = self._rooms_drawn(out), self.run, self.run.context.stages.time
+        with time("rehearsal"):
+            rehearsal: Rehearsal = self.rehearsal()
+        scale = self.scale
+        rehearsal = replace(rehearsal, standing=None if scale is None else scale.of(rehearsal.tip_error_mm))
+        film_at = self.begin(_film, rehearsal, run.plan, run.context.case, run.context.anatomy, out / FILM)
+        document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
+        measured = replace(run, rehearsal=rehearsal).with_files(_write_json(document, out / "rehearsal.json"))
+        rooms = (out / ROOMS,) if shown else ()
+        run = measured.with_files(out / FILM, *rooms)
+        run = run if with_page is None else with_page(run)
+        with time("film"):
+            film: Path = film_at()
+        if film == out / FILM:
+            return run
+        run = measured.with_files(film, *rooms)
+        return run if with_page is None else with_page(run)
+
+    def _rooms_drawn(self, out: Path) -> dict[str, Any]:
+        """What the rehearsal's file says of many rooms, their picture being drawn; nothing where there are none."""
+        from puncture_twin.twin.report.error_pictures import draw_rooms_picture
+
+        found = self.run.distribution
+        if found is None:
+            return {}
+        with self.run.context.stages.time("rooms.png"):
+            draw_rooms_picture(found, out / ROOMS)
+        return {"distribution": found.summary()}
+
+
+def begin_rehearsal(run: Run, rooms: RoomCount | None, begin: Begin) -> PendingRehearsal:
+    """Have the run's plan executed where the truth differs, of many rooms in the median one.
+
+    Raises:
+        InputError: See `plan_truth`.
+        NoAnswerError: See `plan_truth`.
+    """
+    assert run.plan is not None
+    context, plan = run.context, run.plan
+    run = run if rooms is None else replace(run, distribution=_distribution(run, rooms))
+    found = run.distribution
+    truth = plan_truth(context, plan) if found is None else median_truth(found)
+    scale = error_scale(context, plan.insertion.q[-1], found)
+    return PendingRehearsal(run, begin, begin(_execute, plan, context.case, context.anatomy, truth), scale)
+
+
+def _distribution(run: Run, count: RoomCount) -> Distribution:
+    assert run.plan is not None
+    context = run.context
+    with context.stages.time("rooms"):
+        q = run.plan.insertion.q[-1]
+        found = rehearse_trials(context, run.plan.outward_ct, q, count.rooms, context.case.rehearsal.seed)
+    if not (count.physics and len(found)):
+        return found
+    from puncture_twin.twin.rehearsal.plan_truth import physics_trials
+
+    with context.stages.time("physics"):
+        again = partial(context.watcher.count, "rooms in the simulator")
+        return replace(found, physics=physics_trials(context, run.plan, found, count.physics, again))
+
+
+def _write_json(summary: dict[str, Any], path: Path) -> Path:
+    with atomic(path) as temporary:
+        temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path
