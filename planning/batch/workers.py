@@ -129,7 +129,8 @@ def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator
     try:
         while queue or workers:
             while queue and len(workers) < jobs:
-                workers.append(_started(queue.next(None), limits))
+                with _without_interrupt():  # until the worker is listed: one that is not would be left alone
+                    workers.append(_started(queue.next(None), limits))
             for worker in _spoken(workers):
                 yield from _heard(worker, workers, queue)
             for worker in list(workers):
@@ -148,15 +149,14 @@ def _started(task: CaseTask, limits: Limits) -> _Worker:
     ours, theirs = SPAWN.Pipe()
     kept = MEMORY_BYTES if limits.memory_mb is None else min(MEMORY_BYTES, limits.memory_mb * 1_000_000 // 4)
     process = SPAWN.Process(target=work, args=(theirs, kept), daemon=True)
-    with _without_interrupt():
-        process.start()
+    process.start()
     theirs.close()
     return _Worker(process, ours, task)
 
 
 @contextmanager
 def _without_interrupt() -> Iterator[None]:
-    """Start processes that never see Ctrl-C: the main process ends them."""
+    """Put Ctrl-C off; a process that is started within never sees it, and the main process ends it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
