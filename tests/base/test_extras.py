@@ -27,7 +27,7 @@ def test_planner_map_and_page_need_no_extra():
     """All of the planner, and of what searches, plans, exports and draws, is imported where no extra is installed."""
     missing = [*MODULES["twin"], *MODULES["mirror"], "SimpleITK", "pytest", "gdcm", "h5py"]
     rooms = tuple(f"puncture_twin.{room}." for room in ("planning", "twin.report", "twin.jobs.patient"))
-    others = ("planning.collision_cases", "twin.report.scene.film", "twin.jobs.patient.main_job")
+    others = ("planning.collision_cases", "twin.report.scene.film", "twin.jobs.patient.rehearsed")
     names = [name for name in modules() if name.startswith(rooms)]
     names = [name for name in names if not name.startswith(tuple(f"puncture_twin.{other}" for other in others))]
     assert len(names) > 200

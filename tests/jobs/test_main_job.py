@@ -249,7 +249,7 @@ def test_ctrl_c_is_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_path, 
 @pytest.fixture
 def one_core(monkeypatch):
     """Nothing begins in a process beside."""
-    monkeypatch.setattr("puncture_twin.twin.jobs.patient.main_job.worker_count", lambda wanted, pieces: 1)
+    monkeypatch.setattr("puncture_twin.twin.jobs.patient.rehearsed.worker_count", lambda wanted, pieces: 1)
 
 
 @pytest.mark.usefixtures("one_core")

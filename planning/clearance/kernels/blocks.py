@@ -76,9 +76,12 @@ def pack(mesh: TriangleMesh, known: NDArray[np.int32] | None = None) -> Blocks:
 
 
 def _outward(disc: Floats) -> NDArray[np.float32]:
-    """Convert to float32, radius and thickness grown by more than the rounding of anything that made them."""
+    """Convert to float32, radius and thickness grown by more than the rounding of anything that made them.
+
+    A rounded normal is rotated by up to 6e-8: what lies at the rim of a wide, flat disc rises by as much of its radius.
+    """
     grown = disc.copy()
-    grown[3:] = grown[3:] * (1 + 1e-5) + 1e-6
+    grown[3:] = grown[3:] * (1 + 1e-5) + 1e-6 + 1e-6 * disc[3:].sum(axis=0)
     return grown.astype(np.float32)
 
 
