@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
 
-app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = typer.Typer(no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
 
@@ -414,7 +414,9 @@ def export(
     format_name: Annotated[
         str,
         typer.Option(
-            "--format", metavar="FORMAT", help="urscript, ros2, moveit, csv, slicer, candidates-csv or candidates-json."
+            "--format",
+            metavar="FORMAT",
+            help="urscript, ros2, moveit, csv, slicer, candidates-csv, candidates-json, or a package's own.",
         ),
     ],
     case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,

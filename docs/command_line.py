@@ -18,6 +18,10 @@ input is refused, or nothing is found, the object has `error` alone: `code` (one
 `--out` files go to `out/`, into a folder named after case and command (`out/abdomen-search`). What is written:
 [outputs.md](outputs.md).
 
+`run-twin --install-completion` lets bash, zsh, fish or PowerShell, whichever it is called from, complete commands and
+options from its next start on (1 from any other); `--show-completion` prints the script instead, as
+`_RUN_TWIN_COMPLETE=source_bash run-twin` does wherever it is called from.
+
 *Written by `python docs/command_line.py` from the help of each command (`run-twin COMMAND --help`).*
 """
 

@@ -21,7 +21,7 @@ from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE, beyond_images
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, NO_MEMORY, Memory, user_cache
 from puncture_twin.planning.base.errors import Finding, InputError, Severity
-from puncture_twin.planning.base.progress import Silent, Stages, Watcher
+from puncture_twin.planning.base.progress import LOG, Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.case.case import Case
@@ -231,6 +231,8 @@ def prepare(
         )
         check_tissues(case, anatomy)
         shown = tuple(one.sentence for one in collected if one.severity is not Severity.NOTE)
+        for warning in shown:
+            LOG.warning(warning)
         anatomy = replace(anatomy, warnings=shown, findings=collected)
         case.files.release()
         memory.limit(MEMORY_BYTES)

@@ -2,6 +2,7 @@
 
 import math
 import re
+import sys
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from places import ROOT
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -21,7 +23,7 @@ from puncture_twin.planning.arm.ur import JOINT_NAMES, UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.export.exporter import FORMATS, blend_radii_mm, csv_text, export_plan, read_csv
+from puncture_twin.planning.export.exporter import FORMATS, GROUP, blend_radii_mm, csv_text, export_plan, read_csv
 from puncture_twin.planning.export.program import (
     PLAIN,
     check_sampled,
@@ -39,6 +41,7 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
 from puncture_twin.planning.reach.survey import every_branch
+from puncture_twin.twin.jobs.patient.export_jobs import refuse_format
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -456,6 +459,72 @@ def test_what_is_exported_is_the_plan(plan, smooth, name, tmp_path):
             read = read_csv(text, where=source) if name == "csv" else read_ros2(text, UR3, where=source)
             check_sampled(read, one, time_resolution_s=1e-9, where=source)
     assert len(list((tmp_path / "out").iterdir())) == 2
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """An installed package with a format of its own: that of the example."""
+
+    def install(text, names="degrees = own_format:DEGREES"):
+        (tmp_path / "own.dist-info").mkdir()
+        (tmp_path / "own.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: own\nVersion: 1\n")
+        (tmp_path / "own.dist-info" / "entry_points.txt").write_text(f"[{GROUP}]\n{names}\n")
+        (tmp_path / "own_format.py").write_text(text)
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.delitem(sys.modules, "own_format", raising=False)
+
+    return install
+
+
+EXAMPLE = (ROOT / "examples" / "06_export_your_own_format.py").read_text(encoding="utf-8")
+
+
+def test_a_package_adds_a_format(plan, package, tmp_path):
+    """By an entry point; what it writes is held to what ours are."""
+    package(EXAMPLE)
+    refuse_format("degrees")
+    done = export_plan(plan, "degrees", tmp_path / "out", source=SOURCE)
+    assert (done.path.name, done.notes) == ("plan.degrees.txt", ("the insertion is for the operator to start",))
+    last = np.array(done.path.read_text().split("\n\n")[1].split()[-6:], float)
+    np.testing.assert_allclose(np.radians(last), plan.insertion.q[-1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("np.degrees(one.q)", "np.degrees(one.q) + 1e-6"), ("np.radians(block[:, 1:])", "block[:, 1:]")],
+    ids=["written wrong", "read wrong"],
+)
+def test_a_package_that_writes_another_motion_is_refused(plan, package, tmp_path, old, new):
+    """Nothing is published."""
+    package(EXAMPLE.replace(old, new))
+    with pytest.raises(InputError):
+        export_plan(plan, "degrees", tmp_path / "out", source=SOURCE)
+    assert list((tmp_path / "out").glob("*")) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "code"),
+    [
+        (EXAMPLE, "radians", "unknown_format"),
+        ("DEGREES = 1\n", "degrees", "no_exporter"),
+        ("import nothing_of_that_name\n", "degrees", "no_exporter"),
+        ("", "degrees", "no_exporter"),
+        (EXAMPLE.replace(".degrees.txt", ".json"), "degrees", "no_exporter"),
+    ],
+    ids=["another name", "no exporter", "no import", "no such name", "the plan's own name"],
+)
+def test_a_package_without_an_exporter_is_refused(plan, package, tmp_path, text, name, code):
+    """In one line, before anything is written."""
+    package(text)
+    with pytest.raises(InputError) as refused:
+        export_plan(plan, name, tmp_path / "out", source=SOURCE)
+    assert refused.value.code == code and not (tmp_path / "out").exists()
+
+
+def test_a_package_takes_no_name_of_ours(plan, package, tmp_path):
+    """The table stays ours."""
+    package(EXAMPLE, "csv = own_format:DEGREES")
+    assert export_plan(plan, "csv", tmp_path / "out", source=SOURCE).path.name == "plan.csv"
 
 
 def test_the_table_is_exact(plan):

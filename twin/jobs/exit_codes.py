@@ -157,6 +157,8 @@ def _exit_code_of(command: Callable[[], object], print_line: PrintLine, as_json:
 
 def _unread(error: BaseException) -> int:
     """The code where nobody reads stdout; a pipe that broke elsewhere, such as a worker's, is a failure."""
+    if isinstance(error, SystemExit) and not error.code:  # typer has completed a shell's word, or said how
+        return OK
     in_help = traceback.extract_tb(error.__traceback__)[-1].name == "on_broken_pipe"  # rich; stdout goes nowhere then
     if not (in_help or reader_is_gone(sys.stdout)):
         traceback.print_exc()

@@ -15,7 +15,7 @@ from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.export.exporter import FORMATS, Exported
+from puncture_twin.planning.export.exporter import Exported, format_names
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
 from puncture_twin.planning.export.slicer import NAMES, SLICER, SceneContent, entry_area, slicer_files
 from puncture_twin.planning.plan.plan_check import with_case_arm
@@ -84,7 +84,7 @@ def refuse_format(name: str) -> None:
     Raises:
         InputError: Names those that are.
     """
-    known = (*FORMATS, MOVEIT, SLICER, *CANDIDATE_FORMATS)
+    known = (*format_names(), MOVEIT, SLICER, *CANDIDATE_FORMATS)
     if name not in known:
         raise InputError(f"format '{name}' is not known", where="--format", allowed=", ".join(known))
 
