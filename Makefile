@@ -17,7 +17,7 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: FORCE demo test browser quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel docs pictures meshes clean
+.PHONY: FORCE demo test browser quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel release docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
@@ -68,14 +68,14 @@ $(LINKS):
 	@ln -sfn ../$(@F) $@
 
 # The stamp holds what was installed: files that are only newer, as after a checkout, install nothing again.
-VERSION := -c 'import sys; print("Python %d.%d" % sys.version_info[:2])'
-STAMP := { cat pyproject.toml constraints.txt; $(PYTHON) $(VERSION); }
+WHICH := -c 'import sys; print("Python %d.%d" % sys.version_info[:2])'
+STAMP := { cat pyproject.toml constraints.txt; $(PYTHON) $(WHICH); }
 $(VENV)/installed: FORCE
 	@[ -n "$(PYTHON)" ] || { echo "no Python 3.11, 3.12 or 3.13 with venv is here; Debian 12 and later, Ubuntu 24.04: apt install python3-venv"; exit 2; }
 	@$(STAMP) 2>/dev/null | cmp -s - $@ || $(MAKE) --no-print-directory reinstall PYTHON=$(PYTHON)
 
 reinstall:
-	@[ "$$($(BIN)/python $(VERSION) 2>&1)" = "$$($(PYTHON) $(VERSION))" ] || rm -rf $(VENV)
+	@[ "$$($(BIN)/python $(WHICH) 2>&1)" = "$$($(PYTHON) $(WHICH))" ] || rm -rf $(VENV)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
 	@$(BIN)/python -c "import pybullet" 2>/dev/null || { echo "building the simulator: PyBullet has no wheel for this Python (8 minutes; needs g++ and python3-dev)"; \
@@ -102,6 +102,11 @@ kernels:
 # In out/wheels: for every machine.
 wheel: install
 	$(BIN)/pip wheel --quiet --no-deps --wheel-dir out/wheels .
+
+# A commit and a tag, after linters, quick tests and the wheel in an empty environment: make release VERSION=0.2.0
+VERSION ?=
+release: install
+	$(BIN)/python -m tools.release $(VERSION)
 
 # The pages and the API reference, as a site in out/site.
 docs: install
