@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -151,6 +152,16 @@ def test_a_folder_of_compiled_code_is_the_users_alone(folder):
         with pytest.raises(InputError) as error:
             check_own_folder(place)
         assert error.value.code == "cache_not_own"
+
+
+def test_a_place_where_others_could_lay_another_folder_of_compiled_code_is_refused(folder):
+    """Though nobody else may look into the folder itself; the sticky bit forbids that."""
+    folder.chmod(0o700)
+    for mode, wrong in ((0o777, True), (0o757, True), (0o1777, False), (0o755, False)):
+        folder.parent.chmod(mode)
+        entry_file._known_in_reach.cache_clear()
+        with pytest.raises(InputError) if wrong else nullcontext():
+            check_own_folder(folder)
 
 
 def test_a_command_says_it_in_one_line(folder, tmp_path, monkeypatch, capfd):

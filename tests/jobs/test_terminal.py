@@ -1,5 +1,6 @@
 """At the terminal: help, a reader who goes away, folders that name themselves, widths and colours."""
 
+import errno
 import os
 import re
 import subprocess
@@ -72,6 +73,20 @@ def test_a_pipe_that_broke_elsewhere_is_a_failure(capsys):
 
     assert exit_code_of(broken, print) == PROGRAM_FAILED
     assert "BrokenPipeError" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [None, "out/table"])
+def test_a_disk_that_takes_no_more_is_told_in_one_line(name, capsys):
+    """Of whatever file, one that a library writes too: exit code 3, and no traceback."""
+
+    def full():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), name)
+
+    said = []
+    assert exit_code_of(full, said.append) == PROGRAM_FAILED
+    (line,) = said
+    assert "No space left" in line and (name or "kernels") in line
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize(

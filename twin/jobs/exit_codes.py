@@ -5,6 +5,7 @@ What a wrong command line may say instead.
 
 from __future__ import annotations
 
+import errno
 import sys
 import traceback
 import warnings
@@ -168,13 +169,16 @@ def _unread(error: BaseException) -> int:
 
 
 def _failed(error: Exception, print_line: PrintLine) -> int:
-    """What broke is shown whole, unless it is that stdout takes nothing, as where its disk is full."""
+    """What broke is shown whole, unless it is that stdout takes nothing, or a disk no more."""
     why = refusal_of(sys.stdout) if isinstance(error, OSError) else None
-    if why is None:
-        traceback.print_exc()
-    else:
+    if why is not None:
         leave_unread(sys.stdout)
         print_line(f"stdout: {why}; allowed: a place that takes it")
+    elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        place = error.filename or "a file of --out, of a cache (kernels are kept in one) or in $TMPDIR"
+        print_line(f"{place}: {error.strerror}; allowed: room on that disk")
+    else:
+        traceback.print_exc()
     return PROGRAM_FAILED
 
 

@@ -92,7 +92,7 @@ def check_own_folder(folder: Path) -> None:
     Raises:
         InputError: With the code ``cache_not_own``.
     """
-    check_own(folder / "entry")
+    check_own(folder)  # and those around it, where others could lay another in its place
     status = folder.lstat()
     if stat.S_ISLNK(status.st_mode):
         raise _refusal(folder, "is a link")
