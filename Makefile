@@ -17,13 +17,18 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: FORCE demo test browser quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel release docs pictures meshes clean
+.PHONY: FORCE demo test versions browser quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel release docs pictures meshes clean
 
 demo: install
 	$(BIN)/python run_twin.py demo --out $(OUT)
 
 test: install browser lint
 	$(BIN)/pytest -q -n auto --dist loadfile
+	@[ -z "$$CI" ] || $(MAKE) --no-print-directory versions
+
+# Beside this environment: the newest Python, and the lowest version of every part (two minutes; in CI a part of make test).
+versions: install
+	$(BIN)/python -m tools.versions
 
 # While one works: what takes under 0.07 s a test, without real data.
 quick: install

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,8 +32,10 @@ from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, appr
 from puncture_twin.planning.touch.tour_motions import TouchTour
 from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, check_one_place, pivot_calibration
 from puncture_twin.twin.jobs.terminal import write_result
-from puncture_twin.twin.plant.true_needle import TouchTruth, draw_pivot_truth
-from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
+
+if TYPE_CHECKING:  # a list is read where the simulator is not installed
+    from puncture_twin.twin.plant.true_needle import TouchTruth
+    from puncture_twin.twin.rehearsal.touching import Touched
 
 STANDS_OUT = 2.0
 """A touch that misses by so many times the others' root mean square is named."""
@@ -248,6 +250,8 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
 
 
 def _truth(context: CaseContext, tour: TouchTour, seed: int) -> TouchTruth:
+    from puncture_twin.twin.plant.true_needle import draw_pivot_truth
+
     errors = context.case.truth_errors or context.case.errors
     assert errors is not None and context.reach is not None
     names = tuple(f"P{number + 1}" for number in range(len(tour.touches)))
@@ -255,6 +259,8 @@ def _truth(context: CaseContext, tour: TouchTour, seed: int) -> TouchTruth:
 
 
 def _executed(context: CaseContext, tour: TouchTour, truth: TouchTruth) -> Touched:
+    from puncture_twin.twin.rehearsal.touching import execute_touches
+
     checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
     with context.stages.time("touches"):
         touched = execute_touches(tour, context.case, context.anatomy, checkers, truth, count)
