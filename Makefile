@@ -83,7 +83,7 @@ reinstall:
 	@[ "$$($(BIN)/python $(WHICH) 2>&1)" = "$$($(PYTHON) $(WHICH))" ] || rm -rf $(VENV)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
-	@$(BIN)/python -c "import pybullet" 2>/dev/null || { echo "building the simulator: PyBullet has no wheel for this Python (8 minutes; needs g++ and python3-dev)"; \
+	@$(BIN)/python -c "import pybullet" 2>/dev/null || { echo "building the simulator: PyBullet has no wheel for this Python (8 minutes; needs a compiler: apt install g++ python3-dev)"; \
 	  $(BIN)/pip install --quiet --constraint constraints.txt pybullet; } || \
 	  echo "no simulator: demo, rehearse, servo, selfcal, reproduce and their tests need it; all else works (so does PYTHON=python3.11)"
 	$(MAKE) --no-print-directory kernels
@@ -96,11 +96,11 @@ browser:
 	  $(BIN)/playwright install chromium >/dev/null 2>&1 || \
 	  echo "NO BROWSER IS HERE: the page's tests in one are skipped, and fail where CI is set; apt install chromium"
 
-# Compiled here, not while a person waits for a first answer. What is not compiled here is where it is first used.
+# Compiled here, not while a person waits for a first answer; by a search where there is no simulator. What is not compiled here is where it is first used.
 kernels:
 	@echo "compiling the kernels (a minute)"
 	@out=$$(mktemp -d) && export PUNCTURE_TWIN_CACHE=$$out/cache && \
-	  { $(BIN)/python run_twin.py demo --out $$out/demo && \
+	  { { $(BIN)/python run_twin.py demo --out $$out/demo || $(BIN)/python run_twin.py search meshes/abdomen --out $$out/demo; } && \
 	    $(BIN)/python run_twin.py check meshes/abdomen --theta 64 --beta 98; } > $$out/log 2>&1 || \
 	  { tail -n 1 $$out/log; echo "kernels will be compiled where they are first used"; }; rm -rf $$out
 
