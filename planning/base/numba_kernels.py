@@ -179,7 +179,8 @@ _use_folder()
 
 UNCOUNTED: dict[str, Any] = {"_nrt": False} if nb.version_info.short <= (0, 68) else {}
 """Numba's option of that meaning, in versions that were tried: it is no public one. Without it answers are the same, a
-search takes a third more and compiling half."""
+search takes a third more and compiling half. Arrays without a counter, which an intrinsic of public names can hand on,
+buy two thirds of that in the smallest kernel (.49 s plain, .15 so, .01 with the option)."""
 
 allocation_free: Any = partial(nb.njit, cache=True, **UNCOUNTED)
 """Compile a kernel that makes no array: all that it works on, and works in, its caller owns.
