@@ -17,12 +17,12 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: FORCE demo test versions browser quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel release docs pictures meshes clean
+.PHONY: FORCE demo test versions simulator browser quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel release docs pictures meshes clean
 
-demo: install
+demo: install simulator
 	$(BIN)/python run_twin.py demo --out $(OUT)
 
-test: install browser lint
+test: install simulator browser lint
 	$(BIN)/pytest -q -n auto --dist loadfile
 	@[ -z "$$CI" ] || $(MAKE) --no-print-directory versions
 
@@ -83,11 +83,16 @@ reinstall:
 	@[ "$$($(BIN)/python $(WHICH) 2>&1)" = "$$($(PYTHON) $(WHICH))" ] || rm -rf $(VENV)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
-	@$(BIN)/python -c "import pybullet" 2>/dev/null || { echo "building the simulator: PyBullet has no wheel for this Python (8 minutes; needs a compiler: apt install g++ python3-dev)"; \
-	  $(BIN)/pip install --quiet --constraint constraints.txt pybullet; } || \
-	  echo "no simulator: demo, rehearse, servo, selfcal, reproduce and their tests need it; all else works (so does PYTHON=python3.11)"
+	@$(MAKE) --no-print-directory simulator
 	$(MAKE) --no-print-directory kernels
 	$(STAMP) > $(VENV)/installed
+
+# PyBullet has no wheel after Python 3.11. Where it could not be built, the next make demo or make test tries again.
+simulator:
+	@$(BIN)/python -c "import pybullet" 2>/dev/null || { command -v g++ >/dev/null && \
+	  echo "building the simulator: PyBullet has no wheel for this Python (8 minutes; needs g++ and python3-dev)" && \
+	  $(BIN)/pip install --quiet --constraint constraints.txt pybullet; } || \
+	  echo "NO SIMULATOR: demo, rehearse, servo, selfcal, reproduce and their tests need it; all else works. apt install g++ python3-dev, or PYTHON=python3.11"
 
 # The page is tested in one: Debian's where it may be installed, else Playwright's own.
 browser:
