@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,8 +59,8 @@ LONGEST_MM = 1e9
 class FastEngine:
     """Exact distances by bundles of directions over trees of discs; FCL where a verdict hangs on rounding.
 
-    Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, measured from any
-    target.
+    Answers what `FclEngine` answers, to rounding of float64. Surfaces are packed when it is first asked, once for all
+    targets.
 
     Args:
         meshes: The k surfaces, in the CT frame, mm.
@@ -80,8 +80,7 @@ class FastEngine:
         cache: Cache = NO_CACHE,
         threads: int = MOST_THREADS,
     ) -> None:
-        memory = cache.memory
-        self._blocks = _packed(meshes, threads, cache) if memory is NO_MEMORY else _remembered(meshes, memory)
+        self._meshes, self._cache = tuple(meshes), cache
         self._seen: tuple[Floats, tuple[PlacedSurface, ...]] | None = None
         self._threads = threads
         self._progress = progress
@@ -90,12 +89,14 @@ class FastEngine:
     @property
     def triangles(self) -> tuple[Floats, ...]:
         """Triangles of each structure, in blocks; see `ClearanceEngine`."""
-        return tuple(blocks.triangles for blocks in self._blocks)
+        return tuple(blocks.triangles for blocks in self.blocks)
 
-    @property
+    @cached_property
     def blocks(self) -> tuple[Blocks, ...]:
         """Packed blocks of each structure; see `ClearanceEngine`."""
-        return self._blocks
+        if self._cache.memory is NO_MEMORY:
+            return _packed(self._meshes, self._threads, self._cache)
+        return _remembered(self._meshes, self._cache.memory)
 
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
@@ -103,7 +104,7 @@ class FastEngine:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         target = np.ascontiguousarray(target_ct, dtype=np.float64)
         outward = np.ascontiguousarray(outward_ct, dtype=np.float64).reshape(-1, 3)
-        shape = (len(self._blocks), len(outward))
+        shape = (len(self._meshes), len(outward))
         lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[::-1]).T
         _refuse_unsound(target, outward, lengths)
         answer = AxisDistances(np.empty(shape), np.empty(shape), np.empty(shape, np.int32))
@@ -112,7 +113,7 @@ class FastEngine:
         threads = self._threads if np.prod(shape) >= WORTH_THREADS else 1
         for done in on_threads(lambda k: measure_structure(target, *pieces[k], counts[k]), len(pieces), threads):
             if shown and self._progress is not None:
-                self._progress(done * len(self._blocks) // len(pieces), len(self._blocks))
+                self._progress(done * shape[0] // len(pieces), shape[0])
         self.counts += counts.sum(axis=0)
         return AxisDistances(answer.distance.T, answer.depth.T, answer.nearest.T)
 
@@ -124,8 +125,8 @@ class FastEngine:
         Here rows of ``answer`` are structures.
         """
         seen, tiles, pieces = self._seen_from(target), bundle(outward), []
-        for row in sorted(range(len(self._blocks)), key=lambda row: -len(self._blocks[row].triangles)):
-            blocks = self._blocks[row]
+        for row in sorted(range(len(self.blocks)), key=lambda row: -len(self.blocks[row].triangles)):
+            blocks = self.blocks[row]
             own = AxisDistances(answer.distance[row], answer.depth[row], answer.nearest[row])
             for part in tiles.parts(2 + len(blocks.triangles) // PIECE_TRIANGLES):
                 pieces.append((part, blocks, seen[row], lengths[row], own))
@@ -134,7 +135,7 @@ class FastEngine:
     def _seen_from(self, target: Floats) -> tuple[PlacedSurface, ...]:
         """The surfaces as seen from a target; those of the last target are cached."""
         if self._seen is None or not np.array_equal(self._seen[0], target):
-            self._seen = (target.copy(), tuple(placed_surface(blocks, target) for blocks in self._blocks))
+            self._seen = (target.copy(), tuple(placed_surface(blocks, target) for blocks in self.blocks))
         return self._seen[1]
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
@@ -152,7 +153,8 @@ class FastEngine:
     def of(self, columns: Ints) -> FastEngine:
         """The same engine for some of its structures; see `ClearanceEngine`."""
         part = copy(self)
-        part._blocks = tuple(self._blocks[column] for column in columns)
+        part._meshes = tuple(self._meshes[column] for column in columns)
+        vars(part)["blocks"] = tuple(self.blocks[column] for column in columns)
         part._seen, part._progress = None, None
         return part
 
