@@ -19,7 +19,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE, beyond_images
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, NO_MEMORY, Memory, user_cache
+from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory, user_cache
 from puncture_twin.planning.base.errors import Finding, InputError, Severity
 from puncture_twin.planning.base.progress import Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
@@ -233,7 +233,6 @@ def prepare(
         shown = tuple(one.sentence for one in collected if one.severity is not Severity.NOTE)
         anatomy = replace(anatomy, warnings=shown, findings=collected)
         case.files.release()
-        memory.limit(MEMORY_BYTES)
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
         cache_option = {"cache": cache} if engine == "fast" else {}

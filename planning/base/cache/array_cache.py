@@ -79,19 +79,11 @@ class Memory:
         """What the values may hold."""
         return self._most
 
-    def limit(self, most_bytes: int) -> None:
-        """Hold no more than so much from now on."""
-        self._most = min(self._most, most_bytes)
-        self._shrink()
-
     def _keep(self, key: tuple[Hashable, ...], value: Any, size: int) -> None:
         if size > self._most:
             return
         self._kept[key] = value, size
         self._held += size
-        self._shrink()
-
-    def _shrink(self) -> None:
         while self._held > self._most:
             _, (_, gone) = self._kept.popitem(last=False)
             self._held -= gone
@@ -179,7 +171,7 @@ class Cache:
                 return read(_frozen(make()))
             return self._from_folder(_entry(made_from, by), make, read).value
         entry = _entry(made_from, by)
-        return read(self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, read).arrays, _size))
+        return self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, read), _size).value
 
     def _from_folder(
         self, entry: StoredFile, make: Callable[[], Arrays], read: Callable[[Arrays], Value]
@@ -236,8 +228,9 @@ def _frozen(arrays: Arrays) -> Arrays:
     return arrays
 
 
-def _size(arrays: Arrays) -> int:
-    return sum(array.nbytes for array in arrays.values())
+def _size(found: _Read[Any]) -> int:
+    """Of the arrays, which the value looks at."""
+    return sum(array.nbytes for array in found.arrays.values())
 
 
 def _entry(made_from: Mapping[str, Any], by: str) -> StoredFile:
