@@ -24,7 +24,7 @@ from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
-from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.labels.label_surface import frame, framed_surface
 from puncture_twin.planning.formats.meshes.mesh_files import cached_mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -273,4 +273,6 @@ def ball(middle_ct: Floats, radius_mm: float) -> TriangleMesh:
     field = radius_mm - np.sqrt(x**2 + y**2 + z**2)
     field[field == 0.0] = -np.finfo(np.float32).eps
     T_ct_index = pose(np.eye(3) * cell, middle_ct + offset[0])
-    return field_surface(field / radius_mm, T_ct_index, where=OWN_TARGET)
+    framed, within = frame(field.shape)
+    within[:] = field / radius_mm
+    return framed_surface(framed, T_ct_index, where=OWN_TARGET)

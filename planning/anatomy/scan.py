@@ -33,7 +33,7 @@ from puncture_twin.planning.anatomy.surfaces import Imaged, kept_mesh, mesh_arra
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.labels.label_surface import mask_surface
 from puncture_twin.planning.formats.mesh_guard import fits
 from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
@@ -142,7 +142,7 @@ class Scan:
             limbs = search.limbs()
             if not limbs.any():
                 return None
-            return field_surface(limbs.astype(np.float32) - 0.5, search.T_ct_index, where=self._ct.where)
+            return mask_surface(limbs, search.T_ct_index, where=self._ct.where)
 
         named = [f"{one.name} {one.mesh.digest}" for one in structures]
         made_from = {"what": "attached limbs", "target": target_ct.tolist(), "structures": named}

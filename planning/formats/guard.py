@@ -15,6 +15,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from puncture_twin.planning.base.arrays import is_frozen
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.text import check_name
 
@@ -102,7 +103,7 @@ def _float_array(values: ArrayLike, *, what: str, where: str | Path, allowed: st
         raise InputError(f"{what} is ragged ({error})", where=where, allowed=allowed) from error
     if raw.dtype.kind not in "iuf":
         refuse(f"{what} holds values of type {raw.dtype}", where, allowed)
-    return np.array(raw, dtype=np.float64, order="C")
+    return raw if is_frozen(raw, np.float64) else np.array(raw, dtype=np.float64, order="C")
 
 
 def points_array(points: ArrayLike, names: Sequence[str], *, what: str, where: str | Path) -> NDArray[np.float64]:

@@ -53,7 +53,8 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
     _check_not_tiny(surface.points, where=where)
     if not _any_area(surface):
         refuse(f"none of the {len(indices)} triangles has an area", where, "at least one triangle with an area")
-    return TriangleMesh(surface.points, surface.indices)
+    surface.points.setflags(write=False)  # nobody else has it: it is taken as it is
+    return TriangleMesh(*surface)
 
 
 def fits(mesh: TriangleMesh) -> bool:

@@ -22,7 +22,7 @@ from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import read_input
-from puncture_twin.planning.formats.mesh_guard import guard_mesh, twice_areas
+from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.meshes.obj import read_obj
 from puncture_twin.planning.formats.meshes.ply import read_ply
 from puncture_twin.planning.formats.meshes.stl import read_stl
@@ -183,7 +183,7 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
         name: Its name, for the text.
     """
     warnings = []
-    flat = int((twice_areas(mesh.vertices, mesh.faces) == 0.0).sum())
+    flat = np.count_nonzero(mesh.areas == 0.0)
     if flat:
         warnings.append(f"{name}: {flat} of {len(mesh.faces)} triangles have no area (kept)")
     if not mesh.closed:
