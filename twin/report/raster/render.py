@@ -286,7 +286,7 @@ def _pixels(solid: View, glass: View, band: int, rows: slice) -> NDArray[np.uint
     behind, shells = Drawn.empty(1, size), Drawn.empty(MAX_SHELLS, size)
     solid.draw(np.zeros(size, dtype=np.float32), behind, corner, solid.of_band(band))
     glass.draw(behind.inverse[0], shells, corner, glass.of_band(band))
-    held = np.empty((1 + MAX_SHELLS, SAMPLES * SAMPLES, 4), dtype=np.float32)
+    held = np.zeros((1 + MAX_SHELLS, SAMPLES * SAMPLES, 4), dtype=np.float32)  # what is not there is blended at 0
     pixels = np.empty((size[0] // SAMPLES, size[1] // SAMPLES, 3), dtype=np.uint8)
     place: Any = tuple(LIGHT), solid.grid, corner
     finish(solid.look, glass.look, *place, behind.triangle, shells.triangle, tuple(BACKGROUND), held, pixels)
