@@ -146,14 +146,6 @@ class FastChecker(CellChecker):
         contact = self._tested[check].contact
         return contact._replace(other=OUTSIDE_BODY) if answer == TOUCHES_OUTSIDE else contact
 
-    def segment_contact(self, start: Floats, end: Floats) -> Contact | None:
-        """A contact on the straight joint segment between states (6,), rad; None if free. See :class:`SegmentChecker`.
-
-        Raises:
-            InputError: If a state is not finite.
-        """
-        return self.segment_checker()(start, end)
-
     def segment_checker(self, clear_mm: float = 0.0) -> SegmentChecker:
         """A check of many segments, which remembers what touched last; with a clearance where their ends have it."""
         return SegmentChecker(self.model, self._tested, self._proofs, self._segment_scratch, clear_mm)

@@ -6,9 +6,7 @@ empty one.
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +19,8 @@ MIN_DIAGONAL_MM = 0.5
 """Smallest bounding box diagonal of a structure: less than any vessel. An organ in metres is below."""
 MAX_DIAGONAL_MM = 5_000.0
 """Largest one: a body and its table fit. A body in mm that is declared as cm or m does not."""
+FIRST = 16
+"""Triangles that nearly always answer whether any has an area, without a kernel."""
 MAX_TRIANGLES = 20_000_000
 """Fifty times our finest whole body; more would only exhaust the memory (1.4 GB of corner coordinates)."""
 
@@ -49,12 +49,11 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
     points = points_array(vertices, [], what="vertex", where=where)
     indices = _index_array(faces, len(points), where=where)
     _check_not_huge(points, where=where)
-    surface = _without_unused(points, indices)
-    _check_not_tiny(surface.points, where=where)
-    if not _any_area(surface):
+    mesh = _without_unused(points, indices)
+    _check_not_tiny(mesh.vertices, where=where)
+    if not (_areas(mesh.vertices[mesh.faces[:FIRST]]).any() or mesh.areas.any()):
         refuse(f"none of the {len(indices)} triangles has an area", where, "at least one triangle with an area")
-    surface.points.setflags(write=False)  # nobody else has it: it is taken as it is
-    return TriangleMesh(*surface)
+    return mesh
 
 
 def fits(mesh: TriangleMesh) -> bool:
@@ -62,16 +61,10 @@ def fits(mesh: TriangleMesh) -> bool:
     return _diagonal(mesh.vertices) <= MAX_DIAGONAL_MM
 
 
-def twice_areas(points: NDArray[np.float64], indices: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Twice the area of each triangle, shape (m,), mm^2, for vertices (n, 3) in mm and indices (m, 3)."""
-    a, b, c = points[indices[:, 0]], points[indices[:, 1]], points[indices[:, 2]]
-    areas: NDArray[np.float64] = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return areas
-
-
-class _Surface(NamedTuple):
-    points: NDArray[np.float64]
-    indices: NDArray[np.int32]
+def _areas(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Twice those of a few triangles, shape (m, 3, 3), mm."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
 def _index_array(faces: ArrayLike, n_vertices: int, *, where: str | Path) -> NDArray[np.int32]:
@@ -97,13 +90,13 @@ def _index_array(faces: ArrayLike, n_vertices: int, *, where: str | Path) -> NDA
     return np.ascontiguousarray(raw, dtype=np.int32)
 
 
-def _without_unused(points: NDArray[np.float64], indices: NDArray[np.int32]) -> _Surface:
+def _without_unused(points: NDArray[np.float64], indices: NDArray[np.int32]) -> TriangleMesh:
     used = np.zeros(len(points), dtype=bool)
     used[indices.reshape(-1)] = True
-    if used.all():
-        return _Surface(points, indices)
-    renumbered = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    return _Surface(points[used], renumbered[indices])
+    if not used.all():
+        points, indices = points[used], (np.cumsum(used, dtype=np.int32) - np.int32(1))[indices]
+    points.setflags(write=False)  # nobody else has it: it is taken as it is
+    return TriangleMesh(points, indices)
 
 
 def _diagonal(points: NDArray[np.float64]) -> float:
@@ -126,10 +119,3 @@ def _check_not_tiny(used: NDArray[np.float64], *, where: str | Path) -> None:
     if diagonal < MIN_DIAGONAL_MM:
         hint = "looks like metres declared as mm" if diagonal > 0.0 else "all corners in one place"
         refuse(f"bounding box diagonal of {diagonal:.4g} mm: {hint}", where, _EXTENT_ALLOWED)
-
-
-def _any_area(surface: _Surface) -> bool:
-    """Whether any triangle has an area: looked at in chunks, since the first triangles nearly always answer."""
-    starts = (0, 16, *range(4096, len(surface.indices), 4096), len(surface.indices))
-    chunks = (surface.indices[start:end] for start, end in pairwise(starts))
-    return any(bool((twice_areas(surface.points, chunk) > 0.0).any()) for chunk in chunks)

@@ -62,11 +62,6 @@ class InsertionForce:
         """The greatest force, N."""
         return float(self.total_n.max(initial=0.0))
 
-    @property
-    def work_n_mm(self) -> float:
-        """Work of the arm, N mm: the force integrated over the samples."""
-        return float(np.trapezoid(self.total_n, self.depth_mm))
-
 
 def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> InsertionForce:
     """The force of a needle that goes through layers at a steady speed.

@@ -423,7 +423,7 @@ def test_segments_have_the_verdict_of_many_states(padding: float) -> None:
             ends[1] - ends[0]
         )
         met = fast.first_contact(states, needle_may_touch_patient=False)
-        contact = fast.segment_contact(*ends)
+        contact = fast.segment_checker()(*ends)
         if (contact is None) != (
             met is None
         ):  # only where the deepest of it is within the 1 mm that a state answers for
@@ -473,7 +473,7 @@ def test_what_a_judge_remembers_changes_no_verdict() -> None:
     assert isinstance(fast, FastChecker)
     asked = segments(np.random.default_rng(11), 150)
     seasoned = fast.segment_checker()
-    fresh = [fast.segment_contact(*ends) for ends in asked]
+    fresh = [fast.segment_checker()(*ends) for ends in asked]
     assert [seasoned(*ends) is None for ends in asked] == [contact is None for contact in fresh]
     again = [seasoned(*ends) for ends in reversed(asked)][::-1]
     assert [contact is None for contact in again] == [contact is None for contact in fresh]
@@ -506,13 +506,13 @@ def test_segments_of_no_length_and_no_number() -> None:
     assert isinstance(fast, FastChecker)
     for q in (CLEAR, CLEAR + np.array([0.0, 1.2, 0.0, 0.0, 0.0, 0.0])):
         verdict = slow.contact(q, needle_may_touch_patient=False)
-        assert (fast.segment_contact(q, q) is None) == (verdict is None)
+        assert (fast.segment_checker()(q, q) is None) == (verdict is None)
     for spoiled in (np.full(6, np.nan), CLEAR * np.inf):
         with pytest.raises(InputError, match="not finite"):
-            fast.segment_contact(CLEAR, spoiled)
+            fast.segment_checker()(CLEAR, spoiled)
         with pytest.raises(InputError, match="not finite"):
-            fast.segment_contact(spoiled, CLEAR)
-    assert fast.segment_contact(CLEAR, CLEAR + np.array([2.0 * np.pi, 0, 0, 0, 0, 0])) is not None
+            fast.segment_checker()(spoiled, CLEAR)
+    assert fast.segment_checker()(CLEAR, CLEAR + np.array([2.0 * np.pi, 0, 0, 0, 0, 0])) is not None
 
 
 def test_pieces_that_are_never_asked_about_never_touch() -> None:
