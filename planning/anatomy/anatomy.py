@@ -90,7 +90,7 @@ class Anatomy:
                 return structure
         names = ", ".join(s.name for s in self.structures)
         near = did_you_mean(name, (structure.name for structure in self.structures))
-        raise InputError(f"no structure '{name}'{near}", where="anatomy", allowed=names)
+        raise InputError(f"no structure '{name}'{near}", where="anatomy", allowed=names, code="unknown_structure")
 
 
 def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE) -> Anatomy:
@@ -220,31 +220,32 @@ def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh 
 def _check_count(case: Case, count: int) -> None:
     """Of a case that states how many structures it has, before a surface is made; the CT adds others later."""
     if wrong := count_difference(case.stated_structures, count):
-        raise InputError(wrong, where=case.path, allowed="the number of structures that are read")
+        allowed = "the number of structures that are read"
+        raise InputError(wrong, where=case.path, allowed=allowed, code="structures_miscounted")
 
 
 def _check_names(case: Case, structures: list[Structure]) -> None:
     names = [structure.name for structure in structures]
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
-        raise InputError(f"structure '{twice[0]}' stands twice", where=case.path, allowed="unique names")
+        what = f"structure '{twice[0]}' stands twice"
+        raise InputError(what, where=case.path, allowed="unique names", code="duplicate_name")
     if case.target_structure not in names:
         raise InputError(
             f"target.structure '{case.target_structure}' is no structure of the case"
             f"{did_you_mean(case.target_structure, names)}",
             where=case.path,
             allowed=", ".join(names),
+            code="unknown_structure",
         )
 
 
 def _check_demands(case: Case, structures: list[Structure]) -> None:
     """Where nothing demands a margin every path is "safe", which says nothing about a patient."""
     if not any(structure.demands_margin for structure in structures):
-        raise InputError(
-            "no structure is to be avoided, so that no verdict would say anything about safety",
-            where=case.path,
-            allowed='at least one structure of role "avoid" or "unknown"',
-        )
+        what = "no structure is to be avoided, so that no verdict would say anything about safety"
+        allowed = 'at least one structure of role "avoid" or "unknown"'
+        raise InputError(what, where=case.path, allowed=allowed, code="nothing_to_avoid")
 
 
 def surface_distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:

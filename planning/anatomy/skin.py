@@ -101,12 +101,13 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
     where = f"{labelmap.path}, label {label}"
     if label not in labelmap.boxes:
         allowed = f"the labels present: {', '.join(map(str, labelmap.labels_present()))}"
-        raise InputError("no voxel has the label of the skin", where=where, allowed=allowed)
+        raise InputError("no voxel has the label of the skin", where=where, allowed=allowed, code="label_absent")
     oriented = canonical(labelmap.labels, labelmap.T_ct_index)
     box = box or tuple((0, n) for n in oriented.values.shape)
     body = filled_slices(oriented.values[tuple(slice(*ends) for ends in box)] == label)
     if body.all():
-        raise InputError("no air around the body", where=where, allowed="a label with a border inside the image")
+        what = "no air around the body"
+        raise InputError(what, where=where, allowed="a label with a border inside the image", code="no_air")
     found = BodyMask(body, np.zeros_like(body), ())
     return _skin(np.where(body, 0.5, -0.5), found, shifted(oriented.T_ct_index, box), where)
 
@@ -135,7 +136,8 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
         sides[axis, end] = True
         in_plane = np.all(np.abs(mesh.triangles[:, :, axis] - (low, high)[end][axis]) < CUT_PLANE_MM, axis=1)
         if not in_plane.any():
-            raise InputError(f"no flat end at its {name}", where="skin mesh", allowed="a side where the body was cut")
+            what = f"no flat end at its {name}"
+            raise InputError(what, where="skin mesh", allowed="a side where the body was cut", code="no_flat_end")
         cut_faces |= in_plane
     return Skin(mesh, cut_faces, FieldOfView(pose(np.eye(3), low), high - low, sides), warnings)
 

@@ -137,11 +137,9 @@ class StructureSources:
         local = self._case.space is Space.LOCAL or section.cut is not None
         ends = () if local else kept.get((flat_ends.__name__, mesh.digest), partial(flat_ends, mesh), _no_bytes)
         if ends:
-            raise InputError(
-                f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?",
-                where=self._case.path,
-                allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
-            )
+            what = f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?"
+            allowed = f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin"
+            raise InputError(what, where=self._case.path, allowed=allowed, code="skin_cut_unstated")
         cut = section.cut or ()
         return kept_skin(mesh, cut, self._cache)
 
@@ -160,11 +158,9 @@ class StructureSources:
         """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
         own, named = skin_section.ct, self._case.ct.file
         if own is not None and named not in {None, own}:
-            raise InputError(
-                f"[ct] file '{named}' is not the CT of the skin, '{own}'",
-                where=self._case.path,
-                allowed="one CT: leave out [ct] file where the skin comes from a CT",
-            )
+            what = f"[ct] file '{named}' is not the CT of the skin, '{own}'"
+            allowed = "one CT: leave out [ct] file where the skin comes from a CT"
+            raise InputError(what, where=self._case.path, allowed=allowed, code="several_cts")
         name = own or named
         if name is None:
             return None
@@ -172,17 +168,15 @@ class StructureSources:
         seen = self._seen(name, None, structures, skin_section.cut if own else None)
         scan = Scan(name, seen, None if own else skin)
         if not scan.contains(self._case.target_ct):
-            raise InputError(
-                f"[ct] file '{name}' does not show the target: a slip of file or space?",
-                where=self._case.path,
-                allowed="a CT that holds the target, in the space of the structures",
-            )
+            what = f"[ct] file '{name}' does not show the target: a slip of file or space?"
+            allowed = "a CT that holds the target, in the space of the structures"
+            raise InputError(what, where=self._case.path, allowed=allowed, code="target_outside_ct")
         return scan
 
     def _mesh(self, section: StructureSection) -> TriangleMesh:
         where = f"{self._case.path}: structure '{section.name}'"
         if section.mesh is None or section.unit is None:
-            raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
+            raise InputError("no mesh with a unit", where=where, allowed="mesh and unit", code="missing_source")
         file, by_default = self._file(section.mesh), section.space is None
         space = parse_space(section.space, where=where) if section.space else self._case.space
         unit = parse_unit(section.unit, where=where)
@@ -196,7 +190,8 @@ class StructureSources:
 
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:
-            raise InputError(f"'{section.name}' has no source", where=self._case.path, allowed="mesh or labelmap")
+            what = f"'{section.name}' has no source"
+            raise InputError(what, where=self._case.path, allowed="mesh or labelmap", code="missing_source")
         return self._labels(section.labelmap).label(section.label)
 
     def _labels(self, name: str) -> VolumeSurfaces:
@@ -215,9 +210,8 @@ class StructureSources:
 
     def _refuse_local(self, name: str, kind: str) -> None:
         if self._case.space is Space.LOCAL:
-            raise InputError(
-                f'{kind} {name} in a case of space "local"', where=self._case.path, allowed='space "LPS" or "RAS"'
-            )
+            what = f'{kind} {name} in a case of space "local"'
+            raise InputError(what, where=self._case.path, allowed='space "LPS" or "RAS"', code="local_space")
 
     def _volume(self, name: str) -> VolumeSurfaces:
         if name not in self._volumes:

@@ -140,7 +140,8 @@ def _link_shapes(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
 def _pieces(mesh: TriangleMesh, name: str, model: UrModel) -> tuple[TriangleMesh, ...]:
     pieces = convex_pieces(mesh, SLABS.get(name, 1))
     if not pieces:
-        raise InputError(f"a shape of the {name} is flat", where=model_urdf(model).where, allowed="bodies, not sheets")
+        what = f"a shape of the {name} is flat"
+        raise InputError(what, where=model_urdf(model).where, allowed="bodies, not sheets", code="flat_mesh")
     return pieces
 
 
@@ -204,7 +205,7 @@ def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[Tr
             allowed = (
                 f"shapes that meet along their joint's axis, to {MOST_GAP_MM:g} mm: see their unit, scale and origin"
             )
-            raise InputError(what, where=model_urdf(model).where, allowed=allowed)
+            raise InputError(what, where=model_urdf(model).where, allowed=allowed, code="links_apart")
         pins.append(tuple(_pin(a - PIN_ROOT_MM, b + PIN_ROOT_MM) for a, b in gaps))
     return [*pins, ()]
 
@@ -248,7 +249,7 @@ def model_urdf(model: UrModel) -> ArmUrdf:
         return model.urdf
     if not model.shipped:
         what = f"the arm {model.name!r} is known by its numbers alone"
-        raise InputError(what, where="robot", allowed="the case that names its URDF")
+        raise InputError(what, where="robot", allowed="the case that names its URDF", code="urdf_missing")
     return _shipped(model.name)
 
 
@@ -264,7 +265,8 @@ def _shipped(name: str) -> ArmUrdf:
     path = meshes.folder() / SHAPES / f"{name}.urdf"
     if not path.is_file():
         allowed = ", ".join(sorted(p.stem for p in path.parent.glob("*.urdf")))
-        raise InputError(f"no link meshes for robot {name!r}", where=f"meshes/{SHAPES}", allowed=allowed)
+        what = f"no link meshes for robot {name!r}"
+        raise InputError(what, where=f"meshes/{SHAPES}", allowed=allowed, code="no_link_meshes")
     return read_arm_urdf(
         path.read_bytes(),
         path,

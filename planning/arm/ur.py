@@ -177,5 +177,6 @@ def ur_model(name: str) -> UrModel:
     """
     model = UR_MODELS.get(name.lower())
     if model is None:
-        raise InputError(f"unknown robot model {name!r}", where="robot model", allowed=", ".join(UR_MODELS))
+        what = f"unknown robot model {name!r}"
+        raise InputError(what, where="robot model", allowed=", ".join(UR_MODELS), code="unknown_robot")
     return model

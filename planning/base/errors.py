@@ -7,6 +7,7 @@ Parts of the installation that planner, map and page do without, and what is sai
 
 from __future__ import annotations
 
+import copy
 import json
 import sys
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Self
 
 MOST_WHAT, MOST_WHERE, MOST_ALLOWED = 400, 300, 600
 """Characters of an error's parts: what is longer loses its middle, so that the line can still be read."""
@@ -26,6 +27,9 @@ MOST_MESSAGE = 1_500
 
 class PlanningError(Exception):
     """Base of everything that the planner raises on purpose."""
+
+    code = "program_failed"
+    """The kind of mistake, for those who ask a program and not a person."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """With all its parts, which a process that sends it makes again; they do not follow from the message alone."""
@@ -46,7 +50,7 @@ class InputError(PlanningError):
         what: What is wrong, with the offending value.
         where: The file, and the place in it (key, line, marker name).
         allowed: What would have been accepted.
-        code: What kind of fault it is, in one word, for those who ask a program and not a person.
+        code: What kind of mistake it is, in snake_case: the same kind has one code, wherever it is found.
         numbers: What was measured, by name with its unit.
     """
 
@@ -59,14 +63,24 @@ class InputError(PlanningError):
         *,
         where: str | Path,
         allowed: str,
-        code: str = "",
+        code: str,
         numbers: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         self.code, self.numbers = code, dict(numbers)
         self.what = one_line(what, self.most_what)
         self.where = one_line(str(where), MOST_WHERE)
         self.allowed = one_line(allowed, MOST_ALLOWED)
-        super().__init__(f"{self.where}: {self.what}; allowed: {self.allowed}")
+        super().__init__(self.what)
+
+    def __str__(self) -> str:
+        """One line: where, what, and what is allowed."""
+        return f"{self.where}: {self.what}; allowed: {self.allowed}"
+
+    def at(self, where: str | Path) -> Self:
+        """This error with another place in it."""
+        moved = copy.copy(self)
+        moved.where = one_line(str(where), MOST_WHERE)
+        return moved
 
 
 class InputListError(InputError):
@@ -80,11 +94,12 @@ class NoAnswerError(PlanningError):
 
     Args:
         message: What was not found.
+        code: Why not, as an `InputError` has it.
         counts: How many candidates fell to which reason.
     """
 
-    def __init__(self, message: str, *, counts: dict[str, int] | None = None) -> None:
-        self.counts = dict(counts or {})
+    def __init__(self, message: str, *, code: str, counts: Mapping[str, int] = MappingProxyType({})) -> None:
+        self.code, self.counts = code, dict(counts)
         super().__init__(message)
 
 

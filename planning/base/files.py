@@ -53,7 +53,8 @@ def sha256(path: Path) -> str:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
+        what = f"cannot be read ({error.strerror})"
+        raise InputError(what, where=path, allowed="a readable file", code="unreadable") from error
 
 
 def is_plain_file(path: Path) -> bool:
@@ -84,7 +85,8 @@ def atomic(path: Path) -> Iterator[Path]:
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     except OSError as error:
         what = f"cannot be written ({error.strerror})"
-        raise InputError(what, where=_shown(path), allowed="a folder that may be written to") from error
+        where = _shown(path)
+        raise InputError(what, where=where, allowed="a folder that may be written to", code="unwritable") from error
     os.close(handle)
     temporary = Path(name)
     temporary.chmod(0o644)
@@ -107,9 +109,10 @@ def check_writable(folder: Path) -> Path:
         nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists() or place.is_symlink())
         usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) and _names_fit(nearest, folder)
     except (OSError, ValueError) as error:
-        raise InputError(f"output folder cannot be used ({error})", where=_shown(folder), allowed=allowed) from error
+        what = f"output folder cannot be used ({error})"
+        raise InputError(what, where=_shown(folder), allowed=allowed, code="unwritable") from error
     if not usable:
-        raise InputError("output folder cannot be written to", where=_shown(folder), allowed=allowed)
+        raise InputError("output folder cannot be written to", where=_shown(folder), allowed=allowed, code="unwritable")
     return folder
 
 
@@ -139,17 +142,16 @@ def read_input(path: Path, *, max_bytes: int, where: str) -> bytes:
     try:
         if not path.exists():
             other = _other_case(path)
-            raise InputError(
-                f"no such file; there is '{other}'" if other else "no such file", where=where, allowed=allowed
-            )
+            what = f"no such file; there is '{other}'" if other else "no such file"
+            raise InputError(what, where=where, allowed=allowed, code="no_such_file")
         if not path.is_file():
-            raise InputError("not a file but a directory or device", where=where, allowed=allowed)
+            raise InputError("not a file but a directory or device", where=where, allowed=allowed, code="not_a_file")
         size = path.stat().st_size
         if not 0 < size <= max_bytes:
-            raise InputError(f"file of {size} bytes", where=where, allowed=allowed)
+            raise InputError(f"file of {size} bytes", where=where, allowed=allowed, code="file_size")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # unreadable, or a path with a NUL in it
-        raise InputError(f"cannot be read ({error})", where=where, allowed=allowed) from error
+        raise InputError(f"cannot be read ({error})", where=where, allowed=allowed, code="unreadable") from error
 
 
 def absence(path: Path) -> str:
@@ -198,4 +200,5 @@ def decode_text(data: bytes, where: str) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"byte {error.start} is not text", where=where, allowed="text in UTF-8") from error
+        what = f"byte {error.start} is not text"
+        raise InputError(what, where=where, allowed="text in UTF-8", code="not_text") from error

@@ -137,7 +137,8 @@ class InputFiles:
         known = self.sha256(name)
         content = read_input(self._folder / name, max_bytes=1 << 40, where=str(self._folder / name))
         if content_input("", name, content).sha256 != known:
-            raise InputError("has changed since it was read", where=self._folder / name, allowed="start again")
+            what = "has changed since it was read"
+            raise InputError(what, where=self._folder / name, allowed="start again", code="input_changed")
         return content
 
     def sha256(self, name: str) -> str:
@@ -161,5 +162,5 @@ class InputFiles:
         file = self._folder / name
         if not is_plain_file(file):
             what = f"{key}: file '{name[:200]}' {absence(file)}"
-            raise InputError(what, where=where, allowed=f"a file in {self._folder}")
+            raise InputError(what, where=where, allowed=f"a file in {self._folder}", code="no_such_file")
         return file

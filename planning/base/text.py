@@ -37,11 +37,13 @@ def check_name(name: str, what: str, *, where: str | Path) -> str:
         InputError: An empty name, one of more than `MAX_NAME` characters, or one with a control or format character.
     """
     if not name.strip():
-        raise InputError(f"{what} has an empty name", where=where, allowed=ALLOWED_NAME)
+        raise InputError(f"{what} has an empty name", where=where, allowed=ALLOWED_NAME, code="bad_name")
     if len(name) > MAX_NAME:
-        raise InputError(f"{what} has a name of {len(name)} characters", where=where, allowed=ALLOWED_NAME)
+        raise InputError(
+            f"{what} has a name of {len(name)} characters", where=where, allowed=ALLOWED_NAME, code="bad_name"
+        )
     if not name.isprintable():
-        raise InputError(f"{what} has the name {name!a}", where=where, allowed=ALLOWED_NAME)
+        raise InputError(f"{what} has the name {name!a}", where=where, allowed=ALLOWED_NAME, code="bad_name")
     return name
 
 

@@ -46,6 +46,9 @@ def _one(value: object) -> object:
     return value
 
 
+CODES = {"extra_forbidden": "unknown_key", "missing": "missing_key"}
+"""What is wrong with a key, by Pydantic's word; any other is ``bad_value``."""
+
 SchemaOne = Annotated[int, BeforeValidator(_one)]
 """The key ``schema``: 1."""
 
@@ -61,9 +64,10 @@ def find_toml(path: Path | str, usual_name: str) -> Path:
     try:
         path = path / usual_name if path.is_dir() else path
         if path.exists() and not path.is_file():
-            raise InputError("is no plain file", where=path, allowed=allowed)
+            raise InputError("is no plain file", where=path, allowed=allowed, code="not_a_file")
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot be looked up ({error})", where=str(path)[:80], allowed=allowed) from error
+        what = f"cannot be looked up ({error})"
+        raise InputError(what, where=str(path)[:80], allowed=allowed, code="unreadable") from error
     return path
 
 
@@ -75,10 +79,11 @@ def read_toml_bytes(path: Path, allowed: str) -> bytes:
     """
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError("larger than 1 MB, not written by hand", where=path, allowed=allowed)
+            raise InputError("larger than 1 MB, not written by hand", where=path, allowed=allowed, code="file_size")
         return path.read_bytes()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
+        what = f"cannot be read ({error.strerror})"
+        raise InputError(what, where=path, allowed=allowed, code="unreadable") from error
 
 
 def parse_toml(
@@ -108,7 +113,7 @@ def parse_toml(
         check_toml_bounds(text, path, allowed)
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, a number that Python does not read
-        raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
+        raise InputError(f"is not TOML: {error}", where=path, allowed=allowed, code="not_toml") from error
     data = data if change is None else change(data)
     try:
         return model.model_validate(data)
@@ -117,7 +122,8 @@ def parse_toml(
         place, said = _said(data, first["loc"], first["msg"].removeprefix("Value error, "), first["type"])
         value = "" if isinstance(first["input"], dict | list | tuple | None) else f" (given: {first['input']!r:.60})"
         allowed = f"the keys, types and ranges of {keys}"
-        raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error
+        code = CODES.get(first["type"], "bad_value")
+        raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed, code=code) from error
 
 
 def _said(data: object, keys: tuple[str | int, ...], message: str, kind: str) -> tuple[str, str]:
@@ -190,4 +196,4 @@ def _beyond(kind: str, found: str, depth: int, parts: int) -> str:
 
 
 def _refuse(wrong: str, where: Path | str, line: int, allowed: str) -> None:
-    raise InputError(f"line {line} {wrong}", where=where, allowed=allowed)
+    raise InputError(f"line {line} {wrong}", where=where, allowed=allowed, code="toml_bounds")

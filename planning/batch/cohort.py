@@ -70,7 +70,7 @@ def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]
         cases, inputs = _listed_cases(cohort)
     if not 0 < len(cases) <= MOST_CASES:
         what = f"holds {len(cases)} cases" if cases else "holds no case"
-        raise InputError(what, where=cohort, allowed=f"1 to {MOST_CASES} cases: {ALLOWED}")
+        raise InputError(what, where=cohort, allowed=f"1 to {MOST_CASES} cases: {ALLOWED}", code="cohort_size")
     for one in cases:
         _check_path(one, cohort)
     return tuple(cases), inputs
@@ -82,13 +82,13 @@ def _check_path(case: CohortCase, cohort: Path) -> None:
         str(case.path.absolute()).encode("utf-8")
     except UnicodeEncodeError as error:
         what = f"the path '{one_line(case.stated, 100)}' is no UTF-8"
-        raise InputError(what, where=cohort, allowed="cases whose paths are UTF-8") from error
+        raise InputError(what, where=cohort, allowed="cases whose paths are UTF-8", code="not_text") from error
 
 
 def _listed_cases(path: Path) -> tuple[list[CohortCase], tuple[Input, ...]]:
     readers = {".csv": csv_cases, ".toml": toml_cases}
     if path.suffix.lower() not in readers:
-        raise InputError("is no cohort", where=path, allowed=ALLOWED)
+        raise InputError("is no cohort", where=path, allowed=ALLOWED, code="not_a_cohort")
     content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     return readers[path.suffix.lower()](content, path), (content_input("cohort", path.name, content),)
 
@@ -148,7 +148,8 @@ def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
         if not any(row):
             continue
         if len(row) != len(header):
-            raise InputError(f"{len(row)} cells", where=where, allowed=f"{len(header)}, as in the header")
+            what = f"{len(row)} cells"
+            raise InputError(what, where=where, allowed=f"{len(header)}, as in the header", code="ragged_row")
         cases.append(_case(dict(zip(header, row, strict=True)), path, where))
     return cases
 
@@ -158,29 +159,33 @@ def _rows(content: bytes, path: Path) -> Any:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"is not UTF-8 ({error})", where=path, allowed="a CSV in UTF-8") from error
+        raise InputError(f"is not UTF-8 ({error})", where=path, allowed="a CSV in UTF-8", code="not_text") from error
     if "\0" in text or max(map(len, text.splitlines()), default=0) > LONGEST_CELL:
-        raise InputError("is no CSV", where=path, allowed=f"text, lines of at most {LONGEST_CELL} characters")
+        what = "is no CSV"
+        raise InputError(what, where=path, allowed=f"text, lines of at most {LONGEST_CELL} characters", code="not_csv")
     return csv.reader(io.StringIO(text), strict=False)
 
 
 def _header(row: list[str], path: Path) -> list[str]:
     header = [cell.strip() for cell in row]
     if CASE not in header:
-        raise InputError(f"has no column '{CASE}'", where=f"{path}: line 1", allowed=ALLOWED_COLUMNS)
+        what = f"has no column '{CASE}'"
+        raise InputError(what, where=f"{path}: line 1", allowed=ALLOWED_COLUMNS, code="missing_column")
     for name in header:
         kind, _, key = name.partition(".")
         if name not in (CASE, NAME, TARGET) and not (kind in SECTIONS and key):
-            raise InputError(f"column '{name}' is not known", where=f"{path}: line 1", allowed=ALLOWED_COLUMNS)
+            what = f"column '{name}' is not known"
+            raise InputError(what, where=f"{path}: line 1", allowed=ALLOWED_COLUMNS, code="unknown_column")
         if header.count(name) > 1:
-            raise InputError(f"column '{name}' stands twice", where=f"{path}: line 1", allowed="each column once")
+            what = f"column '{name}' stands twice"
+            raise InputError(what, where=f"{path}: line 1", allowed="each column once", code="duplicate_column")
     return header
 
 
 def _case(cells: dict[str, str], path: Path, where: str) -> CohortCase:
     stated = cells[CASE]
     if not stated.strip() or any(unprintable_texts(cells)):
-        raise InputError("has no case that can be printed", where=where, allowed="the path of a case")
+        raise InputError("has no case that can be printed", where=where, allowed="the path of a case", code="bad_name")
     return CohortCase(stated, path.parent / stated.strip(), cells.get(NAME, "").strip(), _options(cells, where))
 
 
@@ -267,7 +272,7 @@ def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
     axes = [axis for name, kind in AXES.items() if (axis := _axis(getattr(stated, name), name, kind, path))]
     count = len(found) * math.prod(len(axis) for axis in axes)
     if count > MOST_CASES:
-        raise InputError(f"makes {count} cases", where=path, allowed=f"at most {MOST_CASES}")
+        raise InputError(f"makes {count} cases", where=path, allowed=f"at most {MOST_CASES}", code="cohort_size")
     combinations = [_combined(choices, path) for choices in product(*axes)]
     return [CohortCase(one, path.parent / one, name, options) for one in found for name, options in combinations]
 
@@ -278,7 +283,8 @@ def _matches(patterns: Sequence[str], path: Path) -> list[str]:
     for pattern in patterns:
         matches = sorted(glob.glob(pattern, root_dir=path.parent, recursive=True))  # noqa: PTH207  # absolute ones too
         if not matches:
-            raise InputError(f"cases '{pattern}' matches nothing", where=path, allowed="patterns of existing cases")
+            what = f"cases '{pattern}' matches nothing"
+            raise InputError(what, where=path, allowed="patterns of existing cases", code="no_match")
         found |= dict.fromkeys(matches)
     return list(found)
 
@@ -299,7 +305,8 @@ def _table(values: Any, kind: str, where: str) -> Mapping[str, Any]:
         return {"position_mm": list(values)}
     if kind == "arm" and isinstance(values, str):
         return {"model": values}
-    raise InputError(f"option '{kind}' is no table", where=where, allowed="keys and values, as in the case")
+    what = f"option '{kind}' is no table"
+    raise InputError(what, where=where, allowed="keys and values, as in the case", code="not_a_table")
 
 
 def _combined(choices: Sequence[_Choice], path: Path) -> tuple[str, CaseOptions]:

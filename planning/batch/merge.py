@@ -91,7 +91,8 @@ def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
             known = fields.setdefault(one.name, one)
             if known.type != one.type:
                 what = f"column '{one.name}' is {known.type} in one case and {one.type} in another"
-                raise InputError(what, where=where, allowed="results of one version: batch plan and run again")
+                allowed = "results of one version: batch plan and run again"
+                raise InputError(what, where=where, allowed=allowed, code="tables_differ")
     return pa.schema(list(fields.values()))
 
 
@@ -274,10 +275,11 @@ def read_cases(place: Path) -> list[dict[str, Any]]:
     try:
         table = pq.read_table(io.BytesIO(data))
     except (pa.ArrowException, OSError) as error:
-        raise InputError(f"is no table ({one_line(str(error), 100)})", where=path, allowed=ALLOWED) from error
+        what = f"is no table ({one_line(str(error), 100)})"
+        raise InputError(what, where=path, allowed=ALLOWED, code="not_parquet") from error
     missing = [name for name in (*NEEDED, *ENTRY) if name not in table.column_names]
     if missing:
-        raise InputError(f"has no column '{missing[0]}'", where=path, allowed=ALLOWED)
+        raise InputError(f"has no column '{missing[0]}'", where=path, allowed=ALLOWED, code="missing_column")
     rows: list[dict[str, Any]] = table.to_pylist()
     return rows
 

@@ -124,7 +124,8 @@ def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator
         InputError: Memory cannot be watched on this system.
     """
     if limits.memory_mb is not None and not Path(STATM.format(os.getpid())).exists():
-        raise InputError("memory cannot be watched here", where="--memory-mb", allowed="a system with /proc")
+        what = "memory cannot be watched here"
+        raise InputError(what, where="--memory-mb", allowed="a system with /proc", code="memory_not_watched")
     queue, workers = TaskQueue(tasks), list[_Worker]()
     try:
         while queue or workers:

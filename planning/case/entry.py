@@ -85,11 +85,13 @@ def entry_frame(frame: str | EntryAxes | None, space: Space, *, where: str | Pat
         return to_lps(np.eye(3), space).T
     axes = EntryAxes(z="anterior", x="head") if frame == "bed" else frame
     if not isinstance(axes, EntryAxes):
-        raise InputError(f"frame '{frame}' is not known", where=where, allowed="ct, bed, or z and x axes")
+        what = f"frame '{frame}' is not known"
+        raise InputError(what, where=where, allowed="ct, bed, or z and x axes", code="unknown_frame")
     z, x = (_axis(axis, space) for axis in (axes.z, axes.x))
     lengths = np.linalg.norm(z), np.linalg.norm(x)
     if min(lengths) == 0 or abs(z @ x) > AXES_PARALLEL * lengths[0] * lengths[1]:
-        raise InputError("search.frame: its axes are parallel or zero", where=where, allowed="two axes")
+        what = "search.frame: its axes are parallel or zero"
+        raise InputError(what, where=where, allowed="two axes", code="axes_parallel")
     return frame_of_axes(z, x)
 
 

@@ -217,7 +217,8 @@ class CaseVolumes:
             found = parse_segmentation(path, name, self._files.content, series)
         elif series is None:
             what = f"rtstruct '{name}' needs the CT on which it was drawn, as a DICOM series"
-            raise InputError(what, where=self._path, allowed='ct = "FOLDER" beside it, or as the CT of the case')
+            allowed = 'ct = "FOLDER" beside it, or as the CT of the case'
+            raise InputError(what, where=self._path, allowed=allowed, code="rtstruct_without_ct")
         else:
             found = parse_structure_set(path, name, self._files.content, series)
         self._add_masks(name, found)
@@ -285,7 +286,8 @@ def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tupl
     """
     for name in _line_files(files):
         for said in unfinished_warnings(files.content(name), name):
-            raise InputError(said, where=path, allowed="files of which every line ends with a line break")
+            allowed = "files of which every line ends with a line break"
+            raise InputError(said, where=path, allowed=allowed, code="file_cut")
     if content.end is None:
         return (TOP_COUNT_NOTE,)
     return () if ends_with_end(files.content(path.name).decode("utf-8")) else (NOT_LAST_NOTE,)

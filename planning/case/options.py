@@ -94,15 +94,16 @@ def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
     """
     for kind, values in sections.items():
         if kind not in SECTIONS:
-            raise InputError(f"'{kind}' is no kind of option", where=where, allowed=", ".join(SECTIONS))
+            what = f"'{kind}' is no kind of option"
+            raise InputError(what, where=where, allowed=", ".join(SECTIONS), code="unknown_key")
         if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
-            raise InputError(f"option '{kind}' is no table", where=where, allowed="keys and values, as in the case")
+            what = f"option '{kind}' is no table"
+            raise InputError(what, where=where, allowed="keys and values, as in the case", code="not_a_table")
     try:
         plain = json.loads(CaseOptions({kind: values for kind, values in sections.items() if values}).text)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            f"an option cannot be used ({error})", where=where, allowed="finite numbers, texts, lists, tables"
-        ) from error
+        what = f"an option cannot be used ({error})"
+        raise InputError(what, where=where, allowed="finite numbers, texts, lists, tables", code="bad_value") from error
     return CaseOptions(plain)
 
 
@@ -128,13 +129,14 @@ def _set_margins(data: dict[str, Any], values: Mapping[str, Any], where: Path | 
     stated = list(_margins(data))
     for pattern, margin in values.items():
         if not isinstance(margin, int | float) or isinstance(margin, bool):
-            raise InputError(f"margins '{pattern}' is no number", where=where, allowed="mm")
+            raise InputError(f"margins '{pattern}' is no number", where=where, allowed="mm", code="not_a_number")
         if pattern == ADDED:
             continue
         fitting = [one for one in stated if fnmatchcase(one[0], pattern)]
         if not fitting:
             known = ", ".join(name for name, _, _ in stated) or "none"
-            raise InputError(f"margins '{pattern}' fits nothing that has a margin", where=where, allowed=known)
+            what = f"margins '{pattern}' fits nothing that has a margin"
+            raise InputError(what, where=where, allowed=known, code="no_match")
         for _, table, key in fitting:
             table[key] = margin
     for _, table, key in stated if ADDED in values else ():

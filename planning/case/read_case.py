@@ -113,5 +113,5 @@ def _target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) -
     if target.name not in listed.names:
         names = ", ".join(listed.names)
         what = f"target.name '{target.name}' is not in {target.points}{did_you_mean(target.name, listed.names)}"
-        raise InputError(what, where=path, allowed=names)
+        raise InputError(what, where=path, allowed=names, code="unknown_point")
     return read_only(listed.points[listed.names.index(target.name)].copy())

@@ -97,7 +97,8 @@ def _mesh(address: str, *, urdf: str, files: InputFiles, path: Path) -> bytes:
     """The bytes of a mesh that a URDF names."""
     if "://" in address or PurePosixPath(address).is_absolute():
         what = f"robot.urdf: mesh '{address}' is no path beside the URDF"
-        raise InputError(what, where=path, allowed="paths relative to the URDF's folder, such as meshes/base.stl")
+        allowed = "paths relative to the URDF's folder, such as meshes/base.stl"
+        raise InputError(what, where=path, allowed=allowed, code="outside_folder")
     name = str(PurePosixPath(urdf).parent / address)
     return files.read(MESH_ROLE, name, max_bytes=meshes.MAX_FILE_BYTES, key=f"robot.urdf: mesh '{address}'", where=path)
 
@@ -128,13 +129,15 @@ def bending_of(needle: NeedleSection, tissue: Mapping[str, TissueSection], where
     if not tissue:
         if stated:
             message = f"needle.{stated[0]}: how far it bends depends on the tissue, and there is none"
-            raise InputError(message, where=where, allowed="[tissue.PATTERN] for each pattern of names; or no such key")
+            allowed = "[tissue.PATTERN] for each pattern of names; or no such key"
+            raise InputError(message, where=where, allowed=allowed, code="no_tissue")
         return None
     if needle.bevel_deg is None:
-        raise InputError("[tissue] needs needle.bevel_deg", where=where, allowed="degrees; 0 for a symmetric tip")
+        what = "[tissue] needs needle.bevel_deg"
+        raise InputError(what, where=where, allowed="degrees; 0 for a symmetric tip", code="no_bevel")
     if REST not in tissue:
         message = f'[tissue."{REST}"] is missing: between the structures there is tissue too'
-        raise InputError(message, where=where, allowed=f'a table for "{REST}", the rest of the body')
+        raise InputError(message, where=where, allowed=f'a table for "{REST}", the rest of the body', code="no_tissue")
     tissues = {pattern: Tissue(**section.model_dump()) for pattern, section in tissue.items()}
     return Bending(_shaft(needle, where), float(np.radians(needle.bevel_deg)), ByName(tissues))
 
@@ -145,11 +148,13 @@ def _shaft(needle: NeedleSection, where: str | Path) -> Shaft:
         return Shaft(needle.shaft_mm, needle.diameter_mm, 0.0, modulus)
     if needle.gauge not in GAUGES:
         allowed = f"{min(GAUGES)} to {max(GAUGES)}"
-        raise InputError(f"needle.gauge {needle.gauge} is not in the chart", where=where, allowed=allowed)
+        what = f"needle.gauge {needle.gauge} is not in the chart"
+        raise InputError(what, where=where, allowed=allowed, code="unknown_gauge")
     gauge = GAUGES[needle.gauge]
     if abs(gauge.outer_mm - needle.diameter_mm) > SAME_MM:
         message = f"needle.gauge {needle.gauge} is {gauge.outer_mm:g} mm wide, diameter_mm says {needle.diameter_mm:g}"
-        raise InputError(message, where=where, allowed=f"diameter_mm within {SAME_MM:g} of the gauge's")
+        allowed = f"diameter_mm within {SAME_MM:g} of the gauge's"
+        raise InputError(message, where=where, allowed=allowed, code="gauge_contradicted")
     return Shaft(needle.shaft_mm, gauge.outer_mm, 0.0 if needle.solid else gauge.inner_mm, modulus)
 
 
@@ -182,10 +187,11 @@ def _unit(direction: str | Vector, space: Space, where: str | Path) -> Floats:
     if isinstance(direction, str):
         if space is Space.LOCAL:
             message = f'breathing.direction: space "local" has no {direction}'
-            raise InputError(message, where=where, allowed="direction = [x, y, z]")
+            raise InputError(message, where=where, allowed="direction = [x, y, z]", code="local_space")
         return np.array(ANATOMICAL_LPS[direction], dtype=np.float64)
     vector = to_lps(np.array([direction], dtype=np.float64), space)[0]
     length = float(np.linalg.norm(vector))
     if length == 0:
-        raise InputError("breathing.direction is zero", where=where, allowed="a direction of any length")
+        what = "breathing.direction is zero"
+        raise InputError(what, where=where, allowed="a direction of any length", code="zero_direction")
     return np.asarray(vector / length)

@@ -202,13 +202,14 @@ def leaves_of(cap: Cells, tree: tuple[str, ...], where: str | Path = "certificat
         letters = np.array(list(level), dtype="U1")
         if len(letters) != len(cells) or not np.isin(letters, list("tbqSRU")).all():
             what = f"level {depth} of the tree has {len(letters)} cells or an unknown letter"
-            raise InputError(what, where=where, allowed=f"{len(cells)} of t, b, q, S, R, U")
+            raise InputError(what, where=where, allowed=f"{len(cells)} of t, b, q, S, R, U", code="certificate_damaged")
         inner = np.isin(letters, list("tbq"))
         theta.append(cells.theta[~inner])
         beta.append(cells.beta[~inner])
         cells = split(cells.take(inner), letters[inner]).cells
     if len(cells):
-        raise InputError(f"the tree ends with {len(cells)} cells missing", where=where, allowed="a whole tree")
+        what = f"the tree ends with {len(cells)} cells missing"
+        raise InputError(what, where=where, allowed="a whole tree", code="certificate_damaged")
     return Cells(np.concatenate(theta), np.concatenate(beta))
 
 
@@ -275,12 +276,12 @@ def parse_certificate(data: bytes, path: Path) -> Certificate:
     with fitting(path, CERTIFICATE_ALLOWED):
         certificate = _certificate(document, path)
     for name in sorted(set(document) - NAMES):
-        raise InputError(f"key '{name}' is not known", where=path, allowed=", ".join(sorted(NAMES)))
+        raise InputError(f"key '{name}' is not known", where=path, allowed=", ".join(sorted(NAMES)), code="unknown_key")
     stated, counted = document.get("summary"), json.loads(json.dumps(certificate.summary()))
     if stated != counted:
         wrong = [key for key in counted if not isinstance(stated, dict) or stated.get(key) != counted[key]]
         what = f"its summary does not follow from its cells ({', '.join(wrong) or 'other keys'})"
-        raise InputError(what, where=path, allowed="an unchanged certificate")
+        raise InputError(what, where=path, allowed="an unchanged certificate", code="certificate_damaged")
     return certificate
 
 
@@ -290,7 +291,8 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     leaves = leaves_of(question.cap(), tree, path)
     rows = document["witness"]
     if len(rows) != len(leaves):
-        raise InputError(f"{len(rows)} witnesses for {len(leaves)} cells", where=path, allowed="one for each")
+        what = f"{len(rows)} witnesses for {len(leaves)} cells"
+        raise InputError(what, where=path, allowed="one for each", code="certificate_damaged")
     reasons, structures, triangles, bounds = zip(*rows, strict=True)
     return Certificate(
         question=question,

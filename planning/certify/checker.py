@@ -120,16 +120,19 @@ def verify(
 def _check_question(certificate: Certificate, case: Case, anatomy: Anatomy, error: PoseError | None) -> None:
     stated = certificate.question
     if not (np.all(np.isfinite(stated.theta)) and 0 <= stated.theta[0] <= stated.theta[1] <= np.pi + 1e-12):
-        raise InputError(f"theta {stated.theta} is no range", where="certificate", allowed="0 to pi")
+        what = f"theta {stated.theta} is no range"
+        raise InputError(what, where="certificate", allowed="0 to pi", code="out_of_range")
     derived = question_of(case, anatomy, theta=stated.theta, beta=stated.beta, touch=stated.touch, error=error)
     changed = differing_input(stated.inputs, derived.inputs)
     if changed is not None:
         what = f"input '{changed}' is not the one that the certificate was made from"
-        raise InputError(what, where="certificate", allowed=f"a certificate of {case.path}, unchanged since")
+        allowed = f"a certificate of {case.path}, unchanged since"
+        raise InputError(what, where="certificate", allowed=allowed, code="input_changed")
     for name in vars(derived):
         if name != "inputs" and not np.array_equal(getattr(stated, name), getattr(derived, name)):
             what = f"its {name} is not that of the case: the certificate was made for something else"
-            raise InputError(what, where="certificate", allowed=f"a certificate of {case.path}, unchanged since")
+            allowed = f"a certificate of {case.path}, unchanged since"
+            raise InputError(what, where="certificate", allowed=allowed, code="certificate_of_another")
 
 
 class _Checker:
@@ -215,7 +218,8 @@ class _Checker:
             theta, beta = (f"{np.degrees(low):.4f}..{np.degrees(high):.4f}" for low, high in (cell.theta, cell.beta))
             claim = {"S": "safe", "R": f"rejected ({reason})", "U": "small"}[letter]
             what = f"cell {row} (theta {theta}, beta {beta} degrees) is not proven {claim}"
-            raise InputError(what, where="certificate", allowed="claims that follow from the case")
+            where = "certificate"
+            raise InputError(what, where=where, allowed="claims that follow from the case", code="cell_not_proven")
 
     def _safe(self, known: _Known) -> bool:
         """Whether no structure comes near, and the skin is crossed once, soon enough and steeply enough."""

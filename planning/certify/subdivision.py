@@ -81,7 +81,7 @@ def certify(
     question = question_of(case, anatomy, theta=theta, beta=beta, touch=touch, error=error)
     if not SMALLEST_SIZE <= size <= np.pi:
         allowed = f"{np.degrees(SMALLEST_SIZE):g} to 180 degrees"
-        raise InputError(f"size {np.degrees(size):g} degrees", where="certify", allowed=allowed)
+        raise InputError(f"size {np.degrees(size):g} degrees", where="certify", allowed=allowed, code="out_of_range")
     evaluator = _Evaluator(question, anatomy, case.needle)
     record = _Record()
     cells, state = question.cap(), evaluator.start()

@@ -160,7 +160,8 @@ class FastEngine:
 def _refuse_unsound(target: Floats, outward: Floats, lengths: Floats) -> None:
     sound = np.isfinite(target).all() and np.isfinite(outward).all()
     if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
-        raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
+        what = "a needle axis is not finite"
+        raise InputError(what, where="clearance", allowed="finite mm, unit directions", code="not_finite")
 
 
 def _packed(meshes: Sequence[TriangleMesh], threads: int, cache: Cache) -> tuple[Blocks, ...]:

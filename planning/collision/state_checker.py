@@ -123,7 +123,8 @@ def require_finite(q: Floats) -> None:
         InputError: If one is not.
     """
     if not np.isfinite(q).all():
-        raise InputError(f"joint angles {q} are not finite", where="collision check", allowed="six angles in rad")
+        what = f"joint angles {q} are not finite"
+        raise InputError(what, where="collision check", allowed="six angles in rad", code="not_finite")
 
 
 @dataclass(frozen=True, eq=False)

@@ -144,12 +144,13 @@ def _parse(data: bytes, path: Path) -> ChecksFile:
         if not isinstance(error.__cause__, ValidationError):
             raise
         place = error.__cause__.errors(include_url=False)[0]["loc"]
-        raise InputError(error.what, where=_where(data, path, place), allowed=error.allowed) from error
+        raise error.at(_where(data, path, place)) from error
     for kind, tables in content.tables().items():
         for at, table in enumerate(tables):
             if (table.case or content.case) is None:
                 where = _where(data, path, (kind, at))
-                raise InputError("no case", where=where, allowed="case = FILE, for the file or for the table")
+                allowed = "case = FILE, for the file or for the table"
+                raise InputError("no case", where=where, allowed=allowed, code="missing_case")
     return content
 
 

@@ -164,7 +164,8 @@ def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
     """
     path = path.resolve()
     if path.read_bytes() != data:
-        raise InputError("changed while the tests ran", where=path, allowed="the same file; run again")
+        what = "changed while the tests ran"
+        raise InputError(what, where=path, allowed="the same file; run again", code="input_changed")
     text, lines = _rewritten(data.decode("utf-8"), path, changes)
     with atomic(path) as draft:
         draft.write_bytes(text.encode("utf-8"))
@@ -186,7 +187,8 @@ def _rewritten(text: str, path: Path, changes: Sequence[Change]) -> tuple[str, l
         lines.append(f"{path.name}: {change.test}: {'.'.join(change.number.keys)} {old} -> {new}{weaker}")
     written = tomlkit.dumps(document)
     if tomllib.loads(written) != expected:
-        raise InputError("cannot be rewritten without changing more", where=path, allowed="the numbers by hand")
+        what = "cannot be rewritten without changing more"
+        raise InputError(what, where=path, allowed="the numbers by hand", code="not_rewritable")
     return written, lines
 
 

@@ -134,16 +134,18 @@ def read_csv(text: str, *, where: Path) -> SampledMotion:
     """
     rows = list(csv.reader(io.StringIO("\n".join(line for line in text.splitlines() if not line.startswith("#")))))
     if not rows or tuple(rows[0]) != COLUMNS:
-        raise InputError("the table's header is another", where=where, allowed=",".join(COLUMNS))
+        raise InputError("the table's header is another", where=where, allowed=",".join(COLUMNS), code="wrong_columns")
     phases: dict[str, list[list[float]]] = {phase: [] for phase in SampledMotion._fields}
     for number, row in enumerate(rows[1:], start=2):
         try:
             phases[row[0]].append([float(cell) for cell in row[1:]])
         except (KeyError, IndexError, ValueError) as error:
             allowed = f"{' or '.join(phases)} and seven numbers"
-            raise InputError(f"row {number} of the table: {error}", where=where, allowed=allowed) from error
+            what = f"row {number} of the table: {error}"
+            raise InputError(what, where=where, allowed=allowed, code="not_a_number") from error
         if len(row) != len(COLUMNS):
-            raise InputError(f"row {number} has {len(row)} cells", where=where, allowed=f"{len(COLUMNS)} cells")
+            what = f"row {number} has {len(row)} cells"
+            raise InputError(what, where=where, allowed=f"{len(COLUMNS)} cells", code="ragged_row")
     tables = [np.array(table).reshape(-1, 7) for table in phases.values()]
     return SampledMotion(*(Trajectory(table[:, 0], table[:, 1:]) for table in tables))
 
@@ -194,7 +196,7 @@ def export_plan(
     path = folder / export_name(source, format_name)
     check_geometry(plan, source)
     if len(plan.insertion.q) < 2:
-        raise InputError("the insertion is a single state", where=source, allowed="a motion")
+        raise InputError("the insertion is a single state", where=source, allowed="a motion", code="no_motion")
     checked = FORMATS[format_name][1](plan, source, checker)
     with atomic(path) as temporary:
         temporary.write_bytes(checked.text.encode("ascii"))
@@ -208,7 +210,7 @@ def export_name(source: Path, format_name: str) -> str:
         InputError: Another format.
     """
     if format_name not in FORMATS:
-        raise InputError(f"format '{format_name}'", where="export", allowed=", ".join(FORMATS))
+        raise InputError(f"format '{format_name}'", where="export", allowed=", ".join(FORMATS), code="unknown_format")
     return f"{source.stem}{FORMATS[format_name][0]}"
 
 

@@ -131,7 +131,8 @@ def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
     for phase in SampledMotion._fields:
         trajectory = goals[phase]["trajectory"]
         if trajectory["joint_names"] != list(plan.model.joint_names):
-            raise InputError(f"{phase} is of other joints", where=where, allowed=", ".join(plan.model.joint_names))
+            what = f"{phase} is of other joints"
+            raise InputError(what, where=where, allowed=", ".join(plan.model.joint_names), code="other_joints")
         starts = [point["time_from_start"] for point in trajectory["points"]]
         times = np.array([one["sec"] + one["nanosec"] / NANOSECONDS for one in starts])
         parts[phase] = Trajectory(times, np.array([point["positions"] for point in trajectory["points"]]))
@@ -186,7 +187,7 @@ def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> M
     check_goals(json.loads(goals), plan, where=source)
     urdf = urdf_with_needle(plan.model, case_tool(case))
     if not ElementTree.fromstring(urdf).findall("link"):
-        raise InputError("the URDF does not read back", where=source, allowed="links and joints")
+        raise InputError("the URDF does not read back", where=source, allowed="links and joints", code="not_read_back")
     sender = SENDER_TEXT.format(sender=names[3], scene=names[0], goals=names[1])
     return dict(zip(names, (_json(scene_message(case, anatomy, plan)), goals, urdf, sender), strict=True))
 

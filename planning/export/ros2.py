@@ -125,7 +125,8 @@ def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
             f"  joint_names: [{', '.join(model.joint_names)}]",
             "  points:",
         ]:
-            raise InputError(f"no message '{phase}' of the six joints", where=where, allowed="approach, insertion")
+            what = f"no message '{phase}' of the six joints"
+            raise InputError(what, where=where, allowed="approach, insertion", code="missing_message")
         lines = lines[4:]
         points = []
         while lines and (match := _POINT.fullmatch(lines[0])):
@@ -133,7 +134,7 @@ def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
             lines = lines[1:]
         parts[phase] = _trajectory(points, model, phase, where)
     if lines:
-        raise InputError(f"line {lines[0]!r:.80}", where=where, allowed="points of two messages")
+        raise InputError(f"line {lines[0]!r:.80}", where=where, allowed="points of two messages", code="wrong_format")
     return SampledMotion(**parts)
 
 
@@ -141,16 +142,19 @@ def _trajectory(points: list[tuple[str, ...]], model: UrModel, phase: str, where
     try:
         return _parsed(points, model, phase, where)
     except ValueError as error:
-        raise InputError(f"{phase}: {error}", where=where, allowed="six positions and velocities a point") from error
+        what = f"{phase}: {error}"
+        raise InputError(what, where=where, allowed="six positions and velocities a point", code="bad_value") from error
 
 
 def _parsed(points: list[tuple[str, ...]], model: UrModel, phase: str, where: Path) -> Trajectory:
     times = np.array([int(sec) + int(nanosec) / NANOSECONDS for _, _, sec, nanosec in points])
     if len(times) and times[-1] > LONGEST_S:
-        raise InputError(f"{phase} of {times[-1]:.3g} s", where=where, allowed=f"at most {LONGEST_S} s")
+        what = f"{phase} of {times[-1]:.3g} s"
+        raise InputError(what, where=where, allowed=f"at most {LONGEST_S} s", code="too_long")
     if len(times) == 0 or times[0] != 0.0 or (np.diff(times) <= 0.0).any():
         what = f"{phase}: two samples within a nanosecond, or none at time 0"
-        raise InputError(what, where=where, allowed="times that rise from 0 by whole nanoseconds")
+        allowed = "times that rise from 0 by whole nanoseconds"
+        raise InputError(what, where=where, allowed=allowed, code="times_not_rising")
     q, speeds = (np.array([[float(x) for x in point[k].split(",")] for point in points]).reshape(-1, 6) for k in (0, 1))
     check_rates(model, speeds, np.zeros((1, 6)), what=f"{phase} velocities", where=where)
     return Trajectory(times, q)

@@ -145,7 +145,8 @@ def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
         InputError: A case in a frame of its own, which Slicer has no name for.
     """
     if case.space is Space.LOCAL:
-        raise InputError('space "local": Slicer knows LPS and RAS', where=case.path, allowed="a case of a patient")
+        what = 'space "local": Slicer knows LPS and RAS'
+        raise InputError(what, where=case.path, allowed="a case of a patient", code="local_space")
     ends = np.stack([drawn.entry_ct, case.target_ct])
     texts = {PATH: markups_text("Line", drawn.name, ("entry", "target"), ends)}
     nodes, notes = [SceneNode("MarkupsLine", drawn.name, PATH)], []

@@ -52,7 +52,9 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
     surface = _without_unused(points, indices)
     _check_not_tiny(surface.points, where=where)
     if not _any_area(surface):
-        refuse(f"none of the {len(indices)} triangles has an area", where, "at least one triangle with an area")
+        refuse(
+            f"none of the {len(indices)} triangles has an area", where, "at least one triangle with an area", "no_area"
+        )
     return TriangleMesh(surface.points, surface.indices)
 
 
@@ -78,21 +80,21 @@ def _index_array(faces: ArrayLike, n_vertices: int, *, where: str | Path) -> NDA
     try:
         raw = np.asarray(faces)
     except ValueError as error:  # what numpy raises for rows of different length
-        raise InputError(f"face list is ragged ({error})", where=where, allowed=allowed) from error
+        raise InputError(f"face list is ragged ({error})", where=where, allowed=allowed, code="wrong_shape") from error
     if raw.size == 0:
-        refuse("no triangle", where, allowed)
+        refuse("no triangle", where, allowed, "empty")
     if raw.ndim != 2 or raw.shape[1] != 3:
-        refuse(f"face list has shape {raw.shape}", where, allowed)
+        refuse(f"face list has shape {raw.shape}", where, allowed, "wrong_shape")
     if len(raw) > MAX_TRIANGLES:
-        refuse(f"{len(raw)} triangles", where, allowed)
+        refuse(f"{len(raw)} triangles", where, allowed, "too_many")
     whole = raw.dtype.kind in "iu" or (raw.dtype.kind == "f" and np.array_equal(raw, np.trunc(raw)))
     if not whole:  # NaN differs from itself and infinity is out of range, so neither passes
-        refuse("a vertex index is not a whole number", where, allowed)
+        refuse("a vertex index is not a whole number", where, allowed, "not_whole")
     low, high = raw.min(), raw.max()
     if low < 0 or high >= n_vertices:
         bad = low if low < 0 else high
         row = int(np.argmax((raw == bad).any(axis=1)))
-        refuse(f"triangle {row} uses vertex {bad:g}, which is out of range", where, allowed)
+        refuse(f"triangle {row} uses vertex {bad:g}, which is out of range", where, allowed, "index_out_of_range")
     return np.ascontiguousarray(raw, dtype=np.int32)
 
 
@@ -113,18 +115,18 @@ def _diagonal(points: NDArray[np.float64]) -> float:
 def _check_not_huge(points: NDArray[np.float64], *, where: str | Path) -> None:
     farthest = float(max(-points.min(), points.max()))
     if farthest > MAX_COORDINATE_MM:
-        refuse(f"a coordinate lies {farthest:.6g} mm from the origin", where, _EXTENT_ALLOWED)
+        refuse(f"a coordinate lies {farthest:.6g} mm from the origin", where, _EXTENT_ALLOWED, "too_far")
     diagonal = _diagonal(points)
     if diagonal > MAX_DIAGONAL_MM:
         hint = "looks like mm declared as cm or m, or a stray vertex"
-        refuse(f"bounding box diagonal of {diagonal:.6g} mm: {hint}", where, _EXTENT_ALLOWED)
+        refuse(f"bounding box diagonal of {diagonal:.6g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
 
 
 def _check_not_tiny(used: NDArray[np.float64], *, where: str | Path) -> None:
     diagonal = _diagonal(used)
     if diagonal < MIN_DIAGONAL_MM:
         hint = "looks like metres declared as mm" if diagonal > 0.0 else "all corners in one place"
-        refuse(f"bounding box diagonal of {diagonal:.4g} mm: {hint}", where, _EXTENT_ALLOWED)
+        refuse(f"bounding box diagonal of {diagonal:.4g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
 
 
 def _any_area(surface: _Surface) -> bool:

@@ -321,7 +321,8 @@ class _Looker:
         low, high = float(volume.values.min()), float(volume.values.max())
         if low >= -1 and high <= 1 and self._wanted.takes("labels", name):
             what = f"values from {low:.3g} to {high:.3g} are neither a mask nor a CT"
-            raise InputError(what, where=self._place.folder / name, allowed="0 and one other whole number in a mask")
+            where = self._place.folder / name
+            raise InputError(what, where=where, allowed="0 and one other whole number in a mask", code="not_a_mask")
 
     def _label_file(self, name: str, surfaces: VolumeSurfaces) -> None:
         self._found.segmentations.append(label_file(self._place, name, surfaces, self._wanted.naming))

@@ -195,11 +195,9 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
     missing = [label for label in present if label not in named]
     if missing:
         shown = ", ".join(map(str, missing[:10]))
-        raise InputError(
-            f"labels without a name: {shown}",
-            where=place.folder / source,
-            allowed="--naming with a name for each label",
-        )
+        what = f"labels without a name: {shown}"
+        allowed = "--naming with a name for each label"
+        raise InputError(what, where=place.folder / source, allowed=allowed, code="labels_without_names")
     return LabelFile(source, naming, {label: named[label] for label in present}, notes, surfaces)
 
 
@@ -271,7 +269,8 @@ def _one_table(
         return (found[0] if found else None), others
     if any([other[label] for label in present] != [found[0][1][label] for label in present] for _, other in found[1:]):
         what = f"several tables name its labels in other ways: {', '.join(table for table, _ in found)}"
-        raise InputError(what, where=place.folder / source, allowed="--naming with the table that is right")
+        where = place.folder / source
+        raise InputError(what, where=where, allowed="--naming with the table that is right", code="several_namings")
     return found[0], others
 
 

@@ -277,7 +277,8 @@ def mesh_folder(
         InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
     """
     if len({mesh_name(one) for one in names}) < len(names):
-        raise InputError("two meshes have one name", where=place.folder / source, allowed="one mesh a structure")
+        what = "two meshes have one name"
+        raise InputError(what, where=place.folder / source, allowed="one mesh a structure", code="duplicate_name")
     if up is None and any(name.lower().endswith(".glb") for name in names):
         what = f"GLB: {UP_NOT_STATED} (--up y turns them to z up, --up z keeps them)"
         raise InputError(what, where=place.folder / source, allowed="--up y or --up z", code="up_not_stated")
@@ -286,7 +287,7 @@ def mesh_folder(
     diagonal = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
     if stated is None and BOTH_MM_AND_CM[0] <= diagonal < BOTH_MM_AND_CM[1]:
         what = f"{diagonal:.0f} units from corner to corner: a small body in mm, or a large one in cm"
-        raise InputError(what, where=place.folder / source, allowed="--unit mm or --unit cm")
+        raise InputError(what, where=place.folder / source, allowed="--unit mm or --unit cm", code="unit_not_stated")
     unit = stated or next(one for one, least in LEAST_EXTENT if diagonal >= least)
     guess = "as stated" if stated else "guessed by their extent (--unit says otherwise)"
     said = (

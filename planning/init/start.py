@@ -265,7 +265,7 @@ def _refuse_outside(point: Floats, ct: Ct, skin: Skin, space: Space) -> None:
         place = "the body in" if _contains(grid, point) else "the CT"
         hint = readings_inside(point, space, in_body)
         what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
-        raise InputError(what, where="--target", allowed=OUTSIDE_WAYS)
+        raise InputError(what, where="--target", allowed=OUTSIDE_WAYS, code="target_outside_body")
 
 
 def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:

@@ -56,7 +56,7 @@ def parse_point(text: str, space: Space) -> Floats:
     """
     numbers = [parse_coordinate(part.strip(), "--target") for part in text.split(",")]
     if len(numbers) != 3:
-        raise InputError(f"{len(numbers)} numbers", where="--target", allowed="X,Y,Z in mm")
+        raise InputError(f"{len(numbers)} numbers", where="--target", allowed="X,Y,Z in mm", code="wrong_count")
     return np.asarray(to_lps(np.array([numbers]), space)[0])
 
 
@@ -97,11 +97,9 @@ def _refuse_likelier(point_ct: Floats, outlines: Outlines, space: Space, names: 
     """A point that is a likelier target in the other space, where nobody said in which it was typed."""
     if other := _other_reading(point_ct, outlines, space, names):
         place = f"in '{chosen_target(names)}'" if names else "in no structure"
-        raise InputError(
-            f"target ({point_text(point_ct, space)}) lies {place}{other}",
-            where="--target",
-            allowed="--space LPS or --space RAS, whichever is meant",
-        )
+        what = f"target ({point_text(point_ct, space)}) lies {place}{other}"
+        allowed = "--space LPS or --space RAS, whichever is meant"
+        raise InputError(what, where="--target", allowed=allowed, code="target_in_other_space")
 
 
 def _refuse_lesion_elsewhere(point_ct: Floats, outlines: Outlines, space: Space) -> None:
@@ -113,6 +111,7 @@ def _refuse_lesion_elsewhere(point_ct: Floats, outlines: Outlines, space: Space)
             f"{_other_reading(point_ct, outlines, space, ())}",
             where="--target",
             allowed="the other --space; or --hit-radius MM, where a target in no structure is meant",
+            code="target_in_no_structure",
         )
 
 
@@ -128,7 +127,7 @@ def _refuse_in_danger(point_ct: Floats, chosen: str, space: Space, other: str) -
     if line is not None:
         what = f"target ({point_text(point_ct, space)}) lies in '{chosen}'{other}: {_danger(line)}"
         allowed = f"a point outside of it, or --target-label '{chosen}' where it is itself the target"
-        raise InputError(what, where="--target", allowed=allowed)
+        raise InputError(what, where="--target", allowed=allowed, code="target_in_danger")
 
 
 def _danger(line: DefaultRole) -> str:
@@ -145,7 +144,8 @@ def label_target(name: str, outlines: Outlines, space: Space) -> Target:
     known = {one: (seg, label) for seg in segmentations for label, one in seg.names.items()}
     if name not in known:
         what = f"no structure is named '{name}'{did_you_mean(name, known)}"
-        raise InputError(what, where="--target-label", allowed=", ".join(sorted(known)) or "none is there")
+        allowed = ", ".join(sorted(known)) or "none is there"
+        raise InputError(what, where="--target-label", allowed=allowed, code="unknown_structure")
     segmentation, label = known[name]
     point, parts = deepest_point(segmentation.surface(label))
     notes = [f"the target is the deepest point of '{name}': {point_text(point, space)}"]

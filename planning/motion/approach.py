@@ -109,7 +109,7 @@ def plan_approach(
         contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
         path = _path(ends, contact_of, seed + RUNS * attempt, max_samples)
         if isinstance(path, Connected):
-            raise NoAnswerError(_why_none(path, ends, seed) + refused)
+            raise NoAnswerError(_why_none(path, ends, seed) + refused, code="no_approach")
         cuts = _cuts(contact_of, path.waypoints)
         for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
             trajectory = _timed(checker, path.waypoints, rounding, speeds)
@@ -119,7 +119,7 @@ def plan_approach(
                 return Approach(path.waypoints, rounding, trajectory, path.goal_index, checked, seed, attempt + 1)
         assert contact is not None
         refused = f"; before that, on a closer look {contact.body} touched {contact.other} on the way"
-    raise NoAnswerError(f"approach unknown: {ATTEMPTS} paths were refused (seed {seed}){refused}")
+    raise NoAnswerError(f"approach unknown: {ATTEMPTS} paths were refused (seed {seed}){refused}", code="no_approach")
 
 
 class _Ends:
@@ -204,7 +204,8 @@ def _within_limits(checker: StateChecker, q: Floats, name: str) -> Floats:
     rows = np.atleast_2d(np.asarray(q, dtype=np.float64))
     if rows.ndim != 2 or rows.shape[1] != 6 or not checker.model.within_limits(rows).all() or len(rows) == 0:
         limits = np.round(np.degrees(checker.model.joint_limits[:, 1])).astype(int).tolist()
-        raise InputError(f"{name} = {rows.round(4).tolist()}", where="approach", allowed=f"six angles, +-{limits} deg")
+        what = f"{name} = {rows.round(4).tolist()}"
+        raise InputError(what, where="approach", allowed=f"six angles, +-{limits} deg", code="joint_beyond_limits")
     return rows
 
 
@@ -212,7 +213,7 @@ def _require_free(checker: StateChecker, home: Floats) -> None:
     """Refuse a home in collision: no segment's check looks at where it begins."""
     contact = checker.contact(home, needle_may_touch_patient=False)
     if contact is not None:
-        raise NoAnswerError(f"home is in collision: {contact.body} touches {contact.other}")
+        raise NoAnswerError(f"home is in collision: {contact.body} touches {contact.other}", code="home_in_collision")
 
 
 def _free_goals(checker: StateChecker, goals: Floats) -> NDArray[np.int64]:
@@ -220,7 +221,7 @@ def _free_goals(checker: StateChecker, goals: Floats) -> NDArray[np.int64]:
     contacts = checker.contacts(goals, needle_may_touch_patient=False)
     if all(contacts):
         named = sorted({f"{contact.body} touches {contact.other}" for contact in contacts if contact})
-        raise NoAnswerError(f"every goal is in collision: {', '.join(named)}")
+        raise NoAnswerError(f"every goal is in collision: {', '.join(named)}", code="goals_in_collision")
     return np.array([row for row, contact in enumerate(contacts) if contact is None], dtype=np.int64)
 
 

@@ -43,11 +43,14 @@ class Trajectory:
     def __post_init__(self) -> None:
         times, q = np.array(self.times_s, dtype=np.float64), np.array(self.q, dtype=np.float64)
         if times.ndim != 1 or q.shape != (len(times), 6) or len(times) == 0:
-            raise InputError(f"shapes {times.shape} and {q.shape}", where="trajectory", allowed="(m,) and (m, 6)")
+            what = f"shapes {times.shape} and {q.shape}"
+            raise InputError(what, where="trajectory", allowed="(m,) and (m, 6)", code="wrong_shape")
         if not (np.isfinite(times).all() and np.isfinite(q).all()):
-            raise InputError("a time or an angle is not finite", where="trajectory", allowed="finite numbers")
+            what = "a time or an angle is not finite"
+            raise InputError(what, where="trajectory", allowed="finite numbers", code="not_finite")
         if times[0] != 0.0 or (np.diff(times) <= 0.0).any():
-            raise InputError("times do not rise from 0", where="trajectory", allowed="0, then strictly rising")
+            what = "times do not rise from 0"
+            raise InputError(what, where="trajectory", allowed="0, then strictly rising", code="times_not_rising")
         for name, array in (("times_s", times), ("q", q)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)

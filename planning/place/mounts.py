@@ -129,11 +129,8 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
     table = next((o for o in case.obstacles if o.name == settings.table and o.frame == "ct"), None)
     mounts = settings.mounts or ("floor", "rail", "ceiling", "side")
     if table is None and settings.mounts is not None and "rail" in mounts:
-        raise InputError(
-            f"place.mounts has a rail, and no obstacle '{settings.table}' of frame ct is the table",
-            where=case.path,
-            allowed="an [[obstacle]] of that name, or place.table",
-        )
+        what = f"place.mounts has a rail, and no obstacle '{settings.table}' of frame ct is the table"
+        raise InputError(what, where=case.path, allowed="an [[obstacle]] of that name, or place.table", code="no_table")
     reach = default_reach_mm(model, case.needle.length_mm)
     found: list[Region] = []
     for mount in mounts:

@@ -164,7 +164,8 @@ def search_placements(
         NoAnswerError: No direction is safe for the organs, or in none the needle could start.
     """
     if not candidates.safe.any():
-        raise NoAnswerError("no direction is safe for the organs, so no placement can help", counts=candidates.counts())
+        what = "no direction is safe for the organs, so no placement can help"
+        raise NoAnswerError(what, counts=candidates.counts(), code="no_safe_direction")
     T_ct_bed = bed_frame(case)
     check = _placement_check(case, anatomy, candidates)
     CellChecker(check.model, check.tool)  # refuses shapes that hang on nothing before minutes are spent
@@ -176,7 +177,8 @@ def search_placements(
         needle_can_start(check.tool, check.patient, case.target_ct, check.wanted, ARM_PADDING_MM)
     )
     if not len(startable):
-        raise NoAnswerError("in every organ-safe direction the needle would start too near the skin")
+        what = "in every organ-safe direction the needle would start too near the skin"
+        raise NoAnswerError(what, code="standoff_in_skin")
     coarse = Estimator(
         check.model, check.tool, surroundings, T_ct_bed, startable.spread(COARSE_DIRECTIONS), itself=False
     )

@@ -69,7 +69,8 @@ def check_inputs(plan: Plan, case: Case, path: Path) -> None:
     """
     name = differing_input(plan.inputs, case.inputs)
     if name is not None:
-        raise InputError(f"input '{name}' is not the one that the plan was made from", where=path, allowed="plan again")
+        what = f"input '{name}' is not the one that the plan was made from"
+        raise InputError(what, where=path, allowed="plan again", code="input_changed")
 
 
 def check_geometry(plan: Plan, path: Path) -> None:
@@ -79,7 +80,8 @@ def check_geometry(plan: Plan, path: Path) -> None:
         InputError: Says which end is off, and by how much.
     """
     if not np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=JOIN_TOLERANCE_RAD):
-        raise InputError("the insertion does not start where the approach ends", where=path, allowed="joined phases")
+        what = "the insertion does not start where the approach ends"
+        raise InputError(what, where=path, allowed="joined phases", code="phases_not_joined")
     _check_straight(plan, path)
     _check_speeds(plan, path)
     model = plan.model
@@ -97,6 +99,7 @@ def check_geometry(plan: Plan, path: Path) -> None:
                     f"the {what} at {name} is {error:.3g} mm off the stored pose",
                     where=path,
                     allowed=f"at most {POSE_TOLERANCE_MM} mm: {AGREE}",
+                    code="plan_contradicted",
                 )
 
 
@@ -108,12 +111,13 @@ def check_angles(plan: Plan, path: Path) -> None:
     """
     for name, angle, turn in (("theta_deg", plan.theta, np.pi), ("beta_deg", plan.beta, 2 * np.pi)):
         if not 0.0 <= angle <= turn * (1 + ANGLE_ROUNDING):
-            raise InputError(f"{name} = {np.degrees(angle):g}", where=path, allowed=f"0 to {np.degrees(turn):g}")
+            what = f"{name} = {np.degrees(angle):g}"
+            raise InputError(what, where=path, allowed=f"0 to {np.degrees(turn):g}", code="out_of_range")
     roll = roll_of(plan)
     off = abs((plan.roll - roll + np.pi) % (2 * np.pi) - np.pi)
     if off > ROLL_TOLERANCE_RAD or not 0.0 <= plan.roll < 2 * np.pi:
         what = f"roll_deg is {np.degrees(plan.roll):g}, the joint angles at standoff give {np.degrees(roll):.4g}"
-        raise InputError(what, where=path, allowed="plan again")
+        raise InputError(what, where=path, allowed="plan again", code="plan_contradicted")
 
 
 def roll_of(plan: Plan) -> float:
@@ -148,14 +152,16 @@ def _check_straight(plan: Plan, path: Path) -> None:
     ):
         if not amount <= STRAIGHT_TOLERANCE_MM:
             allowed = f"at most {STRAIGHT_TOLERANCE_MM} mm: {AGREE}"
-            raise InputError(f"the {what} by {amount:.3g} mm", where=f"{path}: insertion", allowed=allowed)
+            where = f"{path}: insertion"
+            raise InputError(f"the {what} by {amount:.3g} mm", where=where, allowed=allowed, code="not_straight")
 
 
 def _between(q: Floats, path: Path) -> Floats:
     """The rows of a joint path and points between them, no more than `BETWEEN_RAD` apart in any joint."""
     counts = np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) / BETWEEN_RAD).clip(min=1)
     if counts.sum() > MOST_STATES:
-        raise InputError("the insertion turns its joints over and over", where=path, allowed="a straight insertion")
+        what = "the insertion turns its joints over and over"
+        raise InputError(what, where=path, allowed="a straight insertion", code="not_straight")
     segment = np.repeat(np.arange(len(counts)), counts.astype(np.int64))
     starts = np.cumsum(counts) - counts
     fraction = (np.arange(len(segment)) - starts[segment]) / counts[segment]
@@ -172,17 +178,17 @@ def _check_speeds(plan: Plan, path: Path) -> None:
         speed = float(tip_speeds(model, part.q, part.times_s, plan.needle_length_mm).max(initial=0.0))
         if not speed <= limit * (1 + SPEED_ROUNDING):
             what = f"the {phase} drives the tip at {speed:.3g} mm/s"
-            raise InputError(what, where=path, allowed=f"at most {limit:g} mm/s; plan again")
+            raise InputError(what, where=path, allowed=f"at most {limit:g} mm/s; plan again", code="tip_too_fast")
         if not model.within_limits(part.q).all():
-            raise InputError(
-                f"the {phase} leaves the joint limits", where=path, allowed="angles within the arm's limits"
-            )
+            what = f"the {phase} leaves the joint limits"
+            raise InputError(what, where=path, allowed="angles within the arm's limits", code="joint_beyond_limits")
         peaks, limits = part.peaks(), rate_limits(slowed(model, plan.speeds))
         for rate in ("speed", "acceleration"):  # a jerk wears the arm, and does not stop it
             most = float((getattr(peaks, rate) / getattr(limits, rate)).max())
             if not most <= 1 + SPEED_ROUNDING:
                 what = f"the {phase} has {most:.3g} times the {rate} that a joint may have"
-                raise InputError(what, where=path, allowed="the limits of the arm and of [robot]; plan again")
+                allowed = "the limits of the arm and of [robot]; plan again"
+                raise InputError(what, where=path, allowed=allowed, code="joint_too_fast")
 
 
 ARM_NAMES = (

@@ -137,11 +137,13 @@ def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
     )
     for name, said, known in stated:
         if not _same_rates(said, known):
-            raise InputError(f"the {name} are not those of its numbers", where=path, allowed="plan again")
+            what = f"the {name} are not those of its numbers"
+            raise InputError(what, where=path, allowed="plan again", code="plan_contradicted")
     for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
         even = SAMPLE_S * np.arange(len(part.times_s))
         if not np.allclose(part.times_s, even, rtol=0, atol=SAME_TIME_S):
-            raise InputError(f"the times of the {phase} are not even", where=path, allowed=f"a row every {SAMPLE_S} s")
+            what = f"the times of the {phase} are not even"
+            raise InputError(what, where=path, allowed=f"a row every {SAMPLE_S} s", code="times_uneven")
 
 
 def _same_rates(said: Any, known: dict[str, list[float]]) -> bool:
@@ -166,7 +168,7 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         optional = set(known) if part is document["clearance_mm"] else {"arm"}
         for name in sorted(set(part) ^ set(known) - (optional - set(part))):
             what = "is not known" if name in part else "is missing"
-            raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
+            raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known), code="unknown_key")
 
 
 def _rates_document(rates: Peaks) -> dict[str, list[float]]:

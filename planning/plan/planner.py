@@ -51,11 +51,9 @@ def make_plan(context: CaseContext, candidates: Candidates, *, seed: int, rows: 
         NoAnswerError: No candidate is safe, or none of the best can be come to.
     """
     if context.reach is None:
-        raise InputError(
-            "the case does not say where the robot stands",
-            where=context.case.path,
-            allowed="[registration] with markers, or [robot.mount]",
-        )
+        what = "the case does not say where the robot stands"
+        allowed = "[registration] with markers, or [robot.mount]"
+        raise InputError(what, where=context.case.path, allowed=allowed, code="no_base")
     last = "no candidate is safe"
     for row in (candidates.ranked if rows is None else rows)[:MAX_TRIES]:
         try:
@@ -65,7 +63,7 @@ def make_plan(context: CaseContext, candidates: Candidates, *, seed: int, rows: 
             candidates = _without(context, candidates, int(row), last)
             continue
         return Planned(plan, candidates, int(row))
-    raise NoAnswerError(f"no plan: {last}", counts=candidates.counts())
+    raise NoAnswerError(f"no plan: {last}", counts=candidates.counts(), code="no_plan")
 
 
 def _without(context: CaseContext, candidates: Candidates, row: int, why: str) -> Candidates:
@@ -117,7 +115,7 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     )
     touched = motion_contact(plan, checker)
     if touched is not None:
-        raise NoAnswerError(touched)
+        raise NoAnswerError(touched, code="motion_touches")
     return replace(plan, clearance_mm={**phase_clearances(plan, checker), **plan.clearance_mm})
 
 
@@ -140,5 +138,6 @@ def _within_limits(
     outward = np.tile(candidates.outward_ct[row], (len(goals), 1))
     kept = satisfies_limits(context.chance, outward, q)
     if not kept.any():
-        raise NoAnswerError("no configuration that an approach may end in keeps search.min_hit and max_touch")
+        what = "no configuration that an approach may end in keeps search.min_hit and max_touch"
+        raise NoAnswerError(what, code="limits_not_kept")
     return [goal for goal, keeps in zip(goals, kept, strict=True) if keeps]

@@ -154,9 +154,10 @@ def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: 
     for request in requests:
         if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
             allowed = f"the tool's {checker.tool.needle_length_mm}"
-            raise InputError(f"needle_length_mm = {request.needle_length_mm}", where="reach request", allowed=allowed)
+            what = f"needle_length_mm = {request.needle_length_mm}"
+            raise InputError(what, where="reach request", allowed=allowed, code="out_of_range")
     if n_rolls < 1:
-        raise InputError(f"n_rolls = {n_rolls}", where="reach", allowed="above 0")
+        raise InputError(f"n_rolls = {n_rolls}", where="reach", allowed="above 0", code="not_positive")
     targets = np.array([request.target_base for request in requests])
     outwards = np.array([request.outward_base for request in requests])
     rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls

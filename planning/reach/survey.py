@@ -47,14 +47,17 @@ class ReachRequest:
         for name in ("target_base", "outward_base"):
             array = np.array(getattr(self, name), dtype=np.float64)
             if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
-                raise InputError(f"{name} = {array}", where="reach request", allowed="three finite numbers")
+                what = f"{name} = {array}"
+                raise InputError(what, where="reach request", allowed="three finite numbers", code="not_finite")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         if abs(math.hypot(*self.outward_base.tolist()) - 1.0) > SAME_UNIT:
-            raise InputError(f"outward_base = {self.outward_base}", where="reach request", allowed="a unit vector")
+            what = f"outward_base = {self.outward_base}"
+            raise InputError(what, where="reach request", allowed="a unit vector", code="not_unit")
         for name in ("needle_length_mm", "standoff_mm"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise InputError(f"{name} = {getattr(self, name)}", where="reach request", allowed="finite and above 0")
+                what = f"{name} = {getattr(self, name)}"
+                raise InputError(what, where="reach request", allowed="finite and above 0", code="not_positive")
 
 
 SAME_UNIT = 1e-9

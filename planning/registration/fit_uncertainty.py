@@ -180,7 +180,8 @@ def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, ne
         if len(q) and singularity(model, q).least().max() >= LEAST_SINGULARITY:
             return farthest_from_singular(model, q, -needle_base)
     place = ", ".join(f"{value:.1f}" for value in point_base)
-    raise NoAnswerError(f"a {model.name} cannot touch ({place}) mm with a needle of {tip_mm:g} mm")
+    what = f"a {model.name} cannot touch ({place}) mm with a needle of {tip_mm:g} mm"
+    raise NoAnswerError(what, code="marker_out_of_reach")
 
 
 def touching_poses(tip_mm: float, point_base: Floats, needle_base: Floats, tilt: float) -> list[Floats]:

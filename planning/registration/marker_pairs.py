@@ -68,13 +68,12 @@ def match(
         missing = sorted(wanted - set(points.names))
         if missing:
             near = "".join(did_you_mean(name, set(points.names) - set(other.names)) for name in missing[:1])
-            raise InputError(
-                f"{', '.join(missing)} missing on the {side} side{near}",
-                where=where,
-                allowed="the same names on both sides, or registration.use = [names]",
-            )
+            what = f"{', '.join(missing)} missing on the {side} side{near}"
+            allowed = "the same names on both sides, or registration.use = [names]"
+            raise InputError(what, where=where, allowed=allowed, code="markers_missing")
     if len(set(names)) < len(names):
-        raise InputError(f"names repeat: {', '.join(names)}", where=where, allowed="unique names")
+        what = f"names repeat: {', '.join(names)}"
+        raise InputError(what, where=where, allowed="unique names", code="duplicate_name")
     rows_ct = [markers_ct.names.index(name) for name in names]
     rows_base = [markers_base.names.index(name) for name in names]
     joints = None if markers_base.joints is None else markers_base.joints[rows_base]
@@ -88,27 +87,22 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
         InputError: Fewer than three, not finite, on a line, of two sizes, or all at one place.
     """
     if len(markers) < MIN_MARKERS:
-        raise InputError(f"{len(markers)} markers", where=where, allowed="3 or more, by the same names")
+        what = f"{len(markers)} markers"
+        raise InputError(what, where=where, allowed="3 or more, by the same names", code="too_few_markers")
     both = np.concatenate([markers.points_ct, markers.points_base])
     if not np.isfinite(both).all():
         bad = [n for n, a, b in zip(markers.names, markers.points_ct, markers.points_base, strict=True)
                if not np.isfinite([a, b]).all()]  # fmt: skip
-        raise InputError(f"marker {', '.join(bad)} is not finite", where=where, allowed="finite mm")
+        raise InputError(f"marker {', '.join(bad)} is not finite", where=where, allowed="finite mm", code="not_finite")
     spreads = [_singular_values(points) for points in (markers.points_ct, markers.points_base)]
     for side, values in zip(("CT", "base"), spreads, strict=True):
         if values[0] == 0 or values[1] / values[0] < COLLINEAR:
-            raise InputError(
-                f"markers {', '.join(markers.names)} are collinear on the {side} side",
-                where=where,
-                allowed="three markers that span a triangle",
-            )
+            what = f"markers {', '.join(markers.names)} are collinear on the {side} side"
+            raise InputError(what, where=where, allowed="three markers that span a triangle", code="markers_collinear")
     ratio = float(np.linalg.norm(spreads[1]) / np.linalg.norm(spreads[0]))
     if not 1 / UNIT_SLIP < ratio < UNIT_SLIP:
-        raise InputError(
-            f"base markers spread {ratio:.3g} times as wide as the CT's: a likely mm/cm/m slip",
-            where=where,
-            allowed="both sides in mm",
-        )
+        what = f"base markers spread {ratio:.3g} times as wide as the CT's: a likely mm/cm/m slip"
+        raise InputError(what, where=where, allowed="both sides in mm", code="wrong_unit")
     span = max(_span(markers.points_ct), _span(markers.points_base))
     if span < LEAST_SPAN_MM:
         raise InputError(
@@ -116,6 +110,7 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
             "of unit (m or cm as mm) on both sides",
             where=where,
             allowed=f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least",
+            code="wrong_unit",
         )
 
 

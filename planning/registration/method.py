@@ -80,17 +80,13 @@ def _fit_by(method: Method, noise: ReadingNoise | None) -> Fit:
 
 def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path) -> None:
     if method == "affine":
-        raise InputError(
-            "method 'affine' bends the patient",
-            where=where,
-            allowed="triad, rigid or weighted; affine only reproduces the paper's Table 6",
-        )
+        allowed = "triad, rigid or weighted; affine only reproduces the paper's Table 6"
+        raise InputError("method 'affine' bends the patient", where=where, allowed=allowed, code="method_bends")
     if method not in get_args(Method):
-        raise InputError(f"method {method!r}", where=where, allowed=", ".join(get_args(Method)), code="method")
+        raise InputError(f"method {method!r}", where=where, allowed=", ".join(get_args(Method)), code="unknown_method")
     if method in WEIGHING and noise is None:
-        raise InputError(
-            f"method '{method}' weighs by declared errors", where=where, allowed="[errors], or method rigid"
-        )
+        what = f"method '{method}' weighs by declared errors"
+        raise InputError(what, where=where, allowed="[errors], or method rigid", code="method_without_errors")
 
 
 def _check_noise(
@@ -102,10 +98,12 @@ def _check_noise(
     values = np.linalg.eigvalsh(covariance.independent if method in WEIGHING else covariance.whole)
     if not values[0] > SINGULAR * values[-1]:
         message = "the declared errors leave readings of the markers without any"
-        raise InputError(message, where=where, allowed="ct_in_plane_mm, ct_slice_mm or touch_mm above 0")
+        allowed = "ct_in_plane_mm, ct_slice_mm or touch_mm above 0"
+        raise InputError(message, where=where, allowed=allowed, code="no_marker_noise")
     if found_in_mm is not None and found_in_mm < LEAST_FOUND_MM:
         message = f"marker_noise = 'found', but the residuals ({found_in_mm:.2g} mm) hold none"
-        raise InputError(message, where=where, allowed="markers measured on both sides, or marker_noise = 'declared'")
+        allowed = "markers measured on both sides, or marker_noise = 'declared'"
+        raise InputError(message, where=where, allowed=allowed, code="no_marker_noise")
 
 
 MAX_RESIDUAL_MM = 15.0
@@ -139,6 +137,7 @@ def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, 
             f"{_rms(residuals):.2f} mm){better_names(markers, target_ct, _rms(residuals))}",
             where=where,
             allowed="both sides right-handed: check LPS/RAS and the marker names",
+            code="markers_mirrored",
         )
     lengths = np.linalg.norm(residuals, axis=1)
     worst = int(np.argmax(lengths))
@@ -148,6 +147,7 @@ def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, 
             f"{better_names(markers, target_ct, _rms(residuals))}",
             where=where,
             allowed=f"residuals up to {MAX_RESIDUAL_MM:g} mm",
+            code="marker_misses",
         )
 
 

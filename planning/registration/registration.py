@@ -211,7 +211,8 @@ def register(
     fre_mm = rigid_fre_mm(markers.points_ct, markers.points_base)
     fit = checked_fit(markers, method, noise, fre_mm if noise_found else None, where=where)
     if method == "triad" and len(markers) != MIN_MARKERS:
-        raise InputError(f"triad takes 3 markers, not {len(markers)}", where=where, allowed="3 names in use")
+        what = f"triad takes 3 markers, not {len(markers)}"
+        raise InputError(what, where=where, allowed="3 names in use", code="wrong_count")
     T_base_ct = fit(markers.points_ct, markers.points_base)
     residuals = apply(T_base_ct, markers.points_ct) - markers.points_base
     check_residuals(markers, residuals, target_ct, where)
@@ -228,7 +229,7 @@ def register(
         what += better_names(markers, target_ct, fre_mm)
         deformed = distortion(T_base_ct, markers, noise, target_ct)
         what += f"; {deformed.brief()}" if deformed is not None and deformed.doubted else ""
-        raise InputError(what, where=where, allowed=ALLOWED_RESIDUALS)
+        raise InputError(what, where=where, allowed=ALLOWED_RESIDUALS, code="residuals_too_large")
     weak = conditioning(markers.points_ct, target_ct)
     return Registration(method, T_base_ct, markers, residuals, test, weak, target_ct, uncertainty)
 

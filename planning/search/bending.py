@@ -145,7 +145,7 @@ def check_tissues(case: Case, anatomy: Anatomy) -> None:
             bend = shortest_bend(case.bending.shaft)
             what = f"tissue.{pattern}: {tissue.stiffness_n_mm2:g} N/mm2 bends this shaft within {bend:.2g} mm"
             allowed = f"at most {most:.3g} N/mm2 for it: beyond, no bound of its bending is known"
-            raise InputError(what, where=case.path, allowed=allowed)
+            raise InputError(what, where=case.path, allowed=allowed, code="tissue_too_stiff")
 
 
 def path_layers(

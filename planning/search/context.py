@@ -208,7 +208,8 @@ def prepare(
             case that does not say where its base is.
     """
     if engine not in ENGINES:
-        raise InputError(f"engine '{engine}' is not known", where="--engine", allowed=", ".join(ENGINES))
+        what = f"engine '{engine}' is not known"
+        raise InputError(what, where="--engine", allowed=", ".join(ENGINES), code="unknown_engine")
     watcher = watcher or Silent()
     stages = Stages(announce=partial(watcher.step, "stage"))
     with stages.time("case"):
@@ -216,7 +217,8 @@ def prepare(
         case = case if target_ct is None else case.aimed_at(target_ct)
         placement = load_placement(case)
     if arm and placement is None:
-        raise InputError(f"the arm is to be checked, but {NO_BASE}", where=case.path, allowed=ALLOWED_BASE)
+        what = f"the arm is to be checked, but {NO_BASE}"
+        raise InputError(what, where=case.path, allowed=ALLOWED_BASE, code="no_base")
     with stages.time("anatomy"):
         cache = replace(user_cache(), memory=memory)
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), cache)

@@ -410,7 +410,8 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
     own = stated.get(case.target_structure, 1.0)
     if own != 1.0:
         message = f"breathing.weights: '{case.target_structure}' holds the target, and {own:g} is not its weight"
-        raise InputError(message, where=case.path, allowed="1, or no weight for it: the amplitude is the target's")
+        allowed = "1, or no weight for it: the amplitude is the target's"
+        raise InputError(message, where=case.path, allowed=allowed, code="breathing_weight")
     of = breathing.weights.of
     weights = [of(name) if weight is None else stated.get(name, weight) for name, weight in fixed.items()]
     return MovingWeights(float(of(skin) or 0.0), np.array(weights, dtype=np.float64))

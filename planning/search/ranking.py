@@ -85,7 +85,9 @@ def ranked_by(candidates: Candidates, cost: Floats) -> Candidates:
     rows = np.flatnonzero(candidates.safe)
     if cost.shape != (len(candidates),) or cost.dtype.kind not in "iufb" or not np.isfinite(cost[rows]).all():
         allowed = f"shape ({len(candidates)},), real numbers, finite for the {len(rows)} safe candidates"
-        raise InputError(f"a cost of shape {cost.shape}, {cost.dtype}", where="rerank", allowed=allowed, code="cost")
+        raise InputError(
+            f"a cost of shape {cost.shape}, {cost.dtype}", where="rerank", allowed=allowed, code="wrong_shape"
+        )
     ranks = np.zeros(len(candidates), np.int32)
     ranks[rows[np.argsort(cost[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
     ranking = Ranking(np.where(candidates.safe, cost, np.nan), ranks, candidates.ranking.pareto)

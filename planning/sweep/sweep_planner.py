@@ -92,14 +92,15 @@ def plan_sweep(
         NoAnswerError: The first directions are not allowed, or no approach to them was found.
     """
     if context.reach is None:
-        raise InputError("the case does not say where the robot stands", where=context.case.path, allowed=_BASE)
+        what = "the case does not say where the robot stands"
+        raise InputError(what, where=context.case.path, allowed=_BASE, code="no_base")
     route = _allowed(context, _angles(start, end), progress)
     point = apply(context.reach.T_base_ct, context.case.target_ct)
     T_base_ct, frame = context.reach.T_base_ct, context.case.T_ct_entry[:3, :3]
     directions = outward(route.angles[:, 0], route.angles[:, 1]) @ (T_base_ct[:3, :3] @ frame).T
     q, stopped = _farthest(context, point, directions, route)
     if len(q) < 2:
-        raise NoAnswerError(f"no sweep: {stopped}")
+        raise NoAnswerError(f"no sweep: {stopped}", code="sweep_stops")
     speeds, checker = context.case.robot.speeds, context.reach.checker
     approach = plan_approach(checker, home_configuration(context.case), q[0], seed=seed, speeds=speeds)
     rotated = np.arccos(np.clip(np.vecdot(directions[1 : len(q)], directions[: len(q) - 1]), -1.0, 1.0))
@@ -109,7 +110,8 @@ def plan_sweep(
         dense_states(checker, sweep.q, RESOLUTION_RAD / FINER), needle_may_touch_patient=False
     )
     if contact is not None:
-        raise NoAnswerError(f"no sweep: between its directions {contact.contact.body} touches {contact.contact.other}")
+        what = f"no sweep: between its directions {contact.contact.body} touches {contact.contact.other}"
+        raise NoAnswerError(what, code="motion_touches")
     length = context.case.needle.length_mm
     return SweepPlan(
         checker.model,
@@ -132,7 +134,7 @@ def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:
     change = np.array([end[0] - start[0], (end[1] - start[1] + np.pi) % (2 * np.pi) - np.pi])
     count = int(np.ceil(np.abs(change).max() / STEP))
     if count == 0:
-        raise InputError("a sweep to where it starts", where="--to", allowed="another direction")
+        raise InputError("a sweep to where it starts", where="--to", allowed="another direction", code="no_motion")
     return np.asarray(start + np.linspace(0.0, 1.0, count + 1)[:, None] * change)
 
 

@@ -69,7 +69,8 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
         NoAnswerError: No place, or not this one, can be touched in so many poses, or no motion was found.
     """
     if context.reach is None:
-        raise InputError("no robot", where=context.case.path, allowed="a case with [robot], placed in its base frame")
+        allowed = "a case with [robot], placed in its base frame"
+        raise InputError("no robot", where=context.case.path, allowed=allowed, code="no_base")
     checkers = approach_checkers(context, PLANNED_PADDING_MM)
     places, most = _places(context) if place_base is None else [place_base], 0
     for place in places:
@@ -84,7 +85,8 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
         except NoMotionError:
             continue
     where = "no place was found that can" if place_base is None else "this place cannot"
-    raise NoAnswerError(f"{where} be touched in {count} poses by free motions: {most} poses at most")
+    what = f"{where} be touched in {count} poses by free motions: {most} poses at most"
+    raise NoAnswerError(what, code="too_few_poses")
 
 
 def spread_poses(R_base_flange: Floats, count: int) -> list[int]:

@@ -162,11 +162,12 @@ def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
     why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
     count = f"{len(task.markers)} of {len(every.markers)} markers can be touched"
     if len(task.markers) < MIN_MARKERS:
-        raise NoAnswerError(f"{count}, {MIN_MARKERS} are needed: {why}")
+        raise NoAnswerError(f"{count}, {MIN_MARKERS} are needed: {why}", code="too_few_markers")
     try:
         return task.error(task.q_insertion)
     except InputError as error:
-        raise NoAnswerError(f"{count}, which do not suffice: {error.what}" + (f"; {why}" if why else "")) from error
+        what = f"{count}, which do not suffice: {error.what}" + (f"; {why}" if why else "")
+        raise NoAnswerError(what, code=error.code) from error
 
 
 def expected_of_touches(context: CaseContext, q_insertion: Floats, read: NamedPoints) -> float:
@@ -212,11 +213,12 @@ def registered(context: CaseContext, read: NamedPoints) -> Registration:
 def _task(context: CaseContext, q_insertion: Floats) -> _Task:
     placement = context.placement
     if context.reach is None or placement is None or placement.registration is None or context.case.errors is None:
-        raise InputError("no touches can be planned", where=context.case.path, allowed=ALLOWED)
+        raise InputError("no touches can be planned", where=context.case.path, allowed=ALLOWED, code="no_markers")
     found = placement.registration.markers
     if len(found) > MOST_MARKERS:
         where = f"{context.case.path}: registration"
-        raise InputError(f"{len(found)} markers", where=where, allowed=f"at most {MOST_MARKERS}: see registration.use")
+        what = f"{len(found)} markers"
+        raise InputError(what, where=where, allowed=f"at most {MOST_MARKERS}: see registration.use", code="too_many")
     believed = MarkerPairs(found.names, found.points_ct, apply(placement.T_base_ct, found.points_ct))
     return _Task(context, believed, cast(Method, placement.registration.method), q_insertion)
 

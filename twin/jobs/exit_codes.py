@@ -190,10 +190,8 @@ def _answered(command: Callable[[], object]) -> object:
     try:
         return command()
     except (PlanningError, ClickException) as error:
-        codes = {InputError: "bad_input", NoAnswerError: "no_answer", PlanningError: "program_failed"}
-        code = next((code for kind, code in codes.items() if isinstance(error, kind)), "command_line")
         document = {
-            "code": getattr(error, "code", "") or code,
+            "code": getattr(error, "code", "command_line"),
             "sentence": getattr(error, "what", _line_and_code(error)[0]),
             "where": getattr(error, "where", ""),
             "allowed": getattr(error, "allowed", ""),

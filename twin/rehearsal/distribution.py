@@ -195,7 +195,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(case, registration)
     if error is None or registration is None:
-        raise InputError("no rooms can be drawn", where=case.path, allowed=ALLOWED)
+        raise InputError("no rooms can be drawn", where=case.path, allowed=ALLOWED, code="no_markers")
     q_touch = touches(case, registration.markers)
     bend = bend_along(context, outward_ct)
     believed = replace(_as_rehearsed(error, q_touch), bend=bend)

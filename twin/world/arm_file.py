@@ -74,7 +74,7 @@ def _check_weights(urdf: ArmUrdf) -> None:
         if not any(member.link.weighs for member in members):
             what = "it states no mass and inertia above 0, without which nothing can be simulated"
             here = f"{urdf.where}: link '{members[0].link.name}'"
-            raise InputError(what, where=here, allowed="an <inertial> of every moving link")
+            raise InputError(what, where=here, allowed="an <inertial> of every moving link", code="no_inertia")
 
 
 def _simplify(robot: ET.Element) -> None:

@@ -154,9 +154,8 @@ class Admittance:
     def __init__(self, model: UrModel, tip_m: float, virtual: VirtualMass, dt: float) -> None:
         decay = virtual.damping_ns_m * dt / virtual.mass_kg
         if not decay < MOST_DECAY:
-            raise InputError(
-                f"D dt / M = {decay:.2f} would diverge", where="admittance", allowed=f"below {MOST_DECAY:g}"
-            )
+            what = f"D dt / M = {decay:.2f} would diverge"
+            raise InputError(what, where="admittance", allowed=f"below {MOST_DECAY:g}", code="control_unstable")
         self.dt = dt
         self._model, self._tip_m, self._virtual = model, tip_m, virtual
         self._place, self._velocity = np.zeros(3), np.zeros(3)
@@ -318,6 +317,7 @@ def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> No
             f"sqrt(K/m) dt = {ratio:.2f}",
             where="impedance",
             allowed=f"below {MOST_RATIO}: less stiffness or a shorter step",
+            code="control_unstable",
         )
 
 

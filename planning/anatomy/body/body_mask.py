@@ -193,7 +193,7 @@ def _found(
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
         allowed = f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
-        raise InputError(what, where=where, allowed=allowed)
+        raise InputError(what, where=where, allowed=allowed, code="no_body")
     warnings: list[str] = []
     tables: tuple[TableSide, ...] = ()
     if shown.tables:
@@ -209,7 +209,8 @@ def _found(
         filled[box] |= filled_slices(limb)
     _fill_cut_lungs(filled, hu, voxel_ml, warnings)
     if filled.all():
-        raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
+        what = "no air around the body"
+        raise InputError(what, where=where, allowed="a CT that shows the skin somewhere", code="no_air")
     return filled, tables, warnings
 
 

@@ -56,12 +56,12 @@ def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tu
             link, here = member.link, f"{document.where}: link '{member.link.name}'"
             if link.drawn and not link.collisions:
                 what = "it is drawn, and has no shape for contacts"
-                raise InputError(what, where=here, allowed="a <collision>; the mesh of its <visual> will do")
+                allowed = "a <collision>; the mesh of its <visual> will do"
+                raise InputError(what, where=here, allowed=allowed, code="no_collision_shape")
             if link.collisions and link.name in chain.beyond:
                 what = f"it is fixed beyond the flange '{chain.flange}'"
-                raise InputError(
-                    what, where=here, allowed="the arm alone; what the flange carries is [tool] of the case"
-                )
+                allowed = "the arm alone; what the flange carries is [tool] of the case"
+                raise InputError(what, where=here, allowed=allowed, code="shape_beyond_flange")
             shapes += [
                 BodyShape(_mesh(shape, document, here, read), member.T_body_link @ shape.T_link_shape)
                 for shape in link.collisions
@@ -69,7 +69,8 @@ def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tu
         if not shapes:
             names = ", ".join(member.link.name for member in members)
             what = f"nothing has a collision shape between the joints {number} and {number + 1} (links {names})"
-            raise InputError(what, where=document.where, allowed="one collision shape a link at least")
+            allowed = "one collision shape a link at least"
+            raise InputError(what, where=document.where, allowed=allowed, code="no_collision_shape")
         found.append(tuple(shapes))
     return tuple(found)
 
@@ -90,15 +91,15 @@ def _mesh(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> Tr
 def _file(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> TriangleMesh:
     if Path(shape.address).suffix.lower() not in MESH_SUFFIXES:
         what = f"mesh '{shape.address}' is of a kind that is not read"
-        raise InputError(what, where=here, allowed=f"a file ending in {', '.join(MESH_SUFFIXES)}, for contacts")
+        allowed = f"a file ending in {', '.join(MESH_SUFFIXES)}, for contacts"
+        raise InputError(what, where=here, allowed=allowed, code="unknown_format")
     path = document.where.parent / shape.address
     try:
         return parse_mesh(read(shape.address), path, unit=Unit.M, space=Space.LOCAL, up=Up.Z, stretch=shape.size)
     except InputError as error:
         what = f"mesh '{shape.address}': {error.what}"
-        raise InputError(
-            what, where=here, allowed=f'{error.allowed}; a URDF speaks metres, scale="0.001 0.001 0.001" reads mm'
-        ) from error
+        allowed = f'{error.allowed}; a URDF speaks metres, scale="0.001 0.001 0.001" reads mm'
+        raise InputError(what, where=here, allowed=allowed, code=error.code) from error
 
 
 def _about(radius: float, length: float) -> Floats:

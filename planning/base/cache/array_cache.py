@@ -223,9 +223,8 @@ def _most_bytes() -> int:
     if not stated:
         return MOST_BYTES
     if not (stated.isascii() and stated.isdigit() and len(stated) < 10):
-        raise InputError(
-            f"{stated[:40]!r} is no size", where=f"${SIZE_VARIABLE}", allowed="whole megabytes, such as 2000"
-        )
+        what = f"{stated[:40]!r} is no size"
+        raise InputError(what, where=f"${SIZE_VARIABLE}", allowed="whole megabytes, such as 2000", code="not_a_number")
     return int(stated) * 1_000_000
 
 

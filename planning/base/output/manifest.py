@@ -140,17 +140,15 @@ def read_output(path: Path, *, max_bytes: int) -> Output:
     digest = hashlib.sha256(data).hexdigest()
     home = path.resolve()
     if home.name == MANIFEST_NAME:
-        raise InputError("lists the files of a command and is none of them", where=path, allowed="one that it lists")
+        what = "lists the files of a command and is none of them"
+        raise InputError(what, where=path, allowed="one that it lists", code="not_in_manifest")
     manifest = _set_of(home.parent)
     if manifest is None:
         return Output(path, data, digest, f"{path} lies outside of any output set: nothing tells whether it is whole")
     if manifest.files.get(home.name) != digest:
         wrong = "is not listed" if home.name not in manifest.files else "has other bytes than are listed"
-        raise InputError(
-            f"{wrong} in {MANIFEST_NAME} beside it: the folder's set is unfinished, or the file was edited",
-            where=path,
-            allowed="what the command wrote: run it again",
-        )
+        what = f"{wrong} in {MANIFEST_NAME} beside it: the folder's set is unfinished, or the file was edited"
+        raise InputError(what, where=path, allowed="what the command wrote: run it again", code="output_not_whole")
     return Output(path, data, digest, "")
 
 
@@ -184,7 +182,8 @@ def read_manifest(folder: Path) -> Manifest | None:
         return None
     document = _document(path)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise InputError("is not that of an output folder", where=path, allowed=ANOTHER_FOLDER)
+        what = "is not that of an output folder"
+        raise InputError(what, where=path, allowed=ANOTHER_FOLDER, code="not_an_output_folder")
     with fitting(path, ANOTHER_FOLDER):
         return _manifest(document)
 

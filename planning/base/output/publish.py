@@ -117,7 +117,8 @@ def refuse_foreign(draft: Draft, files: Iterable[str]) -> None:
         foreign = _foreign_entry(draft.out, name)
         if foreign is not None:
             what = f"{name} is to be written, but the file {foreign} there comes from no run of this program"
-            raise InputError(what, where=draft.out, allowed="another folder, or this one without that file")
+            allowed = "another folder, or this one without that file"
+            raise InputError(what, where=draft.out, allowed=allowed, code="foreign_file")
 
 
 def _foreign_entry(out: Path, name: str) -> str | None:

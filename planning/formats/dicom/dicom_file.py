@@ -48,7 +48,9 @@ def refused_if_damaged(where: str | Path) -> Iterator[None]:
         raise
     except Exception as error:  # the library promises no kind of error for bytes that are damaged
         what = f"damaged ({type(error).__name__}: {str(error)[:200]})"
-        raise InputError(what.encode("ascii", "replace").decode(), where=where, allowed=ALLOWED) from error
+        raise InputError(
+            what.encode("ascii", "replace").decode(), where=where, allowed=ALLOWED, code="file_damaged"
+        ) from error
 
 
 def parse_dicom(content: bytes, path: Path) -> Dataset:
@@ -62,7 +64,8 @@ def parse_dicom(content: bytes, path: Path) -> Dataset:
         InputError: No DICOM, damaged, cut short, inflating to too much, or big endian.
     """
     if not is_dicom(content[:META_START]):
-        raise InputError("no DICOM file: DICM does not stand at byte 128", where=path, allowed=ALLOWED)
+        what = "no DICOM file: DICM does not stand at byte 128"
+        raise InputError(what, where=path, allowed=ALLOWED, code="wrong_format")
     with refused_if_damaged(path):
         stream = io.BytesIO(content)
         meta = read_meta(stream)
@@ -90,7 +93,8 @@ def _behind_meta(tag: BaseTag, vr: str | None, length: int) -> bool:
 def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:
     """The data set's own bytes, inflated where they are deflated."""
     if not syntax:
-        raise InputError("its meta information names no transfer syntax", where=path, allowed=ALLOWED)
+        what = "its meta information names no transfer syntax"
+        raise InputError(what, where=path, allowed=ALLOWED, code="missing_tag")
     if syntax == BIG_ENDIAN:
         refuse_big_endian(path)
     if syntax != DEFLATED:
@@ -102,7 +106,7 @@ def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:
         what = (
             f"inflates to more than {MAX_INFLATED_BYTES} bytes" if more else "cut short: its deflated data do not end"
         )
-        raise InputError(what, where=path, allowed=ALLOWED)
+        raise InputError(what, where=path, allowed=ALLOWED, code="file_damaged")
     return memoryview(inflated)
 
 
@@ -145,7 +149,7 @@ def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[flo
         plain = tuple(float(one) for one in listed)
     if len(plain) != count or not all(map(math.isfinite, plain)):
         what = f"{name(keyword)} is missing" if found is None else f"{name(keyword)} is {str(found)[:100]}"
-        raise InputError(what, where=where, allowed=f"{count} finite number{'s' if count > 1 else ''}")
+        raise InputError(what, where=where, allowed=f"{count} finite number{'s' if count > 1 else ''}", code="bad_tag")
     return plain
 
 
@@ -162,7 +166,8 @@ def whole(data: Dataset, keyword: str, *, low: int, high: int, where: str) -> in
     """
     found = number(data, keyword, where=where)
     if found != int(found) or not low <= found <= high:
-        raise InputError(f"{name(keyword)} is {found:g}", where=where, allowed=f"a whole number from {low} to {high}")
+        what = f"{name(keyword)} is {found:g}"
+        raise InputError(what, where=where, allowed=f"a whole number from {low} to {high}", code="bad_tag")
     return int(found)
 
 
@@ -198,7 +203,7 @@ def items(data: Dataset, keyword: str, *, where: str) -> list[Dataset]:
     with refused_if_damaged(where):
         listed = list(found)
     if not all(isinstance(one, Dataset) for one in listed):
-        raise InputError(f"{name(keyword)} is no sequence", where=where, allowed="a sequence of items")
+        raise InputError(f"{name(keyword)} is no sequence", where=where, allowed="a sequence of items", code="bad_tag")
     return listed
 
 
@@ -280,7 +285,9 @@ class _Walk:
                 self._refuse(f"element {_shown(tag)} has no length", at)
             return self._items(at, end, implicit=implicit or kind == b"UN", depth=depth + 1, closed=True)
         if at + length > end:
-            self._refuse(f"cut short: element {_shown(tag)} promises {length} bytes, and {end - at} are left", at)
+            self._refuse(
+                f"cut short: element {_shown(tag)} promises {length} bytes, and {end - at} are left", at, "file_cut"
+            )
         if kind == b"UN" and _known(tag) == b"SQ":
             self._refuse(f"sequence {_shown(tag)} is stored without its value representation", at)
         if kind == b"SQ":
@@ -297,7 +304,7 @@ class _Walk:
         if kind not in LONG_FORM:
             self._refuse(f"element {_shown(tag)} has the unknown value representation {kind!r}", at)
         if at + 12 > end:
-            self._refuse("cut short within an element's head", at)
+            self._refuse("cut short within an element's head", at, "file_cut")
         return kind, at + 12, struct.unpack_from("<L", self._data, at + 8)[0]
 
     def _items(self, at: int, end: int, *, implicit: bool, depth: int, closed: bool) -> int:
@@ -312,7 +319,7 @@ class _Walk:
                 at = self.data_set(at + 8, end, implicit=implicit, depth=depth, closed=True)
                 continue
             if at + 8 + length > end:
-                self._refuse("cut short within a sequence's item", at)
+                self._refuse("cut short within a sequence's item", at, "file_cut")
             at = self.data_set(at + 8, at + 8 + length, implicit=implicit, depth=depth, closed=False)
         return at
 
@@ -323,7 +330,7 @@ class _Walk:
             if tag == SEQUENCE_END:
                 return at + 8
             if tag != ITEM or at + 8 + length > end:
-                self._refuse("cut short within the compressed pixels", at)
+                self._refuse("cut short within the compressed pixels", at, "file_cut")
             at += 8 + length
 
     def _tag(self, at: int, end: int) -> int:
@@ -331,12 +338,13 @@ class _Walk:
         if self._count > MAX_ELEMENTS:
             self._refuse(f"more than {MAX_ELEMENTS} elements", at)
         if at + 8 > end:
-            self._refuse("cut short: it ends within an element", at)
+            self._refuse("cut short: it ends within an element", at, "file_cut")
         group, element = struct.unpack_from("<HH", self._data, at)
         return int(group << 16 | element)
 
-    def _refuse(self, what: str, at: int) -> NoReturn:
-        raise InputError(f"{what} (byte {at} of the data set)", where=self._where, allowed="a complete DICOM file")
+    def _refuse(self, what: str, at: int, code: str = "file_damaged") -> NoReturn:
+        where = self._where
+        raise InputError(f"{what} (byte {at} of the data set)", where=where, allowed="a complete DICOM file", code=code)
 
 
 def _known(tag: int) -> bytes:

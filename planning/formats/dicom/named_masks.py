@@ -64,11 +64,11 @@ def unique_names(names: Sequence[str], where: Path) -> None:
         InputError: One has none, or two share one.
     """
     if not names:
-        raise InputError("holds no structure", where=where, allowed="a file with structures")
+        raise InputError("holds no structure", where=where, allowed="a file with structures", code="no_structure")
     for name in names:
         if not name or names.count(name) > 1:
             what = f"{names.count(name)} structures are called {name!r}" if name else "a structure has no name"
-            raise InputError(what, where=where, allowed="a name of its own for each structure")
+            raise InputError(what, where=where, allowed="a name of its own for each structure", code="duplicate_name")
 
 
 def check_frame_of_reference(stated: str, ct: CtSeries, where: Path) -> None:
@@ -83,4 +83,5 @@ def check_frame_of_reference(stated: str, ct: CtSeries, where: Path) -> None:
             f"{what}{ct.frame_of_reference or 'one that is not stated'}",
             where=where,
             allowed="structures that were drawn on this CT, or on one that was registered to it",
+            code="other_frame_of_reference",
         )

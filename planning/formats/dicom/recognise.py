@@ -101,7 +101,8 @@ def recognise(path: Path) -> DicomFile | None:
                 if header is not None:
                     header.file_meta = meta
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
+        what = f"cannot be read ({error.strerror})"
+        raise InputError(what, where=path, allowed="a readable file", code="unreadable") from error
     if header is None:
         content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
         return described(parse_dicom(content, path), path)
@@ -163,7 +164,8 @@ def list_folder(folder: Path) -> tuple[tuple[DicomFile, ...], tuple[Entry, ...]]
     found = {one: recognise(folder / one.name) for one in listed if one.what == FILE}
     for one in found.values():
         if one is not None and not one.name.isprintable():
-            raise InputError(f"file name {one.name!a}", where=folder, allowed="names of printable characters")
+            what = f"file name {one.name!a}"
+            raise InputError(what, where=folder, allowed="names of printable characters", code="bad_name")
     files = tuple(one for one in found.values() if one is not None)
     return files, tuple(one for one in listed if found.get(one) is None)
 
@@ -213,7 +215,7 @@ def choose_series(path: Path) -> SeriesFiles:
         named = next((one for one in found if one.name == path.name), None)
         if named is None or not named.is_slice:
             what = "no DICOM file" if named is None else f"{named.sop_class}, no slice of a CT"
-            raise InputError(what, where=path, allowed="a slice of a CT series, or its folder")
+            raise InputError(what, where=path, allowed="a slice of a CT series, or its folder", code="not_a_ct")
         slices = [one for one in slices if one.series_uid == named.series_uid]
     _check_one_series(slices, found, others, path)
     names = tuple(one.name for one in slices)
@@ -250,7 +252,8 @@ def _check_one_series(
         classes = Counter(one.sop_class for one in found)
         shown = [f"{count} {name}" for name, count in classes.most_common()] or ["no DICOM file"]
         what = f"no CT series here: {first_few([*shown, *(one.line for one in others)])}"
-        raise InputError(what, where=path, allowed="a folder with a CT series; folders in it are not entered")
+        allowed = "a folder with a CT series; folders in it are not entered"
+        raise InputError(what, where=path, allowed=allowed, code="no_ct")
     series: dict[str, list[DicomFile]] = {}
     for one in slices:
         series.setdefault(one.series_uid, []).append(one)
@@ -261,7 +264,8 @@ def _check_one_series(
         ]
         more = f"; and {len(series) - SHOWN} more" if len(series) > SHOWN else ""
         what = f"{len(series)} CT series: {'; '.join(listed)}{more}"
-        raise InputError(what, where=path, allowed="one series: name one of its files instead of the folder")
+        allowed = "one series: name one of its files instead of the folder"
+        raise InputError(what, where=path, allowed=allowed, code="several_series")
 
 
 def _notes(aside: Sequence[DicomFile], below: Sequence[Entry], path: Path) -> tuple[str, ...]:

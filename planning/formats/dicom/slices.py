@@ -89,7 +89,7 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     if sop_class_of(data, where=file) == CLASSIC_CT:
         if frames != 1:
             what = f"{name('NumberOfFrames')} is {frames} in a CT image of one slice"
-            raise InputError(what, where=file, allowed="one frame, or an Enhanced CT image")
+            raise InputError(what, where=file, allowed="one frame, or an Enhanced CT image", code="wrong_count")
         return [_slice(file, 0, file, Groups(data, data))]
     found = []
     for frame, groups in enumerate(frame_groups(data, frames, where=file)):
@@ -121,7 +121,8 @@ class Groups:
             return self.own
         found = self.find(keyword, label)
         if len(found) != 1:
-            raise InputError(f"{name(keyword)} has {len(found)} items", where=label, allowed="one for each frame")
+            what = f"{name(keyword)} has {len(found)} items"
+            raise InputError(what, where=label, allowed="one for each frame", code="wrong_count")
         return found[0]
 
 
@@ -134,7 +135,7 @@ def frame_groups(data: Dataset, frames: int, *, where: str) -> list[Groups]:
     own = items(data, "PerFrameFunctionalGroupsSequence", where=where)
     if len(own) != frames:
         what = f"{name('PerFrameFunctionalGroupsSequence')} has {len(own)} items for {frames} frames"
-        raise InputError(what, where=where, allowed="one for each frame")
+        raise InputError(what, where=where, allowed="one for each frame", code="wrong_count")
     shared = items(data, "SharedFunctionalGroupsSequence", where=where)
     return [Groups(one, shared[0] if shared else Dataset()) for one in own]
 
@@ -151,21 +152,20 @@ def plane_of(groups: Groups, label: str) -> Plane:
         groups.holder("PixelMeasuresSequence", label), "PixelSpacing", 2, where=label
     )
     if max(map(abs, origin)) > MAX_ORIGIN_MM:
-        raise InputError(
-            f"{name('ImagePositionPatient')} is {list(origin)}", where=label, allowed=f"{MAX_ORIGIN_MM} mm"
-        )
+        what = f"{name('ImagePositionPatient')} is {list(origin)}"
+        raise InputError(what, where=label, allowed=f"{MAX_ORIGIN_MM} mm", code="too_far")
     if not all(MIN_SPACING_MM <= one <= MAX_SPACING_MM for one in (between_rows, between_columns)):
         allowed = f"{MIN_SPACING_MM} to {MAX_SPACING_MM} mm"
-        raise InputError(
-            f"{name('PixelSpacing')} is {between_rows:g}, {between_columns:g}", where=label, allowed=allowed
-        )
+        what = f"{name('PixelSpacing')} is {between_rows:g}, {between_columns:g}"
+        raise InputError(what, where=label, allowed=allowed, code="implausible_spacing")
     if max(map(abs, cosines)) > 2:
-        raise InputError(f"{name('ImageOrientationPatient')} is {list(cosines)}", where=label, allowed="unit vectors")
+        what = f"{name('ImageOrientationPatient')} is {list(cosines)}"
+        raise InputError(what, where=label, allowed="unit vectors", code="not_unit")
     axes = np.array(cosines).reshape(2, 3).T
     lengths = np.linalg.norm(axes, axis=0)
     if np.abs(lengths - 1.0).max() > UNIT_TOLERANCE or abs(axes[:, 0] @ axes[:, 1]) > UNIT_TOLERANCE:
         what = f"{name('ImageOrientationPatient')} is {list(cosines)}"
-        raise InputError(what, where=label, allowed="two unit vectors at a right angle")
+        raise InputError(what, where=label, allowed="two unit vectors at a right angle", code="axes_not_square")
     row = axes[:, 0] / lengths[0]
     column = axes[:, 1] - (axes[:, 1] @ row) * row
     square = np.stack([row, column / np.linalg.norm(column)], axis=1)
@@ -176,7 +176,8 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
     rescale = groups.holder("PixelValueTransformationSequence", label)
     kind = text(rescale, "RescaleType", where=label)
     if kind not in HOUNSFIELD:
-        raise InputError(f"{name('RescaleType')} is {kind!r}", where=label, allowed="HU (Hounsfield units)")
+        what = f"{name('RescaleType')} is {kind!r}"
+        raise InputError(what, where=label, allowed="HU (Hounsfield units)", code="not_hounsfield")
     for keyword in ("RescaleSlope", "RescaleIntercept"):
         if not has(rescale, keyword):
             what = f"{name(keyword)} is missing, so that nothing tells its Hounsfield units"
@@ -184,7 +185,7 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
     slope, intercept = (number(rescale, keyword, where=label) for keyword in ("RescaleSlope", "RescaleIntercept"))
     if slope == 0 or abs(slope) > 1e6 or abs(intercept) > 1e6:
         what = f"rescaling by {slope:g} and {intercept:g}"
-        raise InputError(what, where=label, allowed="a slope other than 0, both within a million")
+        raise InputError(what, where=label, allowed="a slope other than 0, both within a million", code="out_of_range")
     return Slice(file, frame, label, plane_of(groups, label), slope, intercept)
 
 
@@ -238,7 +239,8 @@ def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
             or uneven steps; the slices are named.
     """
     if len(slices) < 2:
-        raise InputError(f"{len(slices)} slice", where=where, allowed="a series of at least 2 slices")
+        what = f"{len(slices)} slice"
+        raise InputError(what, where=where, allowed="a series of at least 2 slices", code="too_few_slices")
     first = slices[0]
     for other in slices[1:]:
         _check_alike(first, other, where)
@@ -254,7 +256,8 @@ def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
     worst = int(np.argmax(off))
     if off[worst] > _tolerance(step):
         what = f"{ordered[worst].label} lies {off[worst]:.2f} mm off the line of the others"
-        raise InputError(what, where=where, allowed=f"slices along one straight line, to {_tolerance(step):.2g} mm")
+        allowed = f"slices along one straight line, to {_tolerance(step):.2g} mm"
+        raise InputError(what, where=where, allowed=allowed, code="off_grid")
     return Stack(tuple(ordered), ordered[0].plane, step_ct)
 
 
@@ -263,12 +266,15 @@ def _check_alike(first: Slice, other: Slice, where: Path) -> None:
     if difference > AXES_TOLERANCE:
         angle = np.degrees(np.arccos(np.clip(first.plane.normal_ct @ other.plane.normal_ct, -1.0, 1.0)))
         what = f"{first.label} and {other.label} have other orientations (normals {angle:.1f} degrees apart)"
-        raise InputError(what, where=where, allowed="slices of one orientation")
+        raise InputError(what, where=where, allowed="slices of one orientation", code="mixed_geometry")
     ratios = np.array(first.plane.spacing_mm) / other.plane.spacing_mm
     if np.abs(ratios - 1.0).max() > SPACING_TOLERANCE:
         what = f"{first.label} and {other.label} have pixels of other sizes"
         raise InputError(
-            f"{what}: {first.plane.spacing_mm} and {other.plane.spacing_mm} mm", where=where, allowed="one"
+            f"{what}: {first.plane.spacing_mm} and {other.plane.spacing_mm} mm",
+            where=where,
+            allowed="one",
+            code="mixed_geometry",
         )
 
 
@@ -281,7 +287,8 @@ def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> No
     named = [f"{ordered[k].label} and {ordered[k + 1].label}" for k in np.flatnonzero(near).tolist()]
     more = f" and {len(named) - SHOWN} pairs more" if len(named) > SHOWN else ""
     what = f"several slices at one place: {'; '.join(named[:SHOWN])}{more}"
-    raise InputError(what, where=where, allowed="one slice at each place (one time point, no copies)")
+    allowed = "one slice at each place (one time point, no copies)"
+    raise InputError(what, where=where, allowed=allowed, code="duplicate_place")
 
 
 def _check_steps(ordered: Sequence[Slice], steps: Floats, step: float, where: Path) -> None:
@@ -298,7 +305,7 @@ def _check_steps(ordered: Sequence[Slice], steps: Floats, step: float, where: Pa
         what = f"uneven steps: {steps[at]:.4g} mm {between}"
     more = f", and at {len(wrong) - 1} places more" if len(wrong) > 1 else ""
     allowed = f"even steps; the usual one here is {step:.4g} mm (resample the series, or export it again)"
-    raise InputError(f"{what}{more}", where=where, allowed=allowed)
+    raise InputError(f"{what}{more}", where=where, allowed=allowed, code="uneven_slices")
 
 
 def _tolerance(step: float) -> float:
@@ -342,7 +349,7 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
     tilt = float(np.degrees(np.arctan2(np.linalg.norm(sideways_mm), along)))
     if tilt > MAX_TILT_DEG:
         what = f"the slices' normal and the way from slice to slice are {tilt:.0f} degrees apart"
-        raise InputError(what, where=where, allowed=f"a tilt of at most {MAX_TILT_DEG:g} degrees")
+        raise InputError(what, where=where, allowed=f"a tilt of at most {MAX_TILT_DEG:g} degrees", code="gantry_tilt")
     if np.linalg.norm(sideways_mm) * (count - 1) <= NO_TILT_MM:
         sideways_mm = np.zeros(2)
         tilt = 0.0

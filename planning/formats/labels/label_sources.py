@@ -59,14 +59,14 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
     """
     allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one a structure"
     if not is_folder(folder):
-        raise InputError(f"'{folder.name[:200]}' is no folder", where=where, allowed=allowed)
+        raise InputError(f"'{folder.name[:200]}' is no folder", where=where, allowed=allowed, code="not_a_folder")
     found = entries(folder, most=MAX_ENTRIES, allowed=allowed)
     files = [one.name for one in found if is_mask(one) and not known(folder / one.name)]
     left = unaccounted(folder, found, lambda path: path.name in files or known(path))
     if left:
         raise not_read(left, "masks", where)
     if not 1 <= len(files) <= MAX_MASKS:
-        raise InputError(f"'{folder.name}' holds {len(files)} masks", where=where, allowed=allowed)
+        raise InputError(f"'{folder.name}' holds {len(files)} masks", where=where, allowed=allowed, code="wrong_count")
     refuse_one_name(files, where)
     return tuple(files)
 
@@ -108,11 +108,9 @@ def refuse_label_map(mask: LabelMap) -> None:
     """
     present = mask.labels_present()
     if len(present) > 1:
-        raise InputError(
-            f"is no mask: its voxels have the labels {first_few(list(map(str, present)))}",
-            where=mask.path,
-            allowed="0 and one other value; a label map is named with labelmap, outside of a folder of masks",
-        )
+        what = f"is no mask: its voxels have the labels {first_few(list(map(str, present)))}"
+        allowed = "0 and one other value; a label map is named with labelmap, outside of a folder of masks"
+        raise InputError(what, where=mask.path, allowed=allowed, code="not_a_mask")
 
 
 def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> None:
@@ -134,11 +132,9 @@ def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> N
             difference = f"up to {apart:.1f} mm away"
         else:
             continue
-        raise InputError(
-            f"mask {name} lies on another grid than {first}: {difference}",
-            where=where,
-            allowed="masks of one CT, all on one grid; others as [[structure]] with labelmap and label",
-        )
+        what = f"mask {name} lies on another grid than {first}: {difference}"
+        allowed = "masks of one CT, all on one grid; others as [[structure]] with labelmap and label"
+        raise InputError(what, where=where, allowed=allowed, code="other_grid")
 
 
 SEGMENT_ENDING = ".nrrd"
@@ -171,11 +167,10 @@ def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
     """
     header = parse_layered_header(content(file), path)
     if header.data_path != path:
-        raise InputError(
-            f"its voxels lie in {header.data_path.name}", where=path, allowed="header and voxels in one file"
-        )
+        what = f"its voxels lie in {header.data_path.name}"
+        raise InputError(what, where=path, allowed="header and voxels in one file", code="data_elsewhere")
     if header.cells.dtype.kind not in "iu":
-        raise InputError(f"voxels of type {header.cells.dtype}", where=path, allowed="whole numbers")
+        raise InputError(f"voxels of type {header.cells.dtype}", where=path, allowed="whole numbers", code="wrong_type")
     found = listed_segments(header.fields, header.layers, path)
     listed = frozenset(found.values())
     masks = {
@@ -203,7 +198,8 @@ def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict
     for name, segment in zip(names, segments, strict=True):
         if segments.count(segment) > 1:
             what = f"segment {name!r} shares label {segment.label} of layer {segment.layer}"
-            raise InputError(what, where=path, allowed="a label of its own in its layer for each segment")
+            allowed = "a label of its own in its layer for each segment"
+            raise InputError(what, where=path, allowed=allowed, code="duplicate_label")
     return dict(zip(names, segments, strict=True))
 
 
@@ -212,14 +208,16 @@ def _segment(remarks: Mapping[str, str], number: int, layers: int, path: Path) -
     layer = _number(remarks, f"Segment{number}_Layer", "0" if layers == 1 else None, path)
     if not (1 <= label <= MAX_LABEL and layer < layers):
         what = f"segment {number} has label {label} in layer {layer}"
-        raise InputError(what, where=path, allowed=f"labels from 1 to {MAX_LABEL}, layers from 0 to {layers - 1}")
+        allowed = f"labels from 1 to {MAX_LABEL}, layers from 0 to {layers - 1}"
+        raise InputError(what, where=path, allowed=allowed, code="out_of_range")
     return Segment(layer, label)
 
 
 def _number(remarks: Mapping[str, str], key: str, default: str | None, path: Path) -> int:
     text = remarks.get(key, default)
     if text is None or not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise InputError(f"{key} is {'missing' if text is None else repr(text[:20])}", where=path, allowed=ALLOWED)
+        what = f"{key} is {'missing' if text is None else repr(text[:20])}"
+        raise InputError(what, where=path, allowed=ALLOWED, code="bad_value")
     return int(text)
 
 

@@ -48,7 +48,8 @@ def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> Triangle
     if box is None:
         named = labelmap.names or {}
         shown = ", ".join(f"{n} {named[n]}" if n in named else str(n) for n in labelmap.labels_present())
-        raise InputError(f"no voxel has label {label}", where=where, allowed=f"the labels present: {shown}")
+        what = f"no voxel has label {label}"
+        raise InputError(what, where=where, allowed=f"the labels present: {shown}", code="label_absent")
     mask = labelmap.labels[box] == label
     T_ct_box = labelmap.T_ct_index.copy()
     T_ct_box[:3, 3] += labelmap.T_ct_index[:3, :3] @ [axis.start for axis in box]

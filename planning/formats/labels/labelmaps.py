@@ -77,7 +77,7 @@ def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
     names = segment_names(volume.fields, volume.path)
     labels, rounded_by = whole_labels(volume.values, volume.path)
     if not may_be_empty and not labels.any():
-        raise InputError("the label map is empty: every voxel is 0", where=volume.path, allowed=ALLOWED)
+        raise InputError("the label map is empty: every voxel is 0", where=volume.path, allowed=ALLOWED, code="empty")
     return LabelMap(labels, volume.T_ct_index, names, volume.path, rounded_by)
 
 
@@ -124,9 +124,10 @@ def segment_names(fields: dict[str, str], path: Path) -> dict[int, str] | None:
             continue
         value = fields.get(f"Segment{number[1]}_LabelValue", "")
         if not (value.isascii() and value.isdigit() and 0 < int(value) <= MAX_LABEL):
-            raise InputError(f"segment {name!r} has label value {value!r}", where=path, allowed=f"1 to {MAX_LABEL}")
+            what = f"segment {name!r} has label value {value!r}"
+            raise InputError(what, where=path, allowed=f"1 to {MAX_LABEL}", code="out_of_range")
         if int(value) in names:
             what = f"segments {names[int(value)]!r} and {name!r} share label {value}"
-            raise InputError(what, where=path, allowed="one label per segment")
+            raise InputError(what, where=path, allowed="one label per segment", code="duplicate_label")
         names[int(value)] = name
     return names or None

@@ -60,10 +60,11 @@ def parse_names(data: bytes, path: Path) -> dict[int, str]:
         if label is None:
             continue
         if label in names:
-            raise InputError(f"id {label} stands twice", where=entry.where, allowed="each id once")
+            what = f"id {label} stands twice"
+            raise InputError(what, where=entry.where, allowed="each id once", code="duplicate_label")
         names[label] = entry.name.strip()
     if not names:
-        raise InputError("the naming holds no label", where=path, allowed=allowed)
+        raise InputError("the naming holds no label", where=path, allowed=allowed, code="empty")
     return names
 
 
@@ -71,10 +72,12 @@ def _label(entry: _Entry, allowed: str) -> int | None:
     """The number of an entry; None for the background."""
     text = entry.number.strip()
     if not (text.isascii() and text.isdigit() and len(text) < 7 and int(text) <= MAX_LABEL):
-        raise InputError(f"label {text[:40]!r} of {entry.name[:60]!r}", where=entry.where, allowed=allowed)
+        what = f"label {text[:40]!r} of {entry.name[:60]!r}"
+        raise InputError(what, where=entry.where, allowed=allowed, code="bad_label")
     if int(text) == 0:
         if _plain(entry.name) not in BACKGROUND:
-            raise InputError(f"label 0 is {entry.name[:60]!r}", where=entry.where, allowed="0 for the background only")
+            what = f"label 0 is {entry.name[:60]!r}"
+            raise InputError(what, where=entry.where, allowed="0 for the background only", code="bad_label")
         return None
     return int(text)
 
@@ -91,7 +94,8 @@ def _csv_entries(data: bytes, path: Path) -> Iterator[_Entry]:
             continue
         where = f"{path}, line {line}"
         if len(row) != len(rows[0]):
-            raise InputError(f"{len(row)} fields, not {len(rows[0])}: {row}", where=where, allowed=ALLOWED_CSV)
+            what = f"{len(row)} fields, not {len(rows[0])}: {row}"
+            raise InputError(what, where=where, allowed=ALLOWED_CSV, code="ragged_row")
         yield _Entry(row[number], row[name], where)
 
 
@@ -102,7 +106,7 @@ def _rows(data: bytes, path: Path) -> list[list[str]]:
         separator = max((",", ";", "\t"), key=first.count)
         return list(csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator))
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"is no CSV text ({error})", where=path, allowed=ALLOWED_CSV) from error
+        raise InputError(f"is no CSV text ({error})", where=path, allowed=ALLOWED_CSV, code="not_csv") from error
 
 
 def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
@@ -112,7 +116,8 @@ def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
     number = next((plain.index(one) for one in NUMBER_COLUMNS if one in plain and plain.index(one) != name), None)
     if name is None or number is None:
         shown = ",".join(header)[:100] or "missing"
-        raise InputError(f"header {shown!r} names no column of labels and names", where=path, allowed=ALLOWED_CSV)
+        what = f"header {shown!r} names no column of labels and names"
+        raise InputError(what, where=path, allowed=ALLOWED_CSV, code="wrong_columns")
     return number, name
 
 
@@ -120,16 +125,15 @@ def _json_entries(data: bytes, path: Path) -> Iterator[_Entry]:
     tree = parse_json(data, where=path, allowed=ALLOWED_JSON)
     table = tree.get("labels", tree) if isinstance(tree, dict) else None
     if not isinstance(table, dict):
-        raise InputError("no object of labels", where=path, allowed=ALLOWED_JSON)
+        raise InputError("no object of labels", where=path, allowed=ALLOWED_JSON, code="wrong_format")
     for key, value in table.items():
         number, name = (key, value) if isinstance(value, str) else (value, key)
         if isinstance(value, list):
             what = f"{str(key)[:60]!r} is a list of labels (a region): name its labels one by one"
             raise InputError(what, where=path, allowed=ALLOWED_JSON, code="labels_of_regions")
         if isinstance(number, bool) or not isinstance(number, str | int) or not isinstance(name, str):
-            raise InputError(
-                f"entry {str(key)[:60]!r} is no pair of a number and a name", where=path, allowed=ALLOWED_JSON
-            )
+            what = f"entry {str(key)[:60]!r} is no pair of a number and a name"
+            raise InputError(what, where=path, allowed=ALLOWED_JSON, code="wrong_format")
         yield _Entry(str(number), name, str(path))
 
 
@@ -137,7 +141,7 @@ def _list_entries(data: bytes, path: Path) -> Iterator[_Entry]:
     try:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise InputError(f"is no text ({error})", where=path, allowed=ALLOWED_LIST) from error
+        raise InputError(f"is no text ({error})", where=path, allowed=ALLOWED_LIST, code="not_text") from error
     for line, text in enumerate(lines, start=1):
         if text.strip() and not text.lstrip().startswith("#"):
             yield _list_entry(text, f"{path}, line {line}")
@@ -147,12 +151,12 @@ def _list_entry(text: str, where: str) -> _Entry:
     try:
         fields = shlex.split(text)
     except ValueError as error:
-        raise InputError(f"{text[:60]!r} ({error})", where=where, allowed=ALLOWED_LIST) from error
+        raise InputError(f"{text[:60]!r} ({error})", where=where, allowed=ALLOWED_LIST, code="unknown_line") from error
     if len(fields) == 8 and all(_is_number(one) for one in fields[:7]):
         return _Entry(fields[0], fields[7], where)
     if len(fields) == 6 and all(_is_number(one) for one in fields[2:]):
         return _Entry(fields[0], fields[1], where)
-    raise InputError(f"{text[:60]!r}", where=where, allowed=ALLOWED_LIST)
+    raise InputError(f"{text[:60]!r}", where=where, allowed=ALLOWED_LIST, code="unknown_line")
 
 
 def _is_number(text: str) -> bool:

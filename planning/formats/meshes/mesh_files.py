@@ -137,7 +137,8 @@ def _actual_space(stated: Space, space: Space, *, default: bool, where: str) -> 
     if default and space is not Space.LOCAL:
         return stated
     allowed = 'space = "local" where that is meant' if space is Space.LOCAL else f'space = "{stated}"'
-    raise InputError(f"the file states SPACE={stated}, the case {space}", where=where, allowed=allowed)
+    what = f"the file states SPACE={stated}, the case {space}"
+    raise InputError(what, where=where, allowed=allowed, code="other_space")
 
 
 class MeshExtent(NamedTuple):
@@ -162,7 +163,8 @@ def mesh_extent(path: Path) -> MeshExtent:
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     raw = reader(data, str(path))
     if not np.isfinite(raw.vertices).all() or len(raw.vertices) == 0:
-        raise InputError("a vertex is not finite, or there is none", where=path, allowed="finite vertices")
+        what = "a vertex is not finite, or there is none"
+        raise InputError(what, where=path, allowed="finite vertices", code="not_finite")
     box = np.stack([raw.vertices.min(axis=0), raw.vertices.max(axis=0)]).astype(np.float64)
     return MeshExtent(box, raw.space or _stated_space(data))
 
@@ -171,7 +173,7 @@ def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         allowed = "a file ending in " + ", ".join(MESH_SUFFIXES)
-        raise InputError(f"unknown mesh format {path.suffix!r}", where=path, allowed=allowed)
+        raise InputError(f"unknown mesh format {path.suffix!r}", where=path, allowed=allowed, code="unknown_format")
     return _READERS[suffix]
 
 

@@ -72,19 +72,21 @@ def split_header(content: bytes, path: Path) -> NrrdText:
     """
     head = content[:MAX_HEADER_BYTES]
     if re.match(rb"NRRD000[1-5]\r?\n", head) is None:
-        raise InputError("no NRRD header (magic NRRD0001 to NRRD0005)", where=path, allowed="a .nrrd or .nhdr file")
+        what = "no NRRD header (magic NRRD0001 to NRRD0005)"
+        raise InputError(what, where=path, allowed="a .nrrd or .nhdr file", code="wrong_format")
     end = re.search(rb"\n\r?\n", head)
     if end is None and len(head) == MAX_HEADER_BYTES:
-        raise InputError("the header has no end", where=path, allowed=f"at most {MAX_HEADER_BYTES} bytes")
+        what = "the header has no end"
+        raise InputError(what, where=path, allowed=f"at most {MAX_HEADER_BYTES} bytes", code="bad_header")
     try:
         lines = head[: end.start() if end else None].decode("utf-8").split("\n")[1:]
     except UnicodeDecodeError as error:
-        raise InputError(f"the header is not text ({error})", where=path, allowed="UTF-8") from error
+        raise InputError(f"the header is not text ({error})", where=path, allowed="UTF-8", code="not_text") from error
     fields, remarks = _lines(lines, path)
     if "datafile" in fields:
         return NrrdText(fields, remarks, _beside(fields["datafile"], path), 0)
     if end is None:
-        raise InputError("the file ends inside the header", where=path, allowed="a complete file")
+        raise InputError("the file ends inside the header", where=path, allowed="a complete file", code="file_cut")
     return NrrdText(fields, remarks, path, end.end())
 
 
@@ -101,9 +103,11 @@ def _lines(lines: list[str], path: Path) -> tuple[dict[str, str], dict[str, str]
             continue
         key = field.lower().replace(" ", "")
         if not mark or key not in KNOWN_FIELDS:
-            raise InputError(f"unknown header line {line[:60]!r}", where=where, allowed=", ".join(sorted(KNOWN_FIELDS)))
+            what = f"unknown header line {line[:60]!r}"
+            raise InputError(what, where=where, allowed=", ".join(sorted(KNOWN_FIELDS)), code="unknown_line")
         if key in fields:
-            raise InputError(f"the field {field!r} stands twice", where=where, allowed="each field once")
+            what = f"the field {field!r} stands twice"
+            raise InputError(what, where=where, allowed="each field once", code="duplicate_key")
         fields[key] = value.strip()
     return fields, remarks
 
@@ -115,7 +119,8 @@ def stated_field(fields: dict[str, str], key: str, path: Path) -> str:
         InputError: It has not.
     """
     if not fields.get(key):
-        raise InputError(f"the header has no field {key!r}", where=path, allowed="a complete NRRD header")
+        what = f"the header has no field {key!r}"
+        raise InputError(what, where=path, allowed="a complete NRRD header", code="missing_key")
     return fields[key]
 
 
@@ -126,7 +131,7 @@ def whole_number(text: str, path: Path) -> int:
         InputError: Anything but digits.
     """
     if not (text.isascii() and text.isdigit() and len(text) < 19):
-        raise InputError(f"size {text[:30]!r}", where=path, allowed="positive whole numbers")
+        raise InputError(f"size {text[:30]!r}", where=path, allowed="positive whole numbers", code="not_whole")
     return int(text)
 
 
@@ -134,14 +139,15 @@ def _beside(name: str, path: Path) -> Path:
     """The data file of a detached header: a plain name in the same folder, or nothing."""
     allowed = "the name of one file in the same folder"
     if not name or re.search(r"[/\\%\s\0]", name) or name in (".", "..") or name.upper().startswith("LIST"):
-        raise InputError(f"data file {name[:80]!r}", where=path, allowed=allowed)
+        raise InputError(f"data file {name[:80]!r}", where=path, allowed=allowed, code="outside_folder")
     data_path = path.parent / name
     if not is_plain_file(data_path):
-        raise InputError(f"data file {name!r} {absence(data_path)}", where=path, allowed=allowed)
+        raise InputError(f"data file {name!r} {absence(data_path)}", where=path, allowed=allowed, code="no_such_file")
     if data_path.resolve().parent != path.parent.resolve():
-        raise InputError(f"data file {name!r} is a link to another folder", where=path, allowed=allowed)
+        what = f"data file {name!r} is a link to another folder"
+        raise InputError(what, where=path, allowed=allowed, code="outside_folder")
     if data_path.resolve() == path.resolve():
-        raise InputError("the data file is the header itself", where=path, allowed=allowed)
+        raise InputError("the data file is the header itself", where=path, allowed=allowed, code="data_elsewhere")
     return data_path
 
 
@@ -237,8 +243,8 @@ def _wrong_dimension(fields: dict[str, str], path: Path) -> InputError:
     stated = fields.get("dimension")
     if stated == "4":
         what = 'dimension 4: segments that overlap lie in layers; name such a file in [[structures]] seg = "FILE"'
-        return InputError(what, where=path, allowed="dimension: 3, or a .seg.nrrd as seg")
-    return InputError(f"dimension {stated}", where=path, allowed="dimension: 3")
+        return InputError(what, where=path, allowed="dimension: 3, or a .seg.nrrd as seg", code="wrong_dimension")
+    return InputError(f"dimension {stated}", where=path, allowed="dimension: 3", code="wrong_dimension")
 
 
 def _header(raw: NrrdText, path: Path, layers: int = 1) -> VolumeHeader:
@@ -260,10 +266,11 @@ def _layers(raw: NrrdText, path: Path) -> int:
     directions = raw.fields.get("spacedirections", "")
     if not (kinds and kinds[0] in LAYER_KINDS and sizes and directions.startswith("none")):
         what = "dimension 4 whose first axis is none of layers"
-        raise InputError(what, where=path, allowed="kinds: list domain domain domain, space directions: none (...)")
+        allowed = "kinds: list domain domain domain, space directions: none (...)"
+        raise InputError(what, where=path, allowed=allowed, code="wrong_dimension")
     layers = whole_number(sizes[0], path)
     if not 1 <= layers <= MAX_LAYERS:
-        raise InputError(f"{layers} layers", where=path, allowed=f"1 to {MAX_LAYERS}")
+        raise InputError(f"{layers} layers", where=path, allowed=f"1 to {MAX_LAYERS}", code="out_of_range")
     return layers
 
 
@@ -299,14 +306,14 @@ def _check_units(fields: dict[str, str], path: Path) -> None:
     for key in ("spaceunits", "units"):
         named = set(re.findall(r'"([^"]*)"', fields.get(key, ""))) - {""}
         if (fields.get(key) and not named and key == "spaceunits") or named - {"mm"}:
-            raise InputError(f"{key} {fields[key]!r}", where=path, allowed='"mm" "mm" "mm"')
+            raise InputError(f"{key} {fields[key]!r}", where=path, allowed='"mm" "mm" "mm"', code="unknown_unit")
 
 
 def _affine(fields: dict[str, str], path: Path) -> NDArray[np.float64]:
     space = _space(fields, path)
     if space not in LPS_SIGNS:
         allowed = "left-posterior-superior, right-anterior-superior, left-anterior-superior"
-        raise InputError(f"space {space!r} is not patient space", where=path, allowed=allowed)
+        raise InputError(f"space {space!r} is not patient space", where=path, allowed=allowed, code="unknown_space")
     directions = _vectors(stated_field(fields, "spacedirections", path), 3, path)
     origin = _vectors(stated_field(fields, "spaceorigin", path), 1, path)
     T = np.eye(4)
@@ -321,9 +328,10 @@ def _space(fields: dict[str, str], path: Path) -> str:
     if "spacedimension" not in fields:
         return stated_field(fields, "space", path).lower()
     if "space" in fields:
-        raise InputError("both space and space dimension", where=path, allowed="one of the two")
+        raise InputError("both space and space dimension", where=path, allowed="one of the two", code="stated_twice")
     if fields["spacedimension"] != "3":
-        raise InputError(f"space dimension {fields['spacedimension'][:20]!r}", where=path, allowed="3")
+        what = f"space dimension {fields['spacedimension'][:20]!r}"
+        raise InputError(what, where=path, allowed="3", code="wrong_dimension")
     return "lps"
 
 
@@ -331,13 +339,13 @@ def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
     allowed = f"{count} of (x,y,z) in mm"
     rows = VECTOR.findall(text)
     if len(rows) != count or VECTOR.sub("", text).strip():
-        raise InputError(f"{text[:80]!r}", where=path, allowed=allowed)
+        raise InputError(f"{text[:80]!r}", where=path, allowed=allowed, code="not_a_number")
     try:
         vectors = np.array([[float(cell) for cell in row.split(",")] for row in rows])
     except ValueError as error:
-        raise InputError(f"{text[:80]!r} ({error})", where=path, allowed=allowed) from error
+        raise InputError(f"{text[:80]!r} ({error})", where=path, allowed=allowed, code="not_a_number") from error
     if vectors.shape != (count, 3):
-        raise InputError(f"{text[:80]!r}", where=path, allowed=allowed)
+        raise InputError(f"{text[:80]!r}", where=path, allowed=allowed, code="not_a_number")
     return vectors
 
 
@@ -345,31 +353,34 @@ def _check_axes(fields: dict[str, str], path: Path) -> None:
     """Refuse axes that hold several values per voxel, or that are placed in two ways."""
     kinds = fields.get("kinds", "domain domain domain").lower().split()
     if len(kinds) != 3 or not AXIS_KINDS.issuperset(kinds):
-        raise InputError(f"kinds {fields['kinds'][:80]!r}", where=path, allowed="domain domain domain")
+        what = f"kinds {fields['kinds'][:80]!r}"
+        raise InputError(what, where=path, allowed="domain domain domain", code="unsupported_feature")
     for key in ("axismins", "axismaxs"):
         if set(fields.get(key, "nan").lower().split()) != {"nan"}:
-            raise InputError(f"{key} beside a space", where=path, allowed="space origin and space directions alone")
+            what = f"{key} beside a space"
+            raise InputError(what, where=path, allowed="space origin and space directions alone", code="stated_twice")
 
 
 def _cells(raw: NrrdText, path: Path) -> VoxelLayout:
     for key in ("byteskip", "lineskip"):
         if raw.fields.get(key, "0") != "0":
-            raise InputError(f"{key} {raw.fields[key]!r}", where=path, allowed="0")
+            raise InputError(f"{key} {raw.fields[key]!r}", where=path, allowed="0", code="unsupported_feature")
     stated = stated_field(raw.fields, "encoding", path).lower()
     encoding = "gzip" if stated in GZIP else "ascii" if stated in ASCII else stated
     if encoding not in {"raw", "gzip", "ascii"}:
-        raise InputError(f"encoding {stated!r}", where=path, allowed="raw, gzip, ascii")
+        raise InputError(f"encoding {stated!r}", where=path, allowed="raw, gzip, ascii", code="unsupported_feature")
     return VoxelLayout(_dtype(raw.fields, encoding, path), encoding, start=raw.data_offset)
 
 
 def _dtype(fields: dict[str, str], encoding: str, path: Path) -> np.dtype[Any]:
     name = TYPES.get(stated_field(fields, "type", path).lower())
     if name is None:
-        raise InputError(f"type {fields['type']!r}", where=path, allowed="an integer type, float or double")
+        what = f"type {fields['type']!r}"
+        raise InputError(what, where=path, allowed="an integer type, float or double", code="unknown_type")
     dtype = np.dtype(name)
     if encoding == "ascii" or dtype.itemsize == 1:
         return dtype
     order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower())
     if order is None:
-        raise InputError("the byte order is not said", where=path, allowed="endian: little or big")
+        raise InputError("the byte order is not said", where=path, allowed="endian: little or big", code="missing_key")
     return np.dtype(order + name)

@@ -97,7 +97,7 @@ def read_volume(path: Path) -> Volume:
         InputError: Anything wrong with the file; nothing else comes out, whatever its bytes.
     """
     if not is_plain_file(path):
-        raise InputError(f"the file {absence(path)}", where=path, allowed="a volume file")
+        raise InputError(f"the file {absence(path)}", where=path, allowed="a volume file", code="no_such_file")
     _parser(path)  # an unknown ending is refused before anything is read
     content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     beside = data_file(content, path)
@@ -123,9 +123,10 @@ def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volum
     try:
         values = _scaled(decoded(memoryview(stored), header), header.cells)
     except MemoryError as error:
-        raise InputError("it does not fit this machine's memory", where=path, allowed="a smaller one") from error
+        what = "it does not fit this machine's memory"
+        raise InputError(what, where=path, allowed="a smaller one", code="out_of_memory") from error
     if values.dtype.kind == "f" and not np.isfinite(values).all():
-        raise InputError("a voxel is NaN or infinite", where=path, allowed="finite values")
+        raise InputError("a voxel is NaN or infinite", where=path, allowed="finite values", code="not_finite")
     return Volume(values, header.T_ct_index, path, header.fields)
 
 
@@ -135,7 +136,8 @@ def _parser(path: Path) -> Callable[[bytes, Path], VolumeHeader]:
         return parse_nifti_header
     if name.endswith(NRRD_ENDINGS):
         return parse_nrrd_header
-    raise InputError("unknown file ending", where=path, allowed=", ".join(NIFTI_ENDINGS + NRRD_ENDINGS))
+    what = "unknown file ending"
+    raise InputError(what, where=path, allowed=", ".join(NIFTI_ENDINGS + NRRD_ENDINGS), code="unknown_format")
 
 
 def _scaled(stored: NDArray[Any], cells: VoxelLayout) -> NDArray[Any]:

@@ -95,10 +95,12 @@ def check_shape(shape: tuple[int, ...], *, where: Path) -> tuple[int, int, int]:
         InputError: An axis with fewer than two voxels, or more than ``MAX_VOXELS`` in all.
     """
     if len(shape) != 3 or min(shape) < 2:
-        raise InputError(f"a volume of size {shape}", where=where, allowed="3 axes with at least 2 voxels each")
+        what = f"a volume of size {shape}"
+        raise InputError(what, where=where, allowed="3 axes with at least 2 voxels each", code="wrong_dimension")
     count = shape[0] * shape[1] * shape[2]
     if count > MAX_VOXELS:
-        raise InputError(f"the header claims {count} voxels", where=where, allowed=f"at most {MAX_VOXELS}")
+        what = f"the header claims {count} voxels"
+        raise InputError(what, where=where, allowed=f"at most {MAX_VOXELS}", code="too_many")
     return shape[0], shape[1], shape[2]
 
 
@@ -114,22 +116,23 @@ def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.
     """
     T = np.array(T_ct_index, dtype=np.float64)
     if not np.isfinite(T).all():
-        raise InputError("the affine holds NaN or infinity", where=where, allowed="finite numbers")
+        raise InputError("the affine holds NaN or infinity", where=where, allowed="finite numbers", code="not_finite")
     with np.errstate(over="ignore"):  # float32 headers reach 1e38; the spacing check below refuses them
         spacing = np.linalg.norm(T[:3, :3], axis=0)
     if not np.all((spacing >= MIN_SPACING_MM) & (spacing <= MAX_SPACING_MM)):
         shown = " x ".join(f"{s:.3g}" for s in spacing)
         kind = "a zero or singular affine, " if spacing.min() == 0 else ""
         allowed = f"{MIN_SPACING_MM} to {MAX_SPACING_MM} mm (is the unit right?)"
-        raise InputError(f"{kind}voxel spacing {shown} mm", where=where, allowed=allowed)
+        raise InputError(f"{kind}voxel spacing {shown} mm", where=where, allowed=allowed, code="implausible_spacing")
     axes = T[:3, :3] / spacing
     shear = float(np.abs(axes.T @ axes - np.eye(3)).max())
     if shear > SHEAR_TOLERANCE:
         kind = "singular" if abs(np.linalg.det(axes)) < SHEAR_TOLERANCE else "sheared"
         what = f"the affine is {kind}: two voxel axes are {shear:.2g} (cosine) from being perpendicular"
-        raise InputError(what, where=where, allowed=f"axes perpendicular within {SHEAR_TOLERANCE}")
+        raise InputError(what, where=where, allowed=f"axes perpendicular within {SHEAR_TOLERANCE}", code="sheared")
     if np.abs(T[:3, 3]).max() > MAX_ORIGIN_MM:
-        raise InputError(f"origin at {T[:3, 3]} mm", where=where, allowed=f"within {MAX_ORIGIN_MM:.0f} mm")
+        what = f"origin at {T[:3, 3]} mm"
+        raise InputError(what, where=where, allowed=f"within {MAX_ORIGIN_MM:.0f} mm", code="too_far")
     T.setflags(write=False)
     return T
 
@@ -173,4 +176,4 @@ def check_exact_size(actual: int, promised: int, *, where: Path) -> None:
     if actual != promised:
         kind = "cut short" if actual < promised else "longer than its header says"
         what = f"the file is {kind}: {actual} bytes where the header promises {promised}"
-        raise InputError(what, where=where, allowed="a complete file")
+        raise InputError(what, where=where, allowed="a complete file", code="size_mismatch")

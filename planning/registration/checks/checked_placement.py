@@ -247,7 +247,7 @@ def _apart(case: Case, registration: Registration, T_base_ct: Floats) -> Apart:
 
 
 def _refuse(case: Case, what: str) -> None:
-    raise InputError(what, where=f"{case.path}: registration.transform", allowed=ALLOWED)
+    raise InputError(what, where=f"{case.path}: registration.transform", allowed=ALLOWED, code="transform_implausible")
 
 
 class CheckedPlacement(NamedTuple):

@@ -104,7 +104,7 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
                 _check_tip(volume, found, target_ct, hidden)
                 return found
     allowed = f"a straight piece of metal of {SHORTEST_MM:g} mm or more"
-    raise InputError("no needle in the image", where=volume.path, allowed=allowed)
+    raise InputError("no needle in the image", where=volume.path, allowed=allowed, code="needle_not_seen")
 
 
 def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bools) -> None:
@@ -121,7 +121,8 @@ def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bo
     away = target_ct - found.tip_ct
     lateral = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
     what = f"the needle ends at other metal, which hides its tip; its axis passes the target by {lateral:.1f} mm"
-    raise InputError(what, where=volume.path, allowed=f"a tip {SEEN_MM:g} mm clear of wider metal and its blur")
+    allowed = f"a tip {SEEN_MM:g} mm clear of wider metal and its blur"
+    raise InputError(what, where=volume.path, allowed=allowed, code="tip_hidden")
 
 
 def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats, hidden: Bools) -> tuple[Metal, _Line]:

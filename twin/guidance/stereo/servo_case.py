@@ -245,7 +245,8 @@ def load_servo_case(path: Path | str) -> ServoCase:
     markers = parse_points(named["markers"], path.parent / file.head.markers, default_space=Space.LOCAL)
     targets = parse_points(named["targets"], path.parent / file.head.targets, default_space=Space.LOCAL)
     if len(markers.names) < MIN_MARKERS:
-        raise InputError(f"head.markers: {len(markers.names)} markers", where=path, allowed="3 or more")
+        what = f"head.markers: {len(markers.names)} markers"
+        raise InputError(what, where=path, allowed="3 or more", code="too_few_markers")
     return ServoCase(path, file, model, skin, markers, targets, files.inputs)
 
 

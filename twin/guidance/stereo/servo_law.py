@@ -355,7 +355,7 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
         if found is None:
             return Posture(q, branch)
         why = f"{found.contact.body} would touch {found.contact.other} at point {found.at + 1} of {len(points_base)}"
-    raise NoAnswerError(why)
+    raise NoAnswerError(why, code="motion_touches")
 
 
 def path_upward(rod: CarriedRod, points_base: Floats, up_mm: float) -> Floats:

@@ -143,7 +143,7 @@ def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generat
     pairs = [answer for answer in answers if not isinstance(answer, str)]
     q = np.array(pairs, dtype=np.float64).reshape(-1, 2, 6)
     if len(taken) == 0:
-        raise NoAnswerError(f"no pose of {n} can be taken: {counts}", counts=counts)
+        raise NoAnswerError(f"no pose of {n} can be taken: {counts}", counts=counts, code="no_pose")
     poses = Recording(
         goals[0][taken],
         goals[1][taken],
@@ -271,7 +271,8 @@ def choose_poses(
         InputError: More poses wanted than there are candidates, or none.
     """
     if not 0 < n <= len(candidates):
-        raise InputError(f"{n} poses of {len(candidates)} candidates", where="pose choice", allowed="1 to all of them")
+        what = f"{n} poses of {len(candidates)} candidates"
+        raise InputError(what, where="pose choice", allowed="1 to all of them", code="out_of_range")
     prior = prior.estimate if isinstance(prior, Calibration) else prior
     design = _design(candidates, _Belief(noise, prior, None), recorded)
     chosen: list[int] = []

@@ -58,19 +58,18 @@ def parse_recording(content: bytes, file: Path) -> Recording:
     try:
         rows = [row for row in csv.reader(io.StringIO(text), strict=True) if row and not row[0].startswith("#")]
     except csv.Error as error:
-        raise InputError(f"is no CSV ({error})", where=file, allowed="one line per pose, fields of numbers") from error
+        what = f"is no CSV ({error})"
+        raise InputError(what, where=file, allowed="one line per pose, fields of numbers", code="not_csv") from error
     header = tuple(cell.strip() for cell in rows[0]) if rows else ()
     if header not in KINDS:
-        raise InputError(
-            f"columns {', '.join(header)[:200]}",
-            where=f"{file}, header",
-            allowed=", ".join(columns(False, (3, 1), 24)),
-        )
+        what = f"columns {', '.join(header)[:200]}"
+        allowed = ", ".join(columns(False, (3, 1), 24))
+        raise InputError(what, where=f"{file}, header", allowed=allowed, code="wrong_columns")
     pixels, (width, shaft), behind = KINDS[header]
     places = (f"{file}, row {i}" for i in range(2, len(rows) + 1))
     values = np.array([row_numbers(row, header, header[1:], at) for row, at in zip(rows[1:], places, strict=True)])
     if values.size == 0:
-        raise InputError("no pose", where=file, allowed="one row per pose")
+        raise InputError("no pose", where=file, allowed="one row per pose", code="empty")
     names = tuple(row[0].strip() for row in rows[1:])
     try:
         first = 26 + width + shaft

@@ -72,7 +72,8 @@ def checked_calibration(recording: Recording, case: SelfcalCase | None, where: P
         _refuse_slip(recording, found.rms_mm, where)
     if found.rms_mm > SOUND_MM:
         what = f"residuals of {found.rms_mm:.3g} mm (rms): the poses and the image do not belong together"
-        raise InputError(what, where=where, allowed=f"residuals up to {SOUND_MM:g} mm; {ALLOWED}")
+        allowed = f"residuals up to {SOUND_MM:g} mm; {ALLOWED}"
+        raise InputError(what, where=where, allowed=allowed, code="residuals_too_large")
     return found
 
 
@@ -81,7 +82,7 @@ def _check_reach(recording: Recording, where: Path) -> None:
         farthest = float(np.linalg.norm(T[:, :3, 3], axis=1).max())
         if farthest < LEAST_REACH_MM:
             what = f"the flange of {name} is never farther than {farthest:.3g} mm from its base: metres?"
-            raise InputError(what, where=where, allowed=ALLOWED)
+            raise InputError(what, where=where, allowed=ALLOWED, code="wrong_unit")
 
 
 def _refuse_slip(recording: Recording, rms_mm: float, where: Path) -> None:
@@ -90,7 +91,7 @@ def _refuse_slip(recording: Recording, rms_mm: float, where: Path) -> None:
         if other < SUSPECT_MM and other < BETTER * rms_mm:
             as_given = f"residuals {rms_mm:.3g} mm" if np.isfinite(rms_mm) else "no fit"
             what = f"it fits ({other:.2g} mm rms) if {slip}, and not as it is given ({as_given})"
-            raise InputError(what, where=where, allowed=ALLOWED)
+            raise InputError(what, where=where, allowed=ALLOWED, code="recording_slip")
 
 
 def _residual_mm(undo: Reading, recording: Recording) -> float:

@@ -55,7 +55,8 @@ def parse_two(
         InputError: None or more than two, or one angle alone.
     """
     if len(theta_deg) != len(beta_deg):
-        raise InputError("one angle alone gives no direction", where="--theta, --beta", allowed="both, as often")
+        what = "one angle alone gives no direction"
+        raise InputError(what, where="--theta, --beta", allowed="both, as often", code="one_angle")
     choices = [parse_choice(*pair, None, None, None) for pair in zip(theta_deg, beta_deg, strict=True)]
     choices += [parse_choice(None, None, one, None, None) for one in rank]
     choices += [parse_choice(None, None, None, one, None) for one in window]
@@ -63,10 +64,11 @@ def parse_two(
     if len(choices) == 1:
         choices = [BEST_OF_ALL, *choices]
     if len(choices) == 2 and choices[0] == choices[1]:
-        raise InputError("the same direction twice", where="compare", allowed="two, or one that is not the best")
+        what = "the same direction twice"
+        raise InputError(what, where="compare", allowed="two, or one that is not the best", code="same_direction")
     if len(choices) != 2:
         allowed = "two, such as --rank 1 --window 2, or one, which is compared with the best"
-        raise InputError(f"{len(choices)} choices", where="compare", allowed=allowed)
+        raise InputError(f"{len(choices)} choices", where="compare", allowed=allowed, code="wrong_count")
     return choices[0], choices[1]
 
 
@@ -79,10 +81,10 @@ def two_plans(source: Path, other: Path | None, case: Path | None, chosen: bool)
     allowed = "PLAN_A PLAN_B [--case CASE], or CASE with one choice or two"
     if not is_plan(source):
         if other is not None or case is not None:
-            raise InputError("a case and another file", where="compare", allowed=allowed)
+            raise InputError("a case and another file", where="compare", allowed=allowed, code="conflicting_options")
         return None
     if other is None or not is_plan(other) or chosen:
-        raise InputError("a plan is compared with a plan", where=source, allowed=allowed)
+        raise InputError("a plan is compared with a plan", where=source, allowed=allowed, code="conflicting_options")
     return source, other
 
 

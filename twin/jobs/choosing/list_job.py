@@ -38,13 +38,16 @@ def lists_of(
         InputError: Two lists, a list of directions beside a choice, a picture of a list, or a folder without a list.
     """
     if entries is not None and targets is not None:
-        raise InputError("two lists", where="--entries, --targets", allowed="one of them")
+        raise InputError("two lists", where="--entries, --targets", allowed="one of them", code="conflicting_options")
     if entries is not None and choice != BEST:
-        raise InputError("a list of entries beside a choice", where="--entries", allowed="the list alone")
+        what = "a list of entries beside a choice"
+        raise InputError(what, where="--entries", allowed="the list alone", code="conflicting_options")
     if (entries or targets) is not None and picture is not None:
-        raise InputError("a picture is of one candidate", where="--picture", allowed="check without a list")
+        what = "a picture is of one candidate"
+        raise InputError(what, where="--picture", allowed="check without a list", code="conflicting_options")
     if (entries or targets) is None and out_dir is not None:
-        raise InputError("one candidate is printed, not written", where="--out", allowed="--entries or --targets")
+        what = "one candidate is printed, not written"
+        raise InputError(what, where="--out", allowed="--entries or --targets", code="conflicting_options")
     return (entries or targets) is not None
 
 

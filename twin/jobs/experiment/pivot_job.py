@@ -80,7 +80,8 @@ def refuse_of_twin(*options: object) -> None:
         InputError: One of them is stated.
     """
     if any(option is not None for option in options):
-        raise InputError("touches that were read", where="pivot", allowed="JOINTS.csv alone, or the twin's options")
+        allowed = "JOINTS.csv alone, or the twin's options"
+        raise InputError("touches that were read", where="pivot", allowed=allowed, code="conflicting_options")
 
 
 def pivot_case(case: Case, joints: Path) -> PivotRun:
@@ -109,7 +110,7 @@ def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> 
         InputError: As `pivot_case`.
     """
     if case.errors is None:
-        raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm")
+        raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm", code="no_noise")
     model, tip_mm = case.robot.model, case.needle.length_mm
     poses = flange_pose(model, q)
     check_one_place(names, poses[:, :3, 3] + tip_mm * poses[:, :3, 2], poses[:, :3, :3], where=where)
@@ -207,7 +208,8 @@ def parse_place(text: str | None) -> Floats | None:
         return None
     numbers = [parse_coordinate(part.strip(), "--at") for part in text.split(",")]
     if len(numbers) != 3:
-        raise InputError(f"{len(numbers)} numbers", where="--at", allowed="X,Y,Z in mm, in the robot's base frame")
+        what = f"{len(numbers)} numbers"
+        raise InputError(what, where="--at", allowed="X,Y,Z in mm, in the robot's base frame", code="wrong_count")
     return np.array(numbers)
 
 
@@ -227,9 +229,10 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
     """
     case = context.case
     if not LEAST_POSES <= poses <= MOST_POSES:
-        raise InputError(f"{poses} poses", where="--poses", allowed=f"{LEAST_POSES} to {MOST_POSES}")
+        what = f"{poses} poses"
+        raise InputError(what, where="--poses", allowed=f"{LEAST_POSES} to {MOST_POSES}", code="out_of_range")
     if case.errors is None:
-        raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm")
+        raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm", code="no_noise")
     with writing(out, "pivot", inputs=case.inputs, names=(PIVOT, SUMMARY), note=context.watcher.note) as draft:
         with context.stages.time("pivot plan"):
             count = partial(context.watcher.count, "motions")
@@ -261,7 +264,7 @@ def _executed(context: CaseContext, tour: TouchTour, truth: TouchTruth) -> Touch
     if len(touched.readings) < LEAST_POSES:
         why = "; ".join(f"{name}: {reason}" for name, reason in touched.failed.items())
         poses = f"{len(touched.readings)} of {len(tour.touches)} poses were touched"
-        raise NoAnswerError(f"{poses}, {LEAST_POSES} are needed: {why}")
+        raise NoAnswerError(f"{poses}, {LEAST_POSES} are needed: {why}", code="too_few_poses")
     return touched
 
 

@@ -80,7 +80,8 @@ def parse_marker(text: str) -> MarkerKind:
     for kind in get_args(MarkerKind):
         if text == kind:
             return kind
-    raise InputError(f"marker '{text[:40]}' is not known", where="--marker", allowed=", ".join(get_args(MarkerKind)))
+    what = f"marker '{text[:40]}' is not known"
+    raise InputError(what, where="--marker", allowed=", ".join(get_args(MarkerKind)), code="unknown_choice")
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +218,8 @@ def _refuse_two_beds(context: CaseContext, request: ScanRequest) -> None:
     own = [one.name for one in context.case.obstacles if one.frame == "ct"]
     if own and request.beside is not None and request.beside.bed != "none":
         what = f"the case has what stands in the scanner: {', '.join(own)}"
-        raise InputError(what, where="--bed", allowed="none, or a case without obstacles in the frame ct")
+        allowed = "none, or a case without obstacles in the frame ct"
+        raise InputError(what, where="--bed", allowed=allowed, code="two_beds")
 
 
 def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volume) -> tuple[Floats, Floats]:
@@ -228,7 +230,8 @@ def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volu
         return scene.target, find_needle(volume, scene.target).tip_ct
     mask = image.labels[solid.layer] == solid.label
     if not mask.any():
-        raise InputError(f"'{name}' is not in the image", where="scan", allowed="a field of view that shows the target")
+        what = f"'{name}' is not in the image"
+        raise InputError(what, where="scan", allowed="a field of view that shows the target", code="outside_image")
     return middle_of(solid.mesh.triangles), read_lesion(volume, mask)
 
 
@@ -394,7 +397,8 @@ def parse_beside(arms: str, bed: str, lines: int) -> OutsideObjects | None:
     """
     for option, word, known in (("--arms", arms, get_args(Arms)), ("--bed", bed, get_args(Bed))):
         if word not in known:
-            raise InputError(f"'{word[:40]}' is not known", where=option, allowed=", ".join(known))
+            what = f"'{word[:40]}' is not known"
+            raise InputError(what, where=option, allowed=", ".join(known), code="unknown_choice")
     wanted = OutsideObjects(
         next(k for k in get_args(Arms) if k == arms), next(k for k in get_args(Bed) if k == bed), lines
     )

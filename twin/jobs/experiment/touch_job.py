@@ -217,7 +217,8 @@ def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
         chosen = choose(context, found, choice)
     rows = [row for row in chosen.rows if np.isfinite(chosen.candidates.arm.q_insertion[row]).all()]
     if not rows:
-        raise NoAnswerError("the arm reaches no such candidate: nothing to touch the markers for")
+        what = "the arm reaches no such candidate: nothing to touch the markers for"
+        raise NoAnswerError(what, code="no_safe_direction")
     return chosen.candidates.arm.q_insertion[rows[0]], chosen.candidates.outward_ct[rows[0]]
 
 

@@ -192,11 +192,14 @@ def reproduced(
         InputError: A paper that is not known, or has no such experiment; a folder that cannot be written to.
     """
     if paper not in PAPERS:
-        raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))
+        what = f"paper '{paper}' is not known"
+        raise InputError(what, where="reproduce", allowed=", ".join(PAPERS), code="unknown_choice")
     if experiment and paper != "chen2019":
-        raise InputError(f"{paper} has no such experiment", where="--experiment", allowed="reproduce chen2019")
+        what = f"{paper} has no such experiment"
+        raise InputError(what, where="--experiment", allowed="reproduce chen2019", code="unknown_choice")
     if runs and not experiment:
-        raise InputError("--runs are of the experiment", where="--runs", allowed="reproduce chen2019 --experiment")
+        what = "--runs are of the experiment"
+        raise InputError(what, where="--runs", allowed="reproduce chen2019 --experiment", code="conflicting_options")
     return chen2019_experiment(out_dir, seeds, runs, watcher) if experiment else PAPERS[paper](out_dir, seeds)
 
 

@@ -80,7 +80,8 @@ def register_report(
     if markers_base is None:
         return registration_report(source)
     if target is None:
-        raise InputError("two lists of markers need a target", where="register", allowed="--target X,Y,Z in mm")
+        what = "two lists of markers need a target"
+        raise InputError(what, where="register", allowed="--target X,Y,Z in mm", code="missing_option")
     return lists_report(source, markers_base, target, space, fle_mm)
 
 
@@ -96,7 +97,8 @@ def registration_report(path: Path) -> dict[str, Any]:
         file = case.robot.transform
         what = "no [registration] with markers" if file is None else f"the base is placed by the transform {file}"
         compared = () if checked is None else (*checked.findings.warnings, *checked.findings.notes)
-        raise InputListError("; ".join((what, *compared)), where=case.path, allowed="markers_ct and markers_base alone")
+        allowed = "markers_ct and markers_base alone"
+        raise InputListError("; ".join((what, *compared)), where=case.path, allowed=allowed, code="no_markers")
     placement, registration = checked.placement, checked.placement.registration
     report = registration_summary(registration)
     pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]
@@ -125,7 +127,7 @@ def lists_report(
     where = "--target"
     numbers = [parse_coordinate(part.strip(), where) for part in target.split(",")]
     if len(numbers) != 3:
-        raise InputError(f"{len(numbers)} numbers", where=where, allowed="X,Y,Z in mm")
+        raise InputError(f"{len(numbers)} numbers", where=where, allowed="X,Y,Z in mm", code="wrong_count")
     content = [read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)) for path in (markers_ct, markers_base)]
     read = [parse_points(content[0], markers_ct, default_space=space), parse_points(content[1], markers_base)]
     target_ct = to_lps(np.array([numbers]), space)[0]

@@ -58,7 +58,8 @@ def table_of(source: Path, choice: Choice) -> Path | None:
         InputError: One candidate is chosen, or a plan is the source.
     """
     if choice != BEST or is_plan(source):
-        raise InputError("a table holds all candidates", where=source, allowed=f"{ALLOWED}; no choice")
+        what = "a table holds all candidates"
+        raise InputError(what, where=source, allowed=f"{ALLOWED}; no choice", code="conflicting_options")
     if source.suffix.lower() == ".parquet":
         return source
     table = source / TABLE
@@ -100,9 +101,10 @@ def _table(data: bytes, path: Path) -> pa.Table:
     try:
         table = pq.read_table(pa.BufferReader(data))
     except (pa.ArrowException, OSError) as error:
-        raise InputError(f"no Parquet file ({str(error)[:100]})", where=path, allowed=ALLOWED) from error
+        what = f"no Parquet file ({str(error)[:100]})"
+        raise InputError(what, where=path, allowed=ALLOWED, code="not_parquet") from error
     if b"run" not in (table.schema.metadata or {}) or not {*ROUNDED, "verdict"} <= set(table.column_names):
-        raise InputError("no table of candidates", where=path, allowed=ALLOWED)
+        raise InputError("no table of candidates", where=path, allowed=ALLOWED, code="no_such_file")
     return table
 
 

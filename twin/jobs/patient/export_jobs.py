@@ -86,7 +86,8 @@ def refuse_format(name: str) -> None:
     """
     known = (*FORMATS, MOVEIT, SLICER, *CANDIDATE_FORMATS)
     if name not in known:
-        raise InputError(f"format '{name}' is not known", where="--format", allowed=", ".join(known))
+        what = f"format '{name}' is not known"
+        raise InputError(what, where="--format", allowed=", ".join(known), code="unknown_format")
 
 
 def export_source(
@@ -117,11 +118,12 @@ def export_source(
     if format_name == SLICER:
         if is_plan(source):
             allowed = "a case, with --rank, --window, --theta or --entry"
-            raise InputError("slicer shows a case", where=source, allowed=allowed)
+            raise InputError("slicer shows a case", where=source, allowed=allowed, code="missing_option")
         shown = export_to_slicer(prepare(source, watcher=watcher), out, choice)
         return Export(shown, shown.summary(), shown.text())
     if format_name == MOVEIT and planned_case is None:
-        raise InputError("moveit's scene is the case's", where=source, allowed="export plan.json --case CASE")
+        what = "moveit's scene is the case's"
+        raise InputError(what, where=source, allowed="export plan.json --case CASE", code="missing_option")
     context = None if planned_case is None else prepare(planned_case, watcher=watcher)
     if format_name == MOVEIT and context is not None:
         done = export_to_moveit(context, source if is_plan(source) else None, out, choice)

@@ -76,11 +76,12 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     _refuse_options(request)
     folder, path = request.folder, request.folder / CASE
     if not is_folder(folder):
-        raise InputError("is no folder", where=str(folder)[:200], allowed=ALLOWED)
+        raise InputError("is no folder", where=str(folder)[:200], allowed=ALLOWED, code="not_a_folder")
     if is_plain_file(path) and not force:
-        raise InputError("there is a case already", where=path, allowed="--force to replace it")
+        raise InputError("there is a case already", where=path, allowed="--force to replace it", code="case_exists")
     if (request.target is None) == (request.target_label is None):
-        raise InputError("one target", where="init", allowed="either --target X,Y,Z or --target-label NAME")
+        allowed = "either --target X,Y,Z or --target-label NAME"
+        raise InputError("one target", where="init", allowed=allowed, code="conflicting_options")
     memory = Memory(READING_BYTES)
     start = start_case(request, replace(user_cache(), memory=memory), partial(watcher.step, "reading"))
     with atomic(path) as draft:
@@ -108,11 +109,13 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
 def _refuse_options(request: Request) -> None:
     region, radius = request.region, request.hit_radius_mm
     if region is not None and region not in get_args(Region):
-        raise InputError(f"region '{region[:40]}' is not known", where="--region", allowed=", ".join(get_args(Region)))
+        what = f"region '{region[:40]}' is not known"
+        raise InputError(what, where="--region", allowed=", ".join(get_args(Region)), code="unknown_region")
     if request.wanted.space is Space.LOCAL:
-        raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
+        raise InputError("a patient's space", where="--space", allowed="LPS or RAS", code="unknown_space")
     if radius is not None and (request.target is None or not 0 < radius <= 100):
-        raise InputError(f"{radius:g}", where="--hit-radius", allowed="mm, above 0, at most 100, beside --target")
+        allowed = "mm, above 0, at most 100, beside --target"
+        raise InputError(f"{radius:g}", where="--hit-radius", allowed=allowed, code="out_of_range")
 
 
 def _with_seen(start: Start, request: Request, context: CaseContext) -> str:

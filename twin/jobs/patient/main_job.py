@@ -61,7 +61,8 @@ def certify_options(wanted: bool, size_deg: float | None, touch: float | None) -
     """
     for option, value in (("--certify-touch", touch), ("--certify-size", size_deg)):
         if value is not None and not wanted:
-            raise InputError("of a certificate that nobody asked for", where=option, allowed="beside --certify")
+            what = "of a certificate that nobody asked for"
+            raise InputError(what, where=option, allowed="beside --certify", code="conflicting_options")
     return CertifyOptions(CERTIFY_DEG if size_deg is None else size_deg, touch) if wanted else None
 
 
@@ -151,7 +152,8 @@ def rehearsed_case(source: Path, case: Path | None, choice: Choice) -> Path:
         InputError: A plan without its case, or see there.
     """
     if (found := case_of(source, case, choice)) is None:
-        raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
+        what = "a plan needs its case"
+        raise InputError(what, where=source, allowed="rehearse plan.json --case CASE", code="missing_option")
     return found
 
 
@@ -163,11 +165,9 @@ def demo_case(context: CaseContext, out: Path) -> Run:
 
 def _refuse_without_arm(context: CaseContext) -> None:
     if context.reach is None:
-        raise InputError(
-            "the case does not say where the robot stands, so nothing can be planned",
-            where=context.case.path,
-            allowed="[registration] with markers_ct and markers_base, or [robot.mount]",
-        )
+        what = "the case does not say where the robot stands, so nothing can be planned"
+        allowed = "[registration] with markers_ct and markers_base, or [robot.mount]"
+        raise InputError(what, where=context.case.path, allowed=allowed, code="no_base")
 
 
 def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
@@ -184,7 +184,7 @@ def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
         choose_stated(context, choice)
     except NoAnswerError as error:
         withdraw(out, "plan")
-        raise NoAnswerError(f"{NO_PLAN}{error}", counts=error.counts) from error
+        raise NoAnswerError(f"{NO_PLAN}{error}", counts=error.counts, code=error.code) from error
     return choice
 
 
@@ -221,7 +221,8 @@ def _answered(run: Run, out: Path) -> Run:
         NoAnswerError: It has none.
     """
     if run.plan is None:
-        raise NoAnswerError(f"{NO_PLAN}{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
+        what = f"{NO_PLAN}{run.refusal}; see {out / 'report.html'}"
+        raise NoAnswerError(what, counts=run.candidates.counts(), code="no_plan")
     return run
 
 
@@ -359,8 +360,10 @@ def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
     """
     if is_plan(source):
         if choice != BEST:
-            raise InputError("a plan has its direction", where=source, allowed="a case, where one is to be chosen")
+            allowed = "a case, where one is to be chosen"
+            raise InputError("a plan has its direction", where=source, allowed=allowed, code="conflicting_options")
         return case
     if case is not None:
-        raise InputError("two cases", where="--case", allowed="CASE alone, or plan.json --case CASE")
+        allowed = "CASE alone, or plan.json --case CASE"
+        raise InputError("two cases", where="--case", allowed=allowed, code="conflicting_options")
     return source

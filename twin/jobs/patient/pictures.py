@@ -105,7 +105,8 @@ def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:
     _check_png(path)
     budget = report.get("budget")
     if budget is None:
-        raise InputError("no error budget to draw", where="--picture", allowed="a case with [errors] and an arm")
+        what = "no error budget to draw"
+        raise InputError(what, where="--picture", allowed="a case with [errors] and an arm", code="no_error_budget")
     inputs = read_inputs(report["inputs"])
     with writing(path.parent, f"register {path.name}", inputs=inputs, names=(path.name,), note=lambda _: None) as draft:
         draw_budget(budget, draft.folder / path.name)
@@ -173,6 +174,7 @@ def _budget(context: CaseContext, q_insertion: Floats) -> Mapping[str, Any] | No
 
 def _check_png(path: Path) -> None:
     if path.suffix.lower() != ".png":
-        raise InputError(f"'{path.name}' is no PNG's name", where="--picture", allowed="FILE.png")
+        raise InputError(f"'{path.name}' is no PNG's name", where="--picture", allowed="FILE.png", code="bad_file_name")
     if not path.parent.is_dir():
-        raise InputError("there is no such folder", where=path.parent, allowed="a folder that is there")
+        what = "there is no such folder"
+        raise InputError(what, where=path.parent, allowed="a folder that is there", code="not_a_folder")

@@ -71,7 +71,8 @@ def place_case(context: CaseContext, out: Path, *, jobs: int, pictures: bool = T
         withdraw(out, "place")
         raise
     if not any(one.verdict.reached for one in run.found.rated):
-        raise NoAnswerError(f"no placement holds any of the {run.directions} organ-safe directions")
+        what = f"no placement holds any of the {run.directions} organ-safe directions"
+        raise NoAnswerError(what, code="no_placement")
     return replace(run, files=draft.final(run.files))
 
 

@@ -52,7 +52,8 @@ def room_count(rooms: int | None, physics: int) -> RoomCount | None:
         InputError: More in the simulator than there are.
     """
     if physics > (rooms or 0):
-        raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
+        what = "--physics runs some of the rooms"
+        raise InputError(what, where="--physics", allowed="--seeds N --physics K, K <= N", code="conflicting_options")
     return None if rooms is None else RoomCount(rooms, physics)
 
 

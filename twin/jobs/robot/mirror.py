@@ -108,7 +108,8 @@ class Mirror:
         checked = checked_placement(case, user_cache())
         if checked is None:
             allowed = "[registration] with markers, or [robot.mount]"
-            raise InputError("the case does not say where the robot stands", where=case.path, allowed=allowed)
+            what = "the case does not say where the robot stands"
+            raise InputError(what, where=case.path, allowed=allowed, code="no_base")
         return cls(case.robot.model, checked.placement.T_base_ct, case.needle.length_mm, case.target_ct)
 
     def show(self, state: RecordedState) -> Mirrored:
@@ -140,14 +141,16 @@ def connect(host: str) -> Receiver:
         receiver: Receiver = RTDEReceiveInterface(host, variables=list(VARIABLES))
     except (OSError, RuntimeError, ValueError) as error:  # ValueError: a name that no address can have
         where = f"mirror {host}, port {RTDE_PORT}"
-        raise InputError(f"no robot answers: {error}", where=where, allowed="a UR that is on") from error
+        what = f"no robot answers: {error}"
+        raise InputError(what, where=where, allowed="a UR that is on", code="no_robot_answers") from error
     return receiver
 
 
 def _check_host(host: str) -> None:
     if not 0 < len(host) <= MAX_HOST or not host.isprintable() or any(c.isspace() for c in host):
         what = f"host of {len(host)} characters, or with spaces in it"
-        raise InputError(what, where=f"mirror {host}", allowed=f"a name or address of 1 to {MAX_HOST} characters")
+        where = f"mirror {host}"
+        raise InputError(what, where=where, allowed=f"a name or address of 1 to {MAX_HOST} characters", code="bad_host")
 
 
 def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[RecordedState]:
@@ -173,7 +176,8 @@ def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -
         elif not receiver.isConnected() or time.monotonic() - heard > SILENCE_S:
             # the library goes on to give the last state it has heard
             said = "hung up" if not receiver.isConnected() else "tells nothing new"
-            raise InputError(f"the robot {said}, {last:.3f} s by its clock", where="mirror", allowed="a UR that is on")
+            what = f"the robot {said}, {last:.3f} s by its clock"
+            raise InputError(what, where="mirror", allowed="a UR that is on", code="robot_silent")
         time.sleep(period_s)
 
 
@@ -244,7 +248,8 @@ def readings_of(
     if recording is None and host is not None:
         return Readings(live_states(connect(host), period_s=period_s, seconds=seconds), case.inputs)
     if recording is None or host is not None:
-        raise InputError("one arm at a time", where="mirror", allowed="either HOST or --from joints.csv")
+        what = "one arm at a time"
+        raise InputError(what, where="mirror", allowed="either HOST or --from joints.csv", code="conflicting_options")
     read = RecordedJoints.read(recording)
     return Readings(read.states(case), (read.input, *case.inputs), read.warnings())
 
@@ -252,7 +257,8 @@ def readings_of(
 def told(time_s: float, q: list[float]) -> RecordedState:
     """A controller's word, if it is a time and six angles that an arm can have; else an `InputError`."""
     if not np.isfinite(time_s):
-        raise InputError(f"a time of {time_s} s", where="the robot's answer", allowed="a finite time")
+        what = f"a time of {time_s} s"
+        raise InputError(what, where="the robot's answer", allowed="a finite time", code="not_finite")
     return RecordedState(float(time_s), joint_readings([q], "rad", where="the robot's answer")[0])
 
 

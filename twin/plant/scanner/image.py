@@ -217,7 +217,8 @@ def check_closed(solid: Solid, where: str) -> Solid:
         InputError: Its surface is open.
     """
     if not solid.mesh.closed:
-        raise InputError(f"'{solid.name}' has an open surface", where=where, allowed="closed surfaces")
+        what = f"'{solid.name}' has an open surface"
+        raise InputError(what, where=where, allowed="closed surfaces", code="open_mesh")
     return solid
 
 

@@ -107,9 +107,8 @@ def adjust(
     """
     problem = _Problem(tuple(cameras), np.asarray(T_c_bodies), np.asarray(points), seen, spreads)
     if problem.rows() < problem.free.sum() or not problem.free.any():
-        raise InputError(
-            f"{problem.rows()} equations for {problem.free.sum()} unknowns", where="bundle", allowed="at least as many"
-        )
+        what = f"{problem.rows()} equations for {problem.free.sum()} unknowns"
+        raise InputError(what, where="bundle", allowed="at least as many", code="undetermined")
     start = np.zeros(int(problem.free.sum()))
     fit = least_squares(
         problem.errors, start, problem.jacobian, method="lm", x_scale=problem.scale(), ftol=TOLERANCE, xtol=TOLERANCE
@@ -128,7 +127,8 @@ def _inverse(information: Floats) -> Floats:
     """Inverse after scaling to a unit diagonal: the parameters' units differ by powers of ten."""
     scale = 1 / np.sqrt(np.diag(information))
     if not np.isfinite(scale).all() or np.linalg.cond(information * np.outer(scale, scale)) > 1e15:
-        raise InputError("a parameter that nothing determines", where="bundle", allowed="hold it or give it a spread")
+        what = "a parameter that nothing determines"
+        raise InputError(what, where="bundle", allowed="hold it or give it a spread", code="undetermined")
     return np.asarray(np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))
 
 

@@ -144,42 +144,39 @@ def _parameters_known(bundle: Bundle, spread: Floats) -> float:
 def _check_shapes(points: Floats, pixels: Floats, names: Sequence[str] | None, where: str | Path) -> None:
     count = len(points)
     if points.shape != (count, 3) or pixels.shape != (count, 2) or (names is not None and len(names) != count):
-        raise InputError(
-            f"points of shape {points.shape}, pixels of shape {pixels.shape}",
-            where=where,
-            allowed="(n, 3), (n, 2), and n names if any",
-        )
+        what = f"points of shape {points.shape}, pixels of shape {pixels.shape}"
+        raise InputError(what, where=where, allowed="(n, 3), (n, 2), and n names if any", code="wrong_shape")
 
 
 def _check_points(points: Floats, pixels: Floats, names: Sequence[str], where: str | Path) -> None:
     lost = np.asarray(~np.isfinite(pixels).all(axis=1))
     if lost.any():
-        raise InputError(f"ball not found: {_listed(names, lost)}", where=where, allowed="every ball seen")
+        what = f"ball not found: {_listed(names, lost)}"
+        raise InputError(what, where=where, allowed="every ball seen", code="ball_not_found")
     wrong = np.asarray(~np.isfinite(points).all(axis=1))
     if wrong.any():
-        raise InputError(f"position not finite: {_listed(names, wrong)}", where=where, allowed="finite mm")
+        what = f"position not finite: {_listed(names, wrong)}"
+        raise InputError(what, where=where, allowed="finite mm", code="not_finite")
     distinct = len(np.unique(points, axis=0))
     if distinct < MIN_POINTS:
-        raise InputError(f"{distinct} distinct points", where=where, allowed=f"{MIN_POINTS} or more, not in a plane")
+        what = f"{distinct} distinct points"
+        raise InputError(what, where=where, allowed=f"{MIN_POINTS} or more, not in a plane", code="too_few_points")
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[2] < COPLANAR * spread[0]:
-        raise InputError(
-            f"the points are coplanar: {spread[2] / spread[0]:.2g} as thick as long",
-            where=where,
-            allowed=f"a set at least {COPLANAR:g} as thick as long, such as a 3 x 2 x 2 grid",
-        )
+        what = f"the points are coplanar: {spread[2] / spread[0]:.2g} as thick as long"
+        allowed = f"a set at least {COPLANAR:g} as thick as long, such as a 3 x 2 x 2 grid"
+        raise InputError(what, where=where, allowed=allowed, code="points_coplanar")
 
 
 def _check_linear(linear: LinearFit, points: Floats, pixels: Floats, names: Sequence[str], where: str | Path) -> None:
     if linear.condition > CRITICAL:
-        raise InputError(
-            f"the points leave the camera free (condition {linear.condition:.2g})",
-            where=where,
-            allowed="points that are not on a plane and a line, or on a twisted cubic through the camera",
-        )
+        what = f"the points leave the camera free (condition {linear.condition:.2g})"
+        allowed = "points that are not on a plane and a line, or on a twisted cubic through the camera"
+        raise InputError(what, where=where, allowed=allowed, code="undetermined")
     behind = np.asarray(points @ linear.M[2, :3] + linear.M[2, 3] <= 0)
     if behind.any():
-        raise InputError(f"behind the camera: {_listed(names, behind)}", where=where, allowed="all in front of it")
+        what = f"behind the camera: {_listed(names, behind)}"
+        raise InputError(what, where=where, allowed="all in front of it", code="behind_camera")
     misses = np.linalg.norm(project(linear.M, points) - pixels, axis=1)
     _check_misses(misses, names, where)
 
@@ -187,20 +184,16 @@ def _check_linear(linear: LinearFit, points: Floats, pixels: Floats, names: Sequ
 def _check_fit(bundle: Bundle, points: Floats, names: Sequence[str], where: str | Path) -> None:
     unseen = np.asarray(~np.isfinite(bundle.cameras[0].project(points)).all(axis=1))
     if unseen.any():
-        raise InputError(
-            f"behind the camera or beyond its lens: {_listed(names, unseen)}", where=where, allowed="all in its view"
-        )
+        what = f"behind the camera or beyond its lens: {_listed(names, unseen)}"
+        raise InputError(what, where=where, allowed="all in its view", code="behind_camera")
     _check_misses(np.linalg.norm(bundle.residuals_px, axis=1), names, where)
 
 
 def _check_misses(misses: Floats, names: Sequence[str], where: str | Path) -> None:
     worst = int(np.argmax(misses))
     if misses[worst] > MAX_RESIDUAL_PX:
-        raise InputError(
-            f"{names[worst]} misses by {misses[worst]:.1f} px: swapped, moved or found wrongly",
-            where=where,
-            allowed=f"residuals up to {MAX_RESIDUAL_PX:g} px",
-        )
+        what = f"{names[worst]} misses by {misses[worst]:.1f} px: swapped, moved or found wrongly"
+        raise InputError(what, where=where, allowed=f"residuals up to {MAX_RESIDUAL_PX:g} px", code="point_misses")
 
 
 def _listed(names: Sequence[str], rows: NDArray[np.bool_]) -> str:

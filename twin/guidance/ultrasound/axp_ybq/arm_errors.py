@@ -123,7 +123,8 @@ def arm_errors(declared: DeclaredArms, recording: Recording) -> ArmErrors:
     """
     q_probe, q_needle = recording.q_probe, recording.q_needle
     if q_probe is None or q_needle is None:
-        raise InputError("the arms' errors need the joints", where="recording", allowed="columns A_q1_deg to B_q6_deg")
+        what = "the arms' errors need the joints"
+        raise InputError(what, where="recording", allowed="columns A_q1_deg to B_q6_deg", code="missing_column")
     for arm, q, T, of in ((declared.probe, q_probe, recording.A, "A"), (declared.needle, q_needle, recording.B, "B")):
         names = [f"{of} in pose {name}" for name in recording.names]
         check_flanges(arm.model, q, T, names=names, where="recording")

@@ -79,7 +79,8 @@ def calibrate(
         Degenerate: The poses cannot show every unknown. It names the motion and proposes further poses.
     """
     if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
-        raise InputError(f"needle length {needle_length_mm}", where="needle_length_mm", allowed="a positive number, mm")
+        what = f"needle length {needle_length_mm}"
+        raise InputError(what, where="needle_length_mm", allowed="a positive number, mm", code="not_positive")
     _check(recording, known_tip, scale, start)
     errors = None if arms is None else arm_errors(arms, recording)
     poses = recording if errors is None else without_play(recording, errors)
@@ -99,15 +100,17 @@ def calibrate(
 
 def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: Estimate | None) -> None:
     if recording.pixels and not scale:
-        raise InputError("the tip is in pixels", where="recording", allowed="mm, or mm per pixel to be found (scale)")
+        what = "the tip is in pixels"
+        raise InputError(what, where="recording", allowed="mm, or mm per pixel to be found (scale)", code="wrong_unit")
     if known_tip is not None and (np.shape(known_tip) != (3,) or not np.isfinite(known_tip).all()):
-        raise InputError(f"known tip {known_tip}", where="known_tip", allowed="three finite numbers, mm, frame end2")
+        what = f"known tip {known_tip}"
+        raise InputError(what, where="known_tip", allowed="three finite numbers, mm, frame end2", code="not_finite")
     least = LEAST_POSES if known_tip is None else LEAST_POSES_KNOWN_TIP
     if start is not None:
         least = len(active_columns(tip=known_tip is None, scale=scale, direction=False)) // 3 + 1
     if len(recording) < least:
         allowed = f"{least} or more" + (f", better {ADVISED_POSES}" if least == LEAST_POSES else "")
-        raise InputError(f"{len(recording)} poses", where="recording", allowed=allowed)
+        raise InputError(f"{len(recording)} poses", where="recording", allowed=allowed, code="too_few_poses")
 
 
 def _solve(

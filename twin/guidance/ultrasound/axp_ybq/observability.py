@@ -257,7 +257,7 @@ class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
         self.ratio = observability.ratio
         self.suggestion = suggestion
         what = "; ".join(motion.text for motion in self.motions) + f" (singular value ratio {self.ratio:.1e})"
-        super().__init__(what, where="recording", allowed=suggestion.text)
+        super().__init__(what, where="recording", allowed=suggestion.text, code="poses_too_alike")
 
 
 def require_observable(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Observability:

@@ -79,11 +79,9 @@ def settled(problem: Problem, fit: RobustFit, *, recheck: bool = True) -> Robust
 def _check_enough(problem: Problem, kept: Bools) -> None:
     n, unknowns = len(problem.recording), len(problem.active)
     if kept.sum() < max(LEAST_KEPT * n, unknowns / 3 + 1):
-        raise InputError(
-            f"only {int(kept.sum())} of {n} poses agree with each other",
-            where="recording",
-            allowed="a recording in which most tips are right",
-        )
+        what = f"only {int(kept.sum())} of {n} poses agree with each other"
+        allowed = "a recording in which most tips are right"
+        raise InputError(what, where="recording", allowed=allowed, code="poses_disagree")
 
 
 HUBER_STEPS, TUKEY_STEPS = 6, 12

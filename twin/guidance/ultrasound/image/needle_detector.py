@@ -192,7 +192,8 @@ def detect(image: Pixels, imager: Imager, settings: DetectorSettings | None = No
     settings = settings or DetectorSettings()
     if image.shape != (imager.rows, imager.columns):
         size = f"({imager.rows}, {imager.columns})"
-        raise InputError(f"picture of shape {image.shape}", where="needle detector", allowed=f"{size}, the imager's")
+        what = f"picture of shape {image.shape}"
+        raise InputError(what, where="needle detector", allowed=f"{size}, the imager's", code="wrong_shape")
     relative = over_background(image, imager)
     segment = _segment(relative, imager, settings)
     length = float(np.linalg.norm(segment.end - segment.start))

@@ -329,4 +329,5 @@ def _require_usable(needle: NeedleInImage) -> None:
     usable = tip.shape == (3,) and direction.shape == (3,) and bool(np.isfinite([*tip, *direction]).all())
     if not usable or abs(float(np.linalg.norm(direction)) - 1.0) > UNIT:
         what = f"needle at {tip.tolist()} along {direction.tolist()}"
-        raise InputError(what, where="B-mode picture", allowed="a finite tip (3,) in mm and a unit direction (3,)")
+        allowed = "a finite tip (3,) in mm and a unit direction (3,)"
+        raise InputError(what, where="B-mode picture", allowed=allowed, code="not_finite")
