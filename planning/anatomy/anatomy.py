@@ -19,7 +19,7 @@ from puncture_twin.planning.anatomy.structure import Role as Role, Structure as 
 from puncture_twin.planning.anatomy.unseen import beyond_images, beyond_labels
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import Finding, InputError, Severity
+from puncture_twin.planning.base.errors import Finding, InputError, Severity, refuse
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
@@ -220,23 +220,21 @@ def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh 
 def _check_count(case: Case, count: int) -> None:
     """Of a case that states how many structures it has, before a surface is made; the CT adds others later."""
     if wrong := count_difference(case.stated_structures, count):
-        allowed = "the number of structures that are read"
-        raise InputError(wrong, where=case.path, allowed=allowed, code="structures_miscounted")
+        refuse(wrong, case.path, "the number of structures that are read", "structures_miscounted")
 
 
 def _check_names(case: Case, structures: list[Structure]) -> None:
     names = [structure.name for structure in structures]
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
-        what = f"structure '{twice[0]}' stands twice"
-        raise InputError(what, where=case.path, allowed="unique names", code="duplicate_name")
+        refuse(f"structure '{twice[0]}' stands twice", case.path, "unique names", "duplicate_name")
     if case.target_structure not in names:
-        raise InputError(
+        refuse(
             f"target.structure '{case.target_structure}' is no structure of the case"
             f"{did_you_mean(case.target_structure, names)}",
-            where=case.path,
-            allowed=", ".join(names),
-            code="unknown_structure",
+            case.path,
+            ", ".join(names),
+            "unknown_structure",
         )
 
 
@@ -244,8 +242,7 @@ def _check_demands(case: Case, structures: list[Structure]) -> None:
     """Where nothing demands a margin every path is "safe", which says nothing about a patient."""
     if not any(structure.demands_margin for structure in structures):
         what = "no structure is to be avoided, so that no verdict would say anything about safety"
-        allowed = 'at least one structure of role "avoid" or "unknown"'
-        raise InputError(what, where=case.path, allowed=allowed, code="nothing_to_avoid")
+        refuse(what, case.path, 'at least one structure of role "avoid" or "unknown"', "nothing_to_avoid")
 
 
 def surface_distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:

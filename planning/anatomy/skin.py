@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, filled_slices
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, WIDE, Box, FieldOfView, shifted, spacing_of
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.labels.label_surface import box_in, field_surface
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.volume_files import canonical
@@ -101,13 +101,12 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
     where = f"{labelmap.path}, label {label}"
     if label not in labelmap.boxes:
         allowed = f"the labels present: {', '.join(map(str, labelmap.labels_present()))}"
-        raise InputError("no voxel has the label of the skin", where=where, allowed=allowed, code="label_absent")
+        refuse("no voxel has the label of the skin", where, allowed, "label_absent")
     oriented = canonical(labelmap.labels, labelmap.T_ct_index)
     box = box or tuple((0, n) for n in oriented.values.shape)
     body = filled_slices(oriented.values[tuple(slice(*ends) for ends in box)] == label)
     if body.all():
-        what = "no air around the body"
-        raise InputError(what, where=where, allowed="a label with a border inside the image", code="no_air")
+        refuse("no air around the body", where, "a label with a border inside the image", "no_air")
     found = BodyMask(body, np.zeros_like(body), ())
     return _skin(np.where(body, 0.5, -0.5), found, shifted(oriented.T_ct_index, box), where)
 
@@ -136,8 +135,7 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
         sides[axis, end] = True
         in_plane = np.all(np.abs(mesh.triangles[:, :, axis] - (low, high)[end][axis]) < CUT_PLANE_MM, axis=1)
         if not in_plane.any():
-            what = f"no flat end at its {name}"
-            raise InputError(what, where="skin mesh", allowed="a side where the body was cut", code="no_flat_end")
+            refuse(f"no flat end at its {name}", "skin mesh", "a side where the body was cut", "no_flat_end")
         cut_faces |= in_plane
     return Skin(mesh, cut_faces, FieldOfView(pose(np.eye(3), low), high - low, sides), warnings)
 

@@ -13,7 +13,7 @@ from puncture_twin.planning.anatomy.skin import Skin, flat_ends
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.anatomy.surfaces import Imaged, VolumeSurfaces, kept_skin
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
@@ -139,7 +139,7 @@ class StructureSources:
         if ends:
             what = f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?"
             allowed = f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin"
-            raise InputError(what, where=self._case.path, allowed=allowed, code="skin_cut_unstated")
+            refuse(what, self._case.path, allowed, "skin_cut_unstated")
         cut = section.cut or ()
         return kept_skin(mesh, cut, self._cache)
 
@@ -158,9 +158,8 @@ class StructureSources:
         """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
         own, named = skin_section.ct, self._case.ct.file
         if own is not None and named not in {None, own}:
-            what = f"[ct] file '{named}' is not the CT of the skin, '{own}'"
             allowed = "one CT: leave out [ct] file where the skin comes from a CT"
-            raise InputError(what, where=self._case.path, allowed=allowed, code="several_cts")
+            refuse(f"[ct] file '{named}' is not the CT of the skin, '{own}'", self._case.path, allowed, "several_cts")
         name = own or named
         if name is None:
             return None
@@ -170,13 +169,13 @@ class StructureSources:
         if not scan.contains(self._case.target_ct):
             what = f"[ct] file '{name}' does not show the target: a slip of file or space?"
             allowed = "a CT that holds the target, in the space of the structures"
-            raise InputError(what, where=self._case.path, allowed=allowed, code="target_outside_ct")
+            refuse(what, self._case.path, allowed, "target_outside_ct")
         return scan
 
     def _mesh(self, section: StructureSection) -> TriangleMesh:
         where = f"{self._case.path}: structure '{section.name}'"
         if section.mesh is None or section.unit is None:
-            raise InputError("no mesh with a unit", where=where, allowed="mesh and unit", code="missing_source")
+            refuse("no mesh with a unit", where, "mesh and unit", "missing_source")
         file, by_default = self._file(section.mesh), section.space is None
         space = parse_space(section.space, where=where) if section.space else self._case.space
         unit = parse_unit(section.unit, where=where)
@@ -190,8 +189,7 @@ class StructureSources:
 
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:
-            what = f"'{section.name}' has no source"
-            raise InputError(what, where=self._case.path, allowed="mesh or labelmap", code="missing_source")
+            refuse(f"'{section.name}' has no source", self._case.path, "mesh or labelmap", "missing_source")
         return self._labels(section.labelmap).label(section.label)
 
     def _labels(self, name: str) -> VolumeSurfaces:
@@ -210,8 +208,7 @@ class StructureSources:
 
     def _refuse_local(self, name: str, kind: str) -> None:
         if self._case.space is Space.LOCAL:
-            what = f'{kind} {name} in a case of space "local"'
-            raise InputError(what, where=self._case.path, allowed='space "LPS" or "RAS"', code="local_space")
+            refuse(f'{kind} {name} in a case of space "local"', self._case.path, 'space "LPS" or "RAS"', "local_space")
 
     def _volume(self, name: str) -> VolumeSurfaces:
         if name not in self._volumes:

@@ -24,7 +24,7 @@ from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import LabelGrid, Role, Structure, label_grids
 from puncture_twin.planning.base.arrays import Floats, widened
-from puncture_twin.planning.base.errors import Finding, InputError, Severity
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.label_surface import mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
@@ -241,7 +241,7 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure]) -> Be
         said = ENDS.format(name=grid.name, voxels=extent.gaps.max())
         if not skin.mesh.closed:
             allowed = "a label map of the whole body about the target, or a closed skin"
-            raise InputError(f"{said} (the skin is open)", where=case.path, allowed=allowed, code="labels_end")
+            refuse(f"{said} (the skin is open)", case.path, allowed, "labels_end")
         warnings.append(f"{said} ({BEYOND_LABELS})")
         margins.append(margin)
         meshes += list(_slabs(extent, skin.mesh))
@@ -268,7 +268,7 @@ def _refuse_without_target(case: Case, grid: LabelGrid) -> None:
     index = apply(np.linalg.inv(grid.voxels.T_ct_index), case.target_ct[None])[0]
     if np.any(index < -0.5) or np.any(index > np.array(grid.voxels.shape) - 0.5):
         what = f"label map {grid.name} ends before the target, so that all about it is unknown"
-        raise InputError(what, where=case.path, allowed="label maps that hold the target", code="labels_end")
+        refuse(what, case.path, "label maps that hold the target", "labels_end")
 
 
 def _slabs(extent: _Extent, skin: TriangleMesh) -> Iterator[TriangleMesh]:

@@ -23,7 +23,7 @@ from puncture_twin.planning.arm.urdf.lengths import NOTHING_STATED, StatedLimits
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined, packed_meshes, unpacked_meshes
 
 LINK_NAMES = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -140,8 +140,7 @@ def _link_shapes(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
 def _pieces(mesh: TriangleMesh, name: str, model: UrModel) -> tuple[TriangleMesh, ...]:
     pieces = convex_pieces(mesh, SLABS.get(name, 1))
     if not pieces:
-        what = f"a shape of the {name} is flat"
-        raise InputError(what, where=model_urdf(model).where, allowed="bodies, not sheets", code="flat_mesh")
+        refuse(f"a shape of the {name} is flat", model_urdf(model).where, "bodies, not sheets", "flat_mesh")
     return pieces
 
 
@@ -205,7 +204,7 @@ def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[Tr
             allowed = (
                 f"shapes that meet along their joint's axis, to {MOST_GAP_MM:g} mm: see their unit, scale and origin"
             )
-            raise InputError(what, where=model_urdf(model).where, allowed=allowed, code="links_apart")
+            refuse(what, model_urdf(model).where, allowed, "links_apart")
         pins.append(tuple(_pin(a - PIN_ROOT_MM, b + PIN_ROOT_MM) for a, b in gaps))
     return [*pins, ()]
 
@@ -249,7 +248,7 @@ def model_urdf(model: UrModel) -> ArmUrdf:
         return model.urdf
     if not model.shipped:
         what = f"the arm {model.name!r} is known by its numbers alone"
-        raise InputError(what, where="robot", allowed="the case that names its URDF", code="urdf_missing")
+        refuse(what, "robot", "the case that names its URDF", "urdf_missing")
     return _shipped(model.name)
 
 
@@ -265,8 +264,7 @@ def _shipped(name: str) -> ArmUrdf:
     path = meshes.folder() / SHAPES / f"{name}.urdf"
     if not path.is_file():
         allowed = ", ".join(sorted(p.stem for p in path.parent.glob("*.urdf")))
-        what = f"no link meshes for robot {name!r}"
-        raise InputError(what, where=f"meshes/{SHAPES}", allowed=allowed, code="no_link_meshes")
+        refuse(f"no link meshes for robot {name!r}", f"meshes/{SHAPES}", allowed, "no_link_meshes")
     return read_arm_urdf(
         path.read_bytes(),
         path,

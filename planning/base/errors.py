@@ -16,7 +16,7 @@ from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 MOST_WHAT, MOST_WHERE, MOST_ALLOWED = 400, 300, 600
 """Characters of an error's parts: what is longer loses its middle, so that the line can still be read."""
@@ -81,6 +81,11 @@ class InputError(PlanningError):
         moved = copy.copy(self)
         moved.where = one_line(str(where), MOST_WHERE)
         return moved
+
+
+def refuse(what: str, where: str | Path, allowed: str, code: str) -> NoReturn:
+    """Raise an `InputError` of these parts: the usual way, where no other error is its cause."""
+    raise InputError(what, where=where, allowed=allowed, code=code)
 
 
 class InputListError(InputError):

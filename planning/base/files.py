@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 
 OUTPUT_NAMES = (
     "manifest.json",
@@ -112,7 +112,7 @@ def check_writable(folder: Path) -> Path:
         what = f"output folder cannot be used ({error})"
         raise InputError(what, where=_shown(folder), allowed=allowed, code="unwritable") from error
     if not usable:
-        raise InputError("output folder cannot be written to", where=_shown(folder), allowed=allowed, code="unwritable")
+        refuse("output folder cannot be written to", _shown(folder), allowed, "unwritable")
     return folder
 
 
@@ -142,13 +142,12 @@ def read_input(path: Path, *, max_bytes: int, where: str) -> bytes:
     try:
         if not path.exists():
             other = _other_case(path)
-            what = f"no such file; there is '{other}'" if other else "no such file"
-            raise InputError(what, where=where, allowed=allowed, code="no_such_file")
+            refuse(f"no such file; there is '{other}'" if other else "no such file", where, allowed, "no_such_file")
         if not path.is_file():
-            raise InputError("not a file but a directory or device", where=where, allowed=allowed, code="not_a_file")
+            refuse("not a file but a directory or device", where, allowed, "not_a_file")
         size = path.stat().st_size
         if not 0 < size <= max_bytes:
-            raise InputError(f"file of {size} bytes", where=where, allowed=allowed, code="file_size")
+            refuse(f"file of {size} bytes", where, allowed, "file_size")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # unreadable, or a path with a NUL in it
         raise InputError(f"cannot be read ({error})", where=where, allowed=allowed, code="unreadable") from error

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import absence, is_plain_file, read_input
 from puncture_twin.planning.base.strict_json import text
 
@@ -137,8 +137,7 @@ class InputFiles:
         known = self.sha256(name)
         content = read_input(self._folder / name, max_bytes=1 << 40, where=str(self._folder / name))
         if content_input("", name, content).sha256 != known:
-            what = "has changed since it was read"
-            raise InputError(what, where=self._folder / name, allowed="start again", code="input_changed")
+            refuse("has changed since it was read", self._folder / name, "start again", "input_changed")
         return content
 
     def sha256(self, name: str) -> str:
@@ -161,6 +160,5 @@ class InputFiles:
     def _existing(self, name: str, key: str, where: Path) -> Path:
         file = self._folder / name
         if not is_plain_file(file):
-            what = f"{key}: file '{name[:200]}' {absence(file)}"
-            raise InputError(what, where=where, allowed=f"a file in {self._folder}", code="no_such_file")
+            refuse(f"{key}: file '{name[:200]}' {absence(file)}", where, f"a file in {self._folder}", "no_such_file")
         return file

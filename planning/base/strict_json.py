@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import read_input
 
 Value = TypeVar("Value")
@@ -69,7 +69,7 @@ def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str
     document = parse_json(data, where=where, allowed=allowed)
     stated = document.get("version") if isinstance(document, dict) else None
     if isinstance(stated, bool) or stated != version:
-        raise InputError(f"version {_shown(stated)}", where=where, allowed=allowed, code="unknown_version")
+        refuse(f"version {_shown(stated)}", where, allowed, "unknown_version")
     return dict(document)
 
 

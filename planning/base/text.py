@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.errors import one_line, refuse
 
 MAX_NAME = 200
 """Characters of a name; the longest of TotalSegmentator has 29. A longer one is refused, never cut: two names that
@@ -37,13 +37,11 @@ def check_name(name: str, what: str, *, where: str | Path) -> str:
         InputError: An empty name, one of more than `MAX_NAME` characters, or one with a control or format character.
     """
     if not name.strip():
-        raise InputError(f"{what} has an empty name", where=where, allowed=ALLOWED_NAME, code="bad_name")
+        refuse(f"{what} has an empty name", where, ALLOWED_NAME, "bad_name")
     if len(name) > MAX_NAME:
-        raise InputError(
-            f"{what} has a name of {len(name)} characters", where=where, allowed=ALLOWED_NAME, code="bad_name"
-        )
+        refuse(f"{what} has a name of {len(name)} characters", where, ALLOWED_NAME, "bad_name")
     if not name.isprintable():
-        raise InputError(f"{what} has the name {name!a}", where=where, allowed=ALLOWED_NAME, code="bad_name")
+        refuse(f"{what} has the name {name!a}", where, ALLOWED_NAME, "bad_name")
     return name
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ValidationError
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 
 MAX_BYTES = 1_000_000
 """Such a file is written by hand; a larger one is something else."""
@@ -64,7 +64,7 @@ def find_toml(path: Path | str, usual_name: str) -> Path:
     try:
         path = path / usual_name if path.is_dir() else path
         if path.exists() and not path.is_file():
-            raise InputError("is no plain file", where=path, allowed=allowed, code="not_a_file")
+            refuse("is no plain file", path, allowed, "not_a_file")
     except (OSError, ValueError) as error:
         what = f"cannot be looked up ({error})"
         raise InputError(what, where=str(path)[:80], allowed=allowed, code="unreadable") from error
@@ -79,7 +79,7 @@ def read_toml_bytes(path: Path, allowed: str) -> bytes:
     """
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError("larger than 1 MB, not written by hand", where=path, allowed=allowed, code="file_size")
+            refuse("larger than 1 MB, not written by hand", path, allowed, "file_size")
         return path.read_bytes()
     except OSError as error:
         what = f"cannot be read ({error.strerror})"
@@ -196,4 +196,4 @@ def _beyond(kind: str, found: str, depth: int, parts: int) -> str:
 
 
 def _refuse(wrong: str, where: Path | str, line: int, allowed: str) -> None:
-    raise InputError(f"line {line} {wrong}", where=where, allowed=allowed, code="toml_bounds")
+    refuse(f"line {line} {wrong}", where, allowed, "toml_bounds")

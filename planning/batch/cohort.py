@@ -17,7 +17,7 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 
 from pydantic import Field
 
-from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.errors import InputError, one_line, refuse
 from puncture_twin.planning.base.files import is_folder, read_input
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.text import unprintable_texts
@@ -70,7 +70,7 @@ def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]
         cases, inputs = _listed_cases(cohort)
     if not 0 < len(cases) <= MOST_CASES:
         what = f"holds {len(cases)} cases" if cases else "holds no case"
-        raise InputError(what, where=cohort, allowed=f"1 to {MOST_CASES} cases: {ALLOWED}", code="cohort_size")
+        refuse(what, cohort, f"1 to {MOST_CASES} cases: {ALLOWED}", "cohort_size")
     for one in cases:
         _check_path(one, cohort)
     return tuple(cases), inputs
@@ -88,7 +88,7 @@ def _check_path(case: CohortCase, cohort: Path) -> None:
 def _listed_cases(path: Path) -> tuple[list[CohortCase], tuple[Input, ...]]:
     readers = {".csv": csv_cases, ".toml": toml_cases}
     if path.suffix.lower() not in readers:
-        raise InputError("is no cohort", where=path, allowed=ALLOWED, code="not_a_cohort")
+        refuse("is no cohort", path, ALLOWED, "not_a_cohort")
     content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     return readers[path.suffix.lower()](content, path), (content_input("cohort", path.name, content),)
 
@@ -120,7 +120,7 @@ def _refuse_unreadable(error: OSError) -> NoReturn:
 
 
 def _refuse(what: str, where: str) -> NoReturn:
-    raise InputError(what, where=where, allowed="folders of patients that can be read", code="cohort_not_whole")
+    refuse(what, where, "folders of patients that can be read", "cohort_not_whole")
 
 
 CASE, NAME, TARGET = "case", "name", "target"
@@ -148,8 +148,7 @@ def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
         if not any(row):
             continue
         if len(row) != len(header):
-            what = f"{len(row)} cells"
-            raise InputError(what, where=where, allowed=f"{len(header)}, as in the header", code="ragged_row")
+            refuse(f"{len(row)} cells", where, f"{len(header)}, as in the header", "ragged_row")
         cases.append(_case(dict(zip(header, row, strict=True)), path, where))
     return cases
 
@@ -161,31 +160,27 @@ def _rows(content: bytes, path: Path) -> Any:
     except UnicodeDecodeError as error:
         raise InputError(f"is not UTF-8 ({error})", where=path, allowed="a CSV in UTF-8", code="not_text") from error
     if "\0" in text or max(map(len, text.splitlines()), default=0) > LONGEST_CELL:
-        what = "is no CSV"
-        raise InputError(what, where=path, allowed=f"text, lines of at most {LONGEST_CELL} characters", code="not_csv")
+        refuse("is no CSV", path, f"text, lines of at most {LONGEST_CELL} characters", "not_csv")
     return csv.reader(io.StringIO(text), strict=False)
 
 
 def _header(row: list[str], path: Path) -> list[str]:
     header = [cell.strip() for cell in row]
     if CASE not in header:
-        what = f"has no column '{CASE}'"
-        raise InputError(what, where=f"{path}: line 1", allowed=ALLOWED_COLUMNS, code="missing_column")
+        refuse(f"has no column '{CASE}'", f"{path}: line 1", ALLOWED_COLUMNS, "missing_column")
     for name in header:
         kind, _, key = name.partition(".")
         if name not in (CASE, NAME, TARGET) and not (kind in SECTIONS and key):
-            what = f"column '{name}' is not known"
-            raise InputError(what, where=f"{path}: line 1", allowed=ALLOWED_COLUMNS, code="unknown_column")
+            refuse(f"column '{name}' is not known", f"{path}: line 1", ALLOWED_COLUMNS, "unknown_column")
         if header.count(name) > 1:
-            what = f"column '{name}' stands twice"
-            raise InputError(what, where=f"{path}: line 1", allowed="each column once", code="duplicate_column")
+            refuse(f"column '{name}' stands twice", f"{path}: line 1", "each column once", "duplicate_column")
     return header
 
 
 def _case(cells: dict[str, str], path: Path, where: str) -> CohortCase:
     stated = cells[CASE]
     if not stated.strip() or any(unprintable_texts(cells)):
-        raise InputError("has no case that can be printed", where=where, allowed="the path of a case", code="bad_name")
+        refuse("has no case that can be printed", where, "the path of a case", "bad_name")
     return CohortCase(stated, path.parent / stated.strip(), cells.get(NAME, "").strip(), _options(cells, where))
 
 
@@ -272,7 +267,7 @@ def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
     axes = [axis for name, kind in AXES.items() if (axis := _axis(getattr(stated, name), name, kind, path))]
     count = len(found) * math.prod(len(axis) for axis in axes)
     if count > MOST_CASES:
-        raise InputError(f"makes {count} cases", where=path, allowed=f"at most {MOST_CASES}", code="cohort_size")
+        refuse(f"makes {count} cases", path, f"at most {MOST_CASES}", "cohort_size")
     combinations = [_combined(choices, path) for choices in product(*axes)]
     return [CohortCase(one, path.parent / one, name, options) for one in found for name, options in combinations]
 
@@ -283,8 +278,7 @@ def _matches(patterns: Sequence[str], path: Path) -> list[str]:
     for pattern in patterns:
         matches = sorted(glob.glob(pattern, root_dir=path.parent, recursive=True))  # noqa: PTH207  # absolute ones too
         if not matches:
-            what = f"cases '{pattern}' matches nothing"
-            raise InputError(what, where=path, allowed="patterns of existing cases", code="no_match")
+            refuse(f"cases '{pattern}' matches nothing", path, "patterns of existing cases", "no_match")
         found |= dict.fromkeys(matches)
     return list(found)
 

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.errors import InputError, one_line, refuse
 from puncture_twin.planning.base.files import is_folder, read_input
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.strict_json import or_null
@@ -91,8 +91,7 @@ def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
             known = fields.setdefault(one.name, one)
             if known.type != one.type:
                 what = f"column '{one.name}' is {known.type} in one case and {one.type} in another"
-                allowed = "results of one version: batch plan and run again"
-                raise InputError(what, where=where, allowed=allowed, code="tables_differ")
+                refuse(what, where, "results of one version: batch plan and run again", "tables_differ")
     return pa.schema(list(fields.values()))
 
 
@@ -279,7 +278,7 @@ def read_cases(place: Path) -> list[dict[str, Any]]:
         raise InputError(what, where=path, allowed=ALLOWED, code="not_parquet") from error
     missing = [name for name in (*NEEDED, *ENTRY) if name not in table.column_names]
     if missing:
-        raise InputError(f"has no column '{missing[0]}'", where=path, allowed=ALLOWED, code="missing_column")
+        refuse(f"has no column '{missing[0]}'", path, ALLOWED, "missing_column")
     rows: list[dict[str, Any]] = table.to_pylist()
     return rows
 

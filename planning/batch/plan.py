@@ -23,7 +23,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from puncture_twin.planning.base.errors import InputError, PlanningError, one_line
+from puncture_twin.planning.base.errors import InputError, PlanningError, one_line, refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
@@ -171,7 +171,7 @@ def read_plan_table(out: Path) -> Plan:
     """
     path = out / PLAN_NAME
     if not path.is_file():
-        raise InputError("has no plan", where=out, allowed=NO_PLAN, code="no_batch_plan")
+        refuse("has no plan", out, NO_PLAN, "no_batch_plan")
     found = read_output(path, max_bytes=MAX_PLAN_BYTES)
     try:
         table = pq.read_table(io.BytesIO(found.data))
@@ -260,8 +260,7 @@ def discard(out: Path, case_id: str, work: Path) -> None:
     """Remove a result that is not final or not whole, at once or not at all."""
     folder = out / case_id
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        what = f"{case_id} there is not a result of this cohort"
-        raise InputError(what, where=out, allowed="a folder of its own", code="folder_of_another")
+        refuse(f"{case_id} there is not a result of this cohort", out, "a folder of its own", "folder_of_another")
     if folder.is_dir():
         gone = new_draft(work, case_id)
         folder.rename(gone / "old")

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, Memory
-from puncture_twin.planning.base.errors import InputError, one_line, require_extra
+from puncture_twin.planning.base.errors import InputError, one_line, refuse, require_extra
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.processes import worker_count
 from puncture_twin.planning.base.progress import Count, Watcher
@@ -78,7 +78,7 @@ def parse_part(text: str) -> Part:
     """
     found = re.fullmatch(r"([0-9]{1,7})/([0-9]{1,7})", text)
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
-        raise InputError(f"'{text[:40]}' is no part", where="--part", allowed=ALLOWED_PARTS, code="bad_part")
+        refuse(f"'{text[:40]}' is no part", "--part", ALLOWED_PARTS, "bad_part")
     return Part(int(found[1]), int(found[2]))
 
 
@@ -92,14 +92,12 @@ def slurm_part(environment: Mapping[str, str]) -> Part | None:
         return None
     stated = {name: environment.get(name, "1" if name == STEP else "") for name in (TASK, COUNT, FIRST, STEP)}
     if not all(re.fullmatch(r"[0-9]{1,9}", value) for value in stated.values()):
-        what = f"{stated} are no numbers"
-        raise InputError(what, where="SLURM's array", allowed=f"--part {ALLOWED_PARTS}", code="bad_part")
+        refuse(f"{stated} are no numbers", "SLURM's array", f"--part {ALLOWED_PARTS}", "bad_part")
     task, count, first, step = (int(stated[name]) for name in (TASK, COUNT, FIRST, STEP))
     place, odd = divmod(task - first, max(step, 1))
     if odd or not 0 <= place < count:
         what = f"task {task} of an array of {count} from {first} in steps of {step}"
-        allowed = f"an array without gaps, or --part {ALLOWED_PARTS}"
-        raise InputError(what, where="SLURM's array", allowed=allowed, code="bad_part")
+        refuse(what, "SLURM's array", f"an array without gaps, or --part {ALLOWED_PARTS}", "bad_part")
     return Part(place + 1, count)
 
 
@@ -184,8 +182,7 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     plan = read_plan_table(out)
     if plan.version != version("puncture-twin"):
         what = f"the plan is of version {plan.version}, this is {version('puncture-twin')}"
-        allowed = "batch plan again: what is unchanged since is not lost"
-        raise InputError(what, where=out, allowed=allowed, code="unknown_version")
+        refuse(what, out, "batch plan again: what is unchanged since is not lost", "unknown_version")
     with running(out, request.part) as work:
         rows = request.part.of(plan.cases)
         cases = distinct(rows)
@@ -200,7 +197,7 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
             for done, end in enumerate(ends, start=1):
                 if end.full:
                     what = f"cannot be written ({end.full}); the cases that are done stay"
-                    raise InputError(what, where=out, allowed="a folder with enough free space", code="unwritable")
+                    refuse(what, out, "a folder with enough free space", "unwritable")
                 counts.add(end)
                 watcher.count("cases", done, len(tasks), counts.failed)
     return counts
@@ -427,7 +424,7 @@ def on_scheduler(address: str) -> RunTasks:
     def run(tasks: Sequence[CaseTask], limits: Limits) -> Generator[CaseEnd, None, None]:
         if limits != NO_LIMITS:
             what = "memory and time of a case are limited by Dask's workers"
-            raise InputError(what, where="--scheduler", allowed="dask worker --memory-limit alone", code="dask_limits")
+            refuse(what, "--scheduler", "dask worker --memory-limit alone", "dask_limits")
         try:
             library: Any = distributed
             client = library.Client(address, timeout=CONNECT_S, set_as_default=False)
@@ -449,9 +446,8 @@ def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Gene
             task = futures.pop(future)
             error = future.exception() if future.status == "error" else None
             if future.status not in ("error", "finished"):
-                what = f"the scheduler has lost a case ({future.status})"
                 allowed = "a scheduler that stays; what is done is kept"
-                raise InputError(what, where="--scheduler", allowed=allowed, code="scheduler_lost")
+                refuse(f"the scheduler has lost a case ({future.status})", "--scheduler", allowed, "scheduler_lost")
             if error is None:
                 yield future.result()
             elif isinstance(error, distributed.KilledWorker):

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.rigid import frame_of_axes
 from puncture_twin.planning.geometry.spaces import Space, to_lps
@@ -85,13 +85,11 @@ def entry_frame(frame: str | EntryAxes | None, space: Space, *, where: str | Pat
         return to_lps(np.eye(3), space).T
     axes = EntryAxes(z="anterior", x="head") if frame == "bed" else frame
     if not isinstance(axes, EntryAxes):
-        what = f"frame '{frame}' is not known"
-        raise InputError(what, where=where, allowed="ct, bed, or z and x axes", code="unknown_frame")
+        refuse(f"frame '{frame}' is not known", where, "ct, bed, or z and x axes", "unknown_frame")
     z, x = (_axis(axis, space) for axis in (axes.z, axes.x))
     lengths = np.linalg.norm(z), np.linalg.norm(x)
     if min(lengths) == 0 or abs(z @ x) > AXES_PARALLEL * lengths[0] * lengths[1]:
-        what = "search.frame: its axes are parallel or zero"
-        raise InputError(what, where=where, allowed="two axes", code="axes_parallel")
+        refuse("search.frame: its axes are parallel or zero", where, "two axes", "axes_parallel")
     return frame_of_axes(z, x)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import unfinished_warnings
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import CaseFile
@@ -217,8 +217,7 @@ class CaseVolumes:
             found = parse_segmentation(path, name, self._files.content, series)
         elif series is None:
             what = f"rtstruct '{name}' needs the CT on which it was drawn, as a DICOM series"
-            allowed = 'ct = "FOLDER" beside it, or as the CT of the case'
-            raise InputError(what, where=self._path, allowed=allowed, code="rtstruct_without_ct")
+            refuse(what, self._path, 'ct = "FOLDER" beside it, or as the CT of the case', "rtstruct_without_ct")
         else:
             found = parse_structure_set(path, name, self._files.content, series)
         self._add_masks(name, found)
@@ -286,8 +285,7 @@ def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tupl
     """
     for name in _line_files(files):
         for said in unfinished_warnings(files.content(name), name):
-            allowed = "files of which every line ends with a line break"
-            raise InputError(said, where=path, allowed=allowed, code="file_cut")
+            refuse(said, path, "files of which every line ends with a line break", "file_cut")
     if content.end is None:
         return (TOP_COUNT_NOTE,)
     return () if ends_with_end(files.content(path.name).decode("utf-8")) else (NOT_LAST_NOTE,)

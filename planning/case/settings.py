@@ -15,7 +15,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.case.entry import entry_frame
 from puncture_twin.planning.case.tables import (
     AIR_HU,
@@ -234,17 +234,15 @@ def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
     x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
     lengths = np.linalg.norm(x), np.linalg.norm(z)
     if min(lengths) == 0 or abs(x @ z) > AXES_PARALLEL * lengths[0] * lengths[1]:
-        what = "robot.mount: x_axis and z_axis are parallel or zero"
-        raise InputError(what, where=path, allowed="two axes", code="axes_parallel")
+        refuse("robot.mount: x_axis and z_axis are parallel or zero", path, "two axes", "axes_parallel")
     angle = float(np.degrees(np.arccos(x @ z / (lengths[0] * lengths[1]))))
     if abs(angle - 90.0) > AXES_SQUARE_DEG:
-        what = f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart"
         allowed = f"a right angle, to {AXES_SQUARE_DEG:g} degree"
-        raise InputError(what, where=path, allowed=allowed, code="axes_not_square")
+        refuse(f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart", path, allowed, "axes_not_square")
     far = float(np.linalg.norm(mount.position_mm))
     if 0.0 < far < LIKE_METRES:
         what = f"robot.mount: position_mm is {far:g} mm from the origin, which would be a base within the patient"
-        raise InputError(what, where=path, allowed="millimetres (these look like metres)", code="wrong_unit")
+        refuse(what, path, "millimetres (these look like metres)", "wrong_unit")
     T_ct_base = pose(frame_of_axes(z, x), to_lps(np.asarray([mount.position_mm]), space)[0])
     T_base_ct = np.asarray(np.linalg.inv(T_ct_base), np.float64)
     T_base_ct.setflags(write=False)

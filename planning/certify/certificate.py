@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
@@ -202,14 +202,13 @@ def leaves_of(cap: Cells, tree: tuple[str, ...], where: str | Path = "certificat
         letters = np.array(list(level), dtype="U1")
         if len(letters) != len(cells) or not np.isin(letters, list("tbqSRU")).all():
             what = f"level {depth} of the tree has {len(letters)} cells or an unknown letter"
-            raise InputError(what, where=where, allowed=f"{len(cells)} of t, b, q, S, R, U", code="certificate_damaged")
+            refuse(what, where, f"{len(cells)} of t, b, q, S, R, U", "certificate_damaged")
         inner = np.isin(letters, list("tbq"))
         theta.append(cells.theta[~inner])
         beta.append(cells.beta[~inner])
         cells = split(cells.take(inner), letters[inner]).cells
     if len(cells):
-        what = f"the tree ends with {len(cells)} cells missing"
-        raise InputError(what, where=where, allowed="a whole tree", code="certificate_damaged")
+        refuse(f"the tree ends with {len(cells)} cells missing", where, "a whole tree", "certificate_damaged")
     return Cells(np.concatenate(theta), np.concatenate(beta))
 
 
@@ -276,12 +275,12 @@ def parse_certificate(data: bytes, path: Path) -> Certificate:
     with fitting(path, CERTIFICATE_ALLOWED):
         certificate = _certificate(document, path)
     for name in sorted(set(document) - NAMES):
-        raise InputError(f"key '{name}' is not known", where=path, allowed=", ".join(sorted(NAMES)), code="unknown_key")
+        refuse(f"key '{name}' is not known", path, ", ".join(sorted(NAMES)), "unknown_key")
     stated, counted = document.get("summary"), json.loads(json.dumps(certificate.summary()))
     if stated != counted:
         wrong = [key for key in counted if not isinstance(stated, dict) or stated.get(key) != counted[key]]
         what = f"its summary does not follow from its cells ({', '.join(wrong) or 'other keys'})"
-        raise InputError(what, where=path, allowed="an unchanged certificate", code="certificate_damaged")
+        refuse(what, path, "an unchanged certificate", "certificate_damaged")
     return certificate
 
 
@@ -291,8 +290,7 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     leaves = leaves_of(question.cap(), tree, path)
     rows = document["witness"]
     if len(rows) != len(leaves):
-        what = f"{len(rows)} witnesses for {len(leaves)} cells"
-        raise InputError(what, where=path, allowed="one for each", code="certificate_damaged")
+        refuse(f"{len(rows)} witnesses for {len(leaves)} cells", path, "one for each", "certificate_damaged")
     reasons, structures, triangles, bounds = zip(*rows, strict=True)
     return Certificate(
         question=question,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, NO_MEMORY, Cache, Memory
 from puncture_twin.planning.base.cache.entry_file import Arrays
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.processes import on_threads
 from puncture_twin.planning.base.progress import Count
@@ -160,8 +160,7 @@ class FastEngine:
 def _refuse_unsound(target: Floats, outward: Floats, lengths: Floats) -> None:
     sound = np.isfinite(target).all() and np.isfinite(outward).all()
     if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
-        what = "a needle axis is not finite"
-        raise InputError(what, where="clearance", allowed="finite mm, unit directions", code="not_finite")
+        refuse("a needle axis is not finite", "clearance", "finite mm, unit directions", "not_finite")
 
 
 def _packed(meshes: Sequence[TriangleMesh], threads: int, cache: Cache) -> tuple[Blocks, ...]:

@@ -14,7 +14,7 @@ from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.arm.tool import Box, Tool, gantry_boxes
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory, user_cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Gantry, Obstacle
 from puncture_twin.planning.collision.fast_checker import FastChecker
@@ -99,7 +99,7 @@ def home_configuration(case: Case) -> Floats:
     home = np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0]) if case.robot.home is None else case.robot.home
     if not case.robot.model.within_limits(home):
         what = f"robot.home_deg: home ({', '.join(f'{angle:g}' for angle in np.degrees(home))}) is beyond the limits"
-        raise InputError(what, where=case.path, allowed="home_deg within the arm's limits", code="home_beyond_limits")
+        refuse(what, case.path, "home_deg within the arm's limits", "home_beyond_limits")
     return home
 
 
@@ -189,8 +189,7 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
     deep = 0.0 if case.gantry is None else gantry_in_patient_mm(case.gantry, skin)
     if deep > 0.0:
         what = f"the gantry's wall stands {np.ceil(10 * deep) / 10:g} mm in the patient"
-        allowed = "a bore about the body: see center_mm, tilt_deg"
-        raise InputError(what, where=f"{case.path}: gantry", allowed=allowed, code="gantry_in_patient")
+        refuse(what, f"{case.path}: gantry", "a bore about the body: see center_mm, tilt_deg", "gantry_in_patient")
 
 
 def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) -> Anatomy:
@@ -205,7 +204,7 @@ def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) ->
     for solid in solids:
         if solid.name in taken:
             what = f"obstacle '{solid.name}' has the name of a structure"
-            raise InputError(what, where=case.path, allowed="a name of its own", code="duplicate_name")
+            refuse(what, case.path, "a name of its own", "duplicate_name")
     nowhere = [obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"] if T_base_ct is None else []
     warnings = (*anatomy.warnings, *([NOWHERE.format(names=", ".join(nowhere))] if nowhere else []))
     return replace(anatomy, surroundings=anatomy.surroundings + solids, warnings=warnings)

@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, StringConstraints, ValidationError, model_validator
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import parse_toml, read_toml_bytes
 from puncture_twin.planning.case.toml_types import (
@@ -148,9 +148,8 @@ def _parse(data: bytes, path: Path) -> ChecksFile:
     for kind, tables in content.tables().items():
         for at, table in enumerate(tables):
             if (table.case or content.case) is None:
-                where = _where(data, path, (kind, at))
                 allowed = "case = FILE, for the file or for the table"
-                raise InputError("no case", where=where, allowed=allowed, code="missing_case")
+                refuse("no case", _where(data, path, (kind, at)), allowed, "missing_case")
     return content
 
 

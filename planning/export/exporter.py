@@ -15,7 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.collision.state_checker import StateChecker
@@ -134,7 +134,7 @@ def read_csv(text: str, *, where: Path) -> SampledMotion:
     """
     rows = list(csv.reader(io.StringIO("\n".join(line for line in text.splitlines() if not line.startswith("#")))))
     if not rows or tuple(rows[0]) != COLUMNS:
-        raise InputError("the table's header is another", where=where, allowed=",".join(COLUMNS), code="wrong_columns")
+        refuse("the table's header is another", where, ",".join(COLUMNS), "wrong_columns")
     phases: dict[str, list[list[float]]] = {phase: [] for phase in SampledMotion._fields}
     for number, row in enumerate(rows[1:], start=2):
         try:
@@ -144,8 +144,7 @@ def read_csv(text: str, *, where: Path) -> SampledMotion:
             what = f"row {number} of the table: {error}"
             raise InputError(what, where=where, allowed=allowed, code="not_a_number") from error
         if len(row) != len(COLUMNS):
-            what = f"row {number} has {len(row)} cells"
-            raise InputError(what, where=where, allowed=f"{len(COLUMNS)} cells", code="ragged_row")
+            refuse(f"row {number} has {len(row)} cells", where, f"{len(COLUMNS)} cells", "ragged_row")
     tables = [np.array(table).reshape(-1, 7) for table in phases.values()]
     return SampledMotion(*(Trajectory(table[:, 0], table[:, 1:]) for table in tables))
 
@@ -196,7 +195,7 @@ def export_plan(
     path = folder / export_name(source, format_name)
     check_geometry(plan, source)
     if len(plan.insertion.q) < 2:
-        raise InputError("the insertion is a single state", where=source, allowed="a motion", code="no_motion")
+        refuse("the insertion is a single state", source, "a motion", "no_motion")
     checked = FORMATS[format_name][1](plan, source, checker)
     with atomic(path) as temporary:
         temporary.write_bytes(checked.text.encode("ascii"))
@@ -210,7 +209,7 @@ def export_name(source: Path, format_name: str) -> str:
         InputError: Another format.
     """
     if format_name not in FORMATS:
-        raise InputError(f"format '{format_name}'", where="export", allowed=", ".join(FORMATS), code="unknown_format")
+        refuse(f"format '{format_name}'", "export", ", ".join(FORMATS), "unknown_format")
     return f"{source.stem}{FORMATS[format_name][0]}"
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import flange_pose, tip_rates
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.export.program import (
     ANGLE_TOLERANCE_RAD,
     Program,
@@ -64,7 +64,7 @@ def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None,
         and np.allclose(_rates(program), _rates(wanted), rtol=SAME_RATE, atol=0.0)
     ):
         what = "a speed, an acceleration or a radius does not read back"
-        raise InputError(what, where=where, allowed="the plan's, above 1e-6", code="not_read_back")
+        refuse(what, where, "the plan's, above 1e-6", "not_read_back")
     _check_approach(program, plan, model, where)
     _check_insertion(program, plan, model, where)
 
@@ -91,8 +91,7 @@ def _check_approach(program: Program, plan: Plan, model: UrModel, where: Path) -
         check_rates(model, *rates, what="approach", where=where)
         _check_tip(model, start, end, fraction * move.speed * np.sign(end - start), plan, where)
     if program.moves and program.moves[-1].blend_mm != 0.0:
-        what = "the approach does not stop at its end"
-        raise InputError(what, where=where, allowed="a last blend of 0", code="not_read_back")
+        refuse("the approach does not stop at its end", where, "a last blend of 0", "not_read_back")
 
 
 def _check_tip(model: UrModel, start: Floats, end: Floats, speeds: Floats, plan: Plan, where: Path) -> None:
@@ -101,9 +100,8 @@ def _check_tip(model: UrModel, start: Floats, end: Floats, speeds: Floats, plan:
     q = start + np.linspace(0.0, 1.0, steps + 1)[:, None] * (end - start)
     fastest = float(tip_rates(model, q, speeds, plan.needle_length_mm).max())
     if not fastest <= plan.speeds.tip_speed_mm_s * (1.0 + SPEED_ROUNDING):
-        allowed = f"at most {plan.speeds.tip_speed_mm_s:g} mm/s"
         what = f"a joint move takes the tip to {fastest:.4g} mm/s"
-        raise InputError(what, where=where, allowed=allowed, code="tip_too_fast")
+        refuse(what, where, f"at most {plan.speeds.tip_speed_mm_s:g} mm/s", "tip_too_fast")
 
 
 def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) -> None:
@@ -114,25 +112,20 @@ def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) 
     ):
         off, angle = _pose_difference(read, planned)
         if not (off <= POSE_TOLERANCE_MM and angle <= TURN_TOLERANCE_RAD):
-            what = f"the {name} pose is {off:.3g} mm off"
-            raise InputError(what, where=where, allowed=f"{POSE_TOLERANCE_MM} mm", code="not_read_back")
+            refuse(f"the {name} pose is {off:.3g} mm off", where, f"{POSE_TOLERANCE_MM} mm", "not_read_back")
     if not program.insertion_mm_s <= plan.speeds.insertion_speed_mm_s * (1.0 + SPEED_ROUNDING):
-        allowed = f"at most {plan.speeds.insertion_speed_mm_s:g} mm/s"
         what = f"the insertion at {program.insertion_mm_s:.4g} mm/s"
-        raise InputError(what, where=where, allowed=allowed, code="tip_too_fast")
+        refuse(what, where, f"at most {plan.speeds.insertion_speed_mm_s:g} mm/s", "tip_too_fast")
     angle = _pose_difference(program.T_base_standoff, program.T_base_target)[1]
     if not angle <= TURN_TOLERANCE_RAD:
-        what = f"the needle turns by {angle:.3g} rad on its way"
-        raise InputError(what, where=where, allowed="a straight way", code="not_straight")
+        refuse(f"the needle turns by {angle:.3g} rad on its way", where, "a straight way", "not_straight")
     moved = straight_move(model, program)
     ends = np.abs(moved.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
     if not ends <= SAME_BRANCH_RAD:
-        what = f"the straight move ends {ends:.3g} rad off"
-        raise InputError(what, where=where, allowed="the plan's own branch", code="not_read_back")
+        refuse(f"the straight move ends {ends:.3g} rad off", where, "the plan's own branch", "not_read_back")
     worst = _farthest_mm(flange_pose(model, moved.q)[:, :3, 3], flange_pose(model, plan.insertion.q)[:, :3, 3])
     if not worst <= STRAIGHT_TOLERANCE_MM:
-        what = f"the straight move is {worst:.3g} mm off the plan's way"
-        raise InputError(what, where=where, allowed="the plan", code="not_straight")
+        refuse(f"the straight move is {worst:.3g} mm off the plan's way", where, "the plan", "not_straight")
     check_trajectory(model, moved, time_resolution_s=0.0, what="insertion", where=where)
 
 
@@ -153,5 +146,4 @@ def _pose_difference(T_a: Floats, T_b: Floats) -> tuple[float, float]:
 
 def _check_same(read: Floats, planned: Floats, what: str, where: Path) -> None:
     if read.shape != planned.shape or not np.abs(read - planned).max() <= ANGLE_TOLERANCE_RAD:
-        allowed = "the plan's angles"
-        raise InputError(f"{what} does not read back as the plan's", where=where, allowed=allowed, code="not_read_back")
+        refuse(f"{what} does not read back as the plan's", where, "the plan's angles", "not_read_back")

@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import check_name
 
 MAX_COORDINATE_MM = 100_000.0
@@ -88,11 +87,6 @@ def guard_points(points: ArrayLike, names: Sequence[str], *, where: str | Path) 
         refuse(message, where, f"coordinates within {MAX_COORDINATE_MM:g} mm", "too_far")
     array.setflags(write=False)
     return array
-
-
-def refuse(what: str, where: str | Path, allowed: str, code: str) -> NoReturn:
-    """Raise an `InputError`."""
-    raise InputError(what, where=where, allowed=allowed, code=code)
 
 
 def _float_array(values: ArrayLike, *, what: str, where: str | Path, allowed: str) -> NDArray[np.float64]:

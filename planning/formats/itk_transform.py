@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, require_extra
+from puncture_twin.planning.base.errors import InputError, refuse, require_extra
 from puncture_twin.planning.base.files import decode_text
-from puncture_twin.planning.formats.guard import guard_transform, refuse
+from puncture_twin.planning.formats.guard import guard_transform
 from puncture_twin.planning.geometry.rigid import pose
 
 TEXT_ENDINGS, HDF5_ENDINGS = (".tfm", ".txt"), (".h5", ".hdf5")
@@ -58,8 +58,7 @@ def parse_transform(data: bytes, path: Path) -> Floats:
     elif name.lower().endswith(TEXT_ENDINGS):
         stated = _text_transforms(data, name)
     else:
-        what = f"transform file of the kind {path.suffix!r}"
-        raise InputError(what, where=path, allowed=ALLOWED, code="unknown_format")
+        refuse(f"transform file of the kind {path.suffix!r}", path, ALLOWED, "unknown_format")
     return guard_transform(linear_motion(stated, name), where=path)
 
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, points_array, refuse
+from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, points_array
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 MIN_DIAGONAL_MM = 0.5

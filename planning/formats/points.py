@@ -28,11 +28,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import decode_text, read_input
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.base.text import brief
-from puncture_twin.planning.formats.guard import guard_points, refuse
+from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit, to_lps
 
 
@@ -117,11 +117,10 @@ def parse_points(
     raw = _reader(path, name)(data, name)
     unit = raw.unit or default_unit
     if unit is None:
-        what = "no unit of length"
-        raise InputError(what, where=name, allowed="x_mm,y_mm,z_mm in the header", code="unit_not_stated")
+        refuse("no unit of length", name, "x_mm,y_mm,z_mm in the header", "unit_not_stated")
     if raw.space is not None and default_space is Space.LOCAL:
         message = f"points in {raw.space}, but the case has a local frame"
-        raise InputError(message, where=name, allowed="points in the case's own space, as CSV", code="local_space")
+        refuse(message, name, "points in the case's own space, as CSV", "local_space")
     space = raw.space or default_space
     points = np.array(raw.points, dtype=np.float64).reshape(-1, 3)
     with np.errstate(over="ignore"):  # beyond the range of floats is infinite, which the guard refuses
@@ -136,8 +135,7 @@ def parse_points(
 def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
     reader = next((read for suffix, read in _READERS.items() if path.name.lower().endswith(suffix)), None)
     if reader is None:
-        what = f"unknown point file {path.name!r}"
-        raise InputError(what, where=where, allowed=", ".join(_READERS), code="unknown_format")
+        refuse(f"unknown point file {path.name!r}", where, ", ".join(_READERS), "unknown_format")
     return reader
 
 
@@ -200,13 +198,13 @@ def parse_coordinate(text: str, where: str) -> float:
     """
     allowed = "a finite number with a decimal point"
     if "_" in text:  # Python would read 1_0 as 10
-        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed, code="not_a_number")
+        refuse(f"{text[:40]!r} is not a number", where, allowed, "not_a_number")
     try:
         number = float(text)
     except ValueError as error:
         raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed, code="not_a_number") from error
     if not math.isfinite(number):
-        raise InputError(f"{text[:40]!r} is not finite", where=where, allowed=allowed, code="not_finite")
+        refuse(f"{text[:40]!r} is not finite", where, allowed, "not_finite")
     return number
 
 
@@ -485,7 +483,7 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
     given = np.asarray(values)
     if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != 6 or not np.isfinite(given).all():
         what = f"joint angles {str(np.array(values, dtype=object).tolist())[:80]}"
-        raise InputError(what, where=where, allowed="six finite angles", code="joints")
+        refuse(what, where, "six finite angles", "joints")
     q = np.array(np.radians(given) if unit == "deg" else given, dtype=np.float64)
     beyond = np.abs(q) > MOST_RAD
     if beyond.any():
@@ -497,10 +495,10 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
         guess = ": degrees?" if likely else ""
         what = f"joint {joint + 1} of {name} at {given[row, joint]:g} {unit}, beyond what it can read{guess}"
         limits = "363 degrees (6.34 rad) to either side, wrist 3 two turns"
-        raise InputError(what, where=where, allowed=limits, code="joints_beyond")
+        refuse(what, where, limits, "joints_beyond")
     if unit == "deg" and plainly_radians(given):
         what = f"every joint within {np.abs(given).max():.3g} degrees of zero: radians?"
-        raise InputError(what, where=where, allowed="degrees, as the names of the columns say", code="joints_unit")
+        refuse(what, where, "degrees, as the names of the columns say", "joints_unit")
     return q
 
 
@@ -520,7 +518,7 @@ def check_times(time_s: Floats, *, where: str | Path) -> None:
     if len(back):
         row = int(back[0])
         what = f"row {row + 2}: the time runs backwards, from {time_s[row]:g} to {time_s[row + 1]:g} s"
-        raise InputError(what, where=where, allowed="rows in the order of their times", code="times_not_rising")
+        refuse(what, where, "rows in the order of their times", "times_not_rising")
 
 
 def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecording:
@@ -546,9 +544,9 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     joints, unit = _joint_columns(header, path)
     time = next((name for name in TIMES if name in header), None)
     if timed and time is None:
-        raise InputError(f"lacks {' or '.join(TIMES)}", where=path, allowed=_ALLOWED_JOINTS, code="missing_column")
+        refuse(f"lacks {' or '.join(TIMES)}", path, _ALLOWED_JOINTS, "missing_column")
     if len(rows) < 2:
-        raise InputError("holds no row", where=path, allowed=_ALLOWED_JOINTS, code="empty")
+        refuse("holds no row", path, _ALLOWED_JOINTS, "empty")
     tool = RTDE_TOOL if set(RTDE_TOOL) <= set(header) else ()
     wanted = [*joints, *([time] if time else []), *tool]
     table = np.array([row_numbers(row, header, wanted, f"{path}: row {i}") for i, row in enumerate(rows[1:], start=1)])
@@ -572,7 +570,7 @@ def _joint_columns(header: Sequence[str], path: Path) -> tuple[tuple[str, ...], 
     missing = [name for name in columns if name not in header]
     if missing:
         what = "no joints" if len(missing) == len(columns) else f"lacks {', '.join(missing)}"
-        raise InputError(what, where=path, allowed=_ALLOWED_JOINTS, code="missing_column")
+        refuse(what, path, _ALLOWED_JOINTS, "missing_column")
     return columns, unit
 
 
@@ -583,6 +581,5 @@ def row_numbers(row: Sequence[str], header: Sequence[str], wanted: Sequence[str]
         InputError: More or fewer fields than the header has, or one that is no finite number.
     """
     if len(row) != len(header):
-        what = f"{len(row)} fields"
-        raise InputError(what, where=where, allowed=f"{len(header)} fields, as in the header", code="ragged_row")
+        refuse(f"{len(row)} fields", where, f"{len(header)} fields, as in the header", "ragged_row")
     return [parse_coordinate(row[header.index(name)].strip(), f"{where}, {name}") for name in wanted]

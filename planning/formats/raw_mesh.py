@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.formats.guard import refuse
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
 from puncture_twin.planning.geometry.spaces import Space
 

@@ -10,7 +10,7 @@ import scipy
 
 from puncture_twin.planning.anatomy.default_roles import BODY, NOT_ANNOTATED, DefaultRole, default_role, never_crossed
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.evidence.target import Likely, likely_target
 from puncture_twin.planning.formats.points import parse_coordinate
@@ -56,7 +56,7 @@ def parse_point(text: str, space: Space) -> Floats:
     """
     numbers = [parse_coordinate(part.strip(), "--target") for part in text.split(",")]
     if len(numbers) != 3:
-        raise InputError(f"{len(numbers)} numbers", where="--target", allowed="X,Y,Z in mm", code="wrong_count")
+        refuse(f"{len(numbers)} numbers", "--target", "X,Y,Z in mm", "wrong_count")
     return np.asarray(to_lps(np.array([numbers]), space)[0])
 
 
@@ -98,20 +98,19 @@ def _refuse_likelier(point_ct: Floats, outlines: Outlines, space: Space, names: 
     if other := _other_reading(point_ct, outlines, space, names):
         place = f"in '{chosen_target(names)}'" if names else "in no structure"
         what = f"target ({point_text(point_ct, space)}) lies {place}{other}"
-        allowed = "--space LPS or --space RAS, whichever is meant"
-        raise InputError(what, where="--target", allowed=allowed, code="target_in_other_space")
+        refuse(what, "--target", "--space LPS or --space RAS, whichever is meant", "target_in_other_space")
 
 
 def _refuse_lesion_elsewhere(point_ct: Floats, outlines: Outlines, space: Space) -> None:
     """A point in no structure is a slip, whatever space was stated, where the other space puts it into a lesion."""
     holders = _other_holders(point_ct, outlines)
     if space is not Space.LOCAL and likely_target(holders) is Likely.LESION:
-        raise InputError(
+        refuse(
             f"target ({point_text(point_ct, space)}) lies in no structure"
             f"{_other_reading(point_ct, outlines, space, ())}",
-            where="--target",
-            allowed="the other --space; or --hit-radius MM, where a target in no structure is meant",
-            code="target_in_no_structure",
+            "--target",
+            "the other --space; or --hit-radius MM, where a target in no structure is meant",
+            "target_in_no_structure",
         )
 
 
@@ -127,7 +126,7 @@ def _refuse_in_danger(point_ct: Floats, chosen: str, space: Space, other: str) -
     if line is not None:
         what = f"target ({point_text(point_ct, space)}) lies in '{chosen}'{other}: {_danger(line)}"
         allowed = f"a point outside of it, or --target-label '{chosen}' where it is itself the target"
-        raise InputError(what, where="--target", allowed=allowed, code="target_in_danger")
+        refuse(what, "--target", allowed, "target_in_danger")
 
 
 def _danger(line: DefaultRole) -> str:
@@ -144,8 +143,7 @@ def label_target(name: str, outlines: Outlines, space: Space) -> Target:
     known = {one: (seg, label) for seg in segmentations for label, one in seg.names.items()}
     if name not in known:
         what = f"no structure is named '{name}'{did_you_mean(name, known)}"
-        allowed = ", ".join(sorted(known)) or "none is there"
-        raise InputError(what, where="--target-label", allowed=allowed, code="unknown_structure")
+        refuse(what, "--target-label", ", ".join(sorted(known)) or "none is there", "unknown_structure")
     segmentation, label = known[name]
     point, parts = deepest_point(segmentation.surface(label))
     notes = [f"the target is the deepest point of '{name}': {point_text(point, space)}"]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker, halving_order
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
@@ -204,8 +204,7 @@ def _within_limits(checker: StateChecker, q: Floats, name: str) -> Floats:
     rows = np.atleast_2d(np.asarray(q, dtype=np.float64))
     if rows.ndim != 2 or rows.shape[1] != 6 or not checker.model.within_limits(rows).all() or len(rows) == 0:
         limits = np.round(np.degrees(checker.model.joint_limits[:, 1])).astype(int).tolist()
-        what = f"{name} = {rows.round(4).tolist()}"
-        raise InputError(what, where="approach", allowed=f"six angles, +-{limits} deg", code="joint_beyond_limits")
+        refuse(f"{name} = {rows.round(4).tolist()}", "approach", f"six angles, +-{limits} deg", "joint_beyond_limits")
     return rows
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.case.tables import MountBounds, MountName, MountSection
@@ -130,7 +130,7 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
     mounts = settings.mounts or ("floor", "rail", "ceiling", "side")
     if table is None and settings.mounts is not None and "rail" in mounts:
         what = f"place.mounts has a rail, and no obstacle '{settings.table}' of frame ct is the table"
-        raise InputError(what, where=case.path, allowed="an [[obstacle]] of that name, or place.table", code="no_table")
+        refuse(what, case.path, "an [[obstacle]] of that name, or place.table", "no_table")
     reach = default_reach_mm(model, case.needle.length_mm)
     found: list[Region] = []
     for mount in mounts:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import HIGHEST, SpeedLimits
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import inputs_document, read_inputs
@@ -137,13 +137,11 @@ def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
     )
     for name, said, known in stated:
         if not _same_rates(said, known):
-            what = f"the {name} are not those of its numbers"
-            raise InputError(what, where=path, allowed="plan again", code="plan_contradicted")
+            refuse(f"the {name} are not those of its numbers", path, "plan again", "plan_contradicted")
     for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
         even = SAMPLE_S * np.arange(len(part.times_s))
         if not np.allclose(part.times_s, even, rtol=0, atol=SAME_TIME_S):
-            what = f"the times of the {phase} are not even"
-            raise InputError(what, where=path, allowed=f"a row every {SAMPLE_S} s", code="times_uneven")
+            refuse(f"the times of the {phase} are not even", path, f"a row every {SAMPLE_S} s", "times_uneven")
 
 
 def _same_rates(said: Any, known: dict[str, list[float]]) -> bool:
@@ -168,7 +166,7 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         optional = set(known) if part is document["clearance_mm"] else {"arm"}
         for name in sorted(set(part) ^ set(known) - (optional - set(part))):
             what = "is not known" if name in part else "is missing"
-            raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known), code="unknown_key")
+            refuse(f"key '{where}{name}' {what}", path, ", ".join(known), "unknown_key")
 
 
 def _rates_document(rates: Peaks) -> dict[str, list[float]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import slowed
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.motion.approach import plan_approach
@@ -51,9 +51,8 @@ def make_plan(context: CaseContext, candidates: Candidates, *, seed: int, rows: 
         NoAnswerError: No candidate is safe, or none of the best can be come to.
     """
     if context.reach is None:
-        what = "the case does not say where the robot stands"
         allowed = "[registration] with markers, or [robot.mount]"
-        raise InputError(what, where=context.case.path, allowed=allowed, code="no_base")
+        refuse("the case does not say where the robot stands", context.case.path, allowed, "no_base")
     last = "no candidate is safe"
     for row in (candidates.ranked if rows is None else rows)[:MAX_TRIES]:
         try:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.formats.points import NamedPoints
 
@@ -68,12 +68,10 @@ def match(
         missing = sorted(wanted - set(points.names))
         if missing:
             near = "".join(did_you_mean(name, set(points.names) - set(other.names)) for name in missing[:1])
-            what = f"{', '.join(missing)} missing on the {side} side{near}"
             allowed = "the same names on both sides, or registration.use = [names]"
-            raise InputError(what, where=where, allowed=allowed, code="markers_missing")
+            refuse(f"{', '.join(missing)} missing on the {side} side{near}", where, allowed, "markers_missing")
     if len(set(names)) < len(names):
-        what = f"names repeat: {', '.join(names)}"
-        raise InputError(what, where=where, allowed="unique names", code="duplicate_name")
+        refuse(f"names repeat: {', '.join(names)}", where, "unique names", "duplicate_name")
     rows_ct = [markers_ct.names.index(name) for name in names]
     rows_base = [markers_base.names.index(name) for name in names]
     joints = None if markers_base.joints is None else markers_base.joints[rows_base]
@@ -87,30 +85,29 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
         InputError: Fewer than three, not finite, on a line, of two sizes, or all at one place.
     """
     if len(markers) < MIN_MARKERS:
-        what = f"{len(markers)} markers"
-        raise InputError(what, where=where, allowed="3 or more, by the same names", code="too_few_markers")
+        refuse(f"{len(markers)} markers", where, "3 or more, by the same names", "too_few_markers")
     both = np.concatenate([markers.points_ct, markers.points_base])
     if not np.isfinite(both).all():
         bad = [n for n, a, b in zip(markers.names, markers.points_ct, markers.points_base, strict=True)
                if not np.isfinite([a, b]).all()]  # fmt: skip
-        raise InputError(f"marker {', '.join(bad)} is not finite", where=where, allowed="finite mm", code="not_finite")
+        refuse(f"marker {', '.join(bad)} is not finite", where, "finite mm", "not_finite")
     spreads = [_singular_values(points) for points in (markers.points_ct, markers.points_base)]
     for side, values in zip(("CT", "base"), spreads, strict=True):
         if values[0] == 0 or values[1] / values[0] < COLLINEAR:
             what = f"markers {', '.join(markers.names)} are collinear on the {side} side"
-            raise InputError(what, where=where, allowed="three markers that span a triangle", code="markers_collinear")
+            refuse(what, where, "three markers that span a triangle", "markers_collinear")
     ratio = float(np.linalg.norm(spreads[1]) / np.linalg.norm(spreads[0]))
     if not 1 / UNIT_SLIP < ratio < UNIT_SLIP:
         what = f"base markers spread {ratio:.3g} times as wide as the CT's: a likely mm/cm/m slip"
-        raise InputError(what, where=where, allowed="both sides in mm", code="wrong_unit")
+        refuse(what, where, "both sides in mm", "wrong_unit")
     span = max(_span(markers.points_ct), _span(markers.points_base))
     if span < LEAST_SPAN_MM:
-        raise InputError(
+        refuse(
             f"markers {', '.join(markers.names)} span {span:.2g} mm, no more than a needle tells apart: a likely slip "
             "of unit (m or cm as mm) on both sides",
-            where=where,
-            allowed=f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least",
-            code="wrong_unit",
+            where,
+            f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least",
+            "wrong_unit",
         )
 
 

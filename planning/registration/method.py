@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import (
     ReadingNoise,
@@ -81,12 +81,12 @@ def _fit_by(method: Method, noise: ReadingNoise | None) -> Fit:
 def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path) -> None:
     if method == "affine":
         allowed = "triad, rigid or weighted; affine only reproduces the paper's Table 6"
-        raise InputError("method 'affine' bends the patient", where=where, allowed=allowed, code="method_bends")
+        refuse("method 'affine' bends the patient", where, allowed, "method_bends")
     if method not in get_args(Method):
-        raise InputError(f"method {method!r}", where=where, allowed=", ".join(get_args(Method)), code="unknown_method")
+        refuse(f"method {method!r}", where, ", ".join(get_args(Method)), "unknown_method")
     if method in WEIGHING and noise is None:
         what = f"method '{method}' weighs by declared errors"
-        raise InputError(what, where=where, allowed="[errors], or method rigid", code="method_without_errors")
+        refuse(what, where, "[errors], or method rigid", "method_without_errors")
 
 
 def _check_noise(
@@ -97,13 +97,11 @@ def _check_noise(
     covariance = noise.covariance(R)
     values = np.linalg.eigvalsh(covariance.independent if method in WEIGHING else covariance.whole)
     if not values[0] > SINGULAR * values[-1]:
-        message = "the declared errors leave readings of the markers without any"
         allowed = "ct_in_plane_mm, ct_slice_mm or touch_mm above 0"
-        raise InputError(message, where=where, allowed=allowed, code="no_marker_noise")
+        refuse("the declared errors leave readings of the markers without any", where, allowed, "no_marker_noise")
     if found_in_mm is not None and found_in_mm < LEAST_FOUND_MM:
         message = f"marker_noise = 'found', but the residuals ({found_in_mm:.2g} mm) hold none"
-        allowed = "markers measured on both sides, or marker_noise = 'declared'"
-        raise InputError(message, where=where, allowed=allowed, code="no_marker_noise")
+        refuse(message, where, "markers measured on both sides, or marker_noise = 'declared'", "no_marker_noise")
 
 
 MAX_RESIDUAL_MM = 15.0
@@ -132,22 +130,22 @@ def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, 
     mirrored = _least_squares(markers.points_ct, markers.points_base, mirrored=True)
     best = _rms(apply(mirrored, markers.points_ct) - markers.points_base)
     if _rms(residuals) > MIRROR_GAIN * best + 1.0:
-        raise InputError(
+        refuse(
             f"markers {', '.join(markers.names)} match only mirrored (rms {best:.2f} mm against "
             f"{_rms(residuals):.2f} mm){better_names(markers, target_ct, _rms(residuals))}",
-            where=where,
-            allowed="both sides right-handed: check LPS/RAS and the marker names",
-            code="markers_mirrored",
+            where,
+            "both sides right-handed: check LPS/RAS and the marker names",
+            "markers_mirrored",
         )
     lengths = np.linalg.norm(residuals, axis=1)
     worst = int(np.argmax(lengths))
     if lengths[worst] > MAX_RESIDUAL_MM:
-        raise InputError(
+        refuse(
             f"marker {markers.names[worst]} misses by {lengths[worst]:.1f} mm: swapped, moved or mistyped"
             f"{better_names(markers, target_ct, _rms(residuals))}",
-            where=where,
-            allowed=f"residuals up to {MAX_RESIDUAL_MM:g} mm",
-            code="marker_misses",
+            where,
+            f"residuals up to {MAX_RESIDUAL_MM:g} mm",
+            "marker_misses",
         )
 
 

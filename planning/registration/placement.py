@@ -30,7 +30,7 @@ from puncture_twin.planning.arm.inverse_kinematics import branch_of
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.case.tables import MarkerSection
@@ -116,8 +116,7 @@ def corrected(case: Case, registration: Registration, *, where: str | Path) -> R
     """
     if registration.markers.joints is None:
         message = "correct = true, but the touches do not say how the arm stood: they tell nothing of its errors"
-        allowed = "q1_deg to q6_deg in markers_base; or correct = false"
-        raise InputError(message, where=where, allowed=allowed, code="no_touch_joints")
+        refuse(message, where, "q1_deg to q6_deg in markers_base; or correct = false", "no_touch_joints")
     model, tip = case.robot.model, case.needle.length_mm
     q = _aimed_insertion(case, registration.T_base_ct, where)
     return aimed(registration, aim_at(model, tip, case.target_ct, q))
@@ -130,16 +129,14 @@ def _aimed_insertion(case: Case, T_base_ct: Floats, where: str | Path) -> Floats
         reached = reached_insertion(case, T_base_ct)
         if reached is None:
             message = "correct = true, but the arm reaches the target in none of the directions tried"
-            allowed = "correct_joints_deg, how the arm stands at the insertion's end"
-            raise InputError(message, where=where, allowed=allowed, code="out_of_reach")
+            refuse(message, where, "correct_joints_deg, how the arm stands at the insertion's end", "out_of_reach")
         return reached
     q = np.radians(np.asarray(case.registration.correct_joints_deg))
     T = flange_pose(case.robot.model, q)
     away = float(np.linalg.norm(T[:3, 3] + case.needle.length_mm * T[:3, 2] - apply(T_base_ct, case.target_ct)))
     if away > MAX_AIM_OFF_MM:
-        what = f"correct_joints_deg put the tip {away:.1f} mm from the target"
         allowed = f"within {MAX_AIM_OFF_MM:g} mm: joints at an insertion's end, with this needle"
-        raise InputError(what, where=where, allowed=allowed, code="aim_beside_target")
+        refuse(f"correct_joints_deg put the tip {away:.1f} mm from the target", where, allowed, "aim_beside_target")
     return q
 
 

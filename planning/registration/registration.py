@@ -16,7 +16,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import away_from_singularities, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import outward
@@ -211,8 +211,7 @@ def register(
     fre_mm = rigid_fre_mm(markers.points_ct, markers.points_base)
     fit = checked_fit(markers, method, noise, fre_mm if noise_found else None, where=where)
     if method == "triad" and len(markers) != MIN_MARKERS:
-        what = f"triad takes 3 markers, not {len(markers)}"
-        raise InputError(what, where=where, allowed="3 names in use", code="wrong_count")
+        refuse(f"triad takes 3 markers, not {len(markers)}", where, "3 names in use", "wrong_count")
     T_base_ct = fit(markers.points_ct, markers.points_base)
     residuals = apply(T_base_ct, markers.points_ct) - markers.points_base
     check_residuals(markers, residuals, target_ct, where)
@@ -229,7 +228,7 @@ def register(
         what += better_names(markers, target_ct, fre_mm)
         deformed = distortion(T_base_ct, markers, noise, target_ct)
         what += f"; {deformed.brief()}" if deformed is not None and deformed.doubted else ""
-        raise InputError(what, where=where, allowed=ALLOWED_RESIDUALS, code="residuals_too_large")
+        refuse(what, where, ALLOWED_RESIDUALS, "residuals_too_large")
     weak = conditioning(markers.points_ct, target_ct)
     return Registration(method, T_base_ct, markers, residuals, test, weak, target_ct, uncertainty)
 

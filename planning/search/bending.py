@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.naming import REST
@@ -145,7 +145,7 @@ def check_tissues(case: Case, anatomy: Anatomy) -> None:
             bend = shortest_bend(case.bending.shaft)
             what = f"tissue.{pattern}: {tissue.stiffness_n_mm2:g} N/mm2 bends this shaft within {bend:.2g} mm"
             allowed = f"at most {most:.3g} N/mm2 for it: beyond, no bound of its bending is known"
-            raise InputError(what, where=case.path, allowed=allowed, code="tissue_too_stiff")
+            refuse(what, case.path, allowed, "tissue_too_stiff")
 
 
 def path_layers(

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse
 from puncture_twin.planning.base.files import decode_text, read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
@@ -153,8 +153,7 @@ def chosen_angles(case: Case, choice: Choice) -> tuple[float, float]:
     lever = _entry_ct(case, choice) - case.target_ct
     reach = float(np.linalg.norm(lever))
     if not reach >= LEAST_LEVER_MM:
-        what = f"{reach:.2g} mm from the target"
-        raise InputError(what, where="--entry", allowed="a point on the skin", code="entry_at_target")
+        refuse(f"{reach:.2g} mm from the target", "--entry", "a point on the skin", "entry_at_target")
     theta, beta = angles((lever / reach) @ case.T_ct_entry[:3, :3])
     return float(theta), float(beta)
 
@@ -168,13 +167,11 @@ def parse_choice(
         InputError: Two choices at once, one angle alone, or an entry that is not X,Y,Z.
     """
     if (theta_deg is None) != (beta_deg is None):
-        what = "one angle alone gives no direction"
-        raise InputError(what, where="--theta, --beta", allowed="both", code="one_angle")
+        refuse("one angle alone gives no direction", "--theta, --beta", "both", "one_angle")
     stated = {"--theta and --beta": theta_deg, "--rank": rank, "--window": window, "--entry": entry}
     names = [name for name, value in stated.items() if value is not None]
     if len(names) > 1:
-        what = f"{', '.join(names)} at once"
-        raise InputError(what, where="choice", allowed="one of them", code="conflicting_options")
+        refuse(f"{', '.join(names)} at once", "choice", "one of them", "conflicting_options")
     angles = None if theta_deg is None or beta_deg is None else (np.radians(theta_deg), np.radians(beta_deg))
     if entry is not None and entry.lower().endswith(FILES):
         return Choice(entry_file=Path(entry))
@@ -193,13 +190,11 @@ def with_file_read(case: Case, choice: Choice) -> Choice:
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     points = parse_points(data, path, default_space=case.space).points
     if len(points) > MOST_POINTS:
-        what = f"{len(points)} points"
-        raise InputError(what, where=path, allowed="one point, or a line from entry to target", code="wrong_count")
+        refuse(f"{len(points)} points", path, "one point, or a line from entry to target", "wrong_count")
     away = np.linalg.norm(points - case.target_ct, axis=1)
     if len(points) == MOST_POINTS and away.min() > NEAR_ENTRY_MM:
-        what = f"neither end is the target: {away.min():.1f} mm away from it"
         allowed = f"a line with one end within {NEAR_ENTRY_MM:g} mm of the target"
-        raise InputError(what, where=path, allowed=allowed, code="line_misses_target")
+        refuse(f"neither end is the target: {away.min():.1f} mm away from it", path, allowed, "line_misses_target")
     x, y, z = to_lps(points[[int(np.argmax(away))]], case.space)[0].tolist()  # the change of signs undoes itself
     return replace(choice, entry_mm=(x, y, z), read=(content_input("entry", str(path), data),))
 
@@ -208,8 +203,7 @@ def _parse_point(text: str) -> tuple[float, float, float]:
     where = "--entry"
     numbers = [parse_coordinate(part.strip(), where) for part in text.split(",")]
     if len(numbers) != 3:
-        what = f"{len(numbers)} numbers"
-        raise InputError(what, where=where, allowed="X,Y,Z in mm, in the case's space", code="wrong_count")
+        refuse(f"{len(numbers)} numbers", where, "X,Y,Z in mm, in the case's space", "wrong_count")
     return numbers[0], numbers[1], numbers[2]
 
 
@@ -219,8 +213,7 @@ def _entry_ct(case: Case, choice: Choice) -> Floats:
 
 def _refuse_beyond(number: int, count: int, where: str, what: str) -> None:
     if not 1 <= number <= count:
-        allowed = f"1 to {count}"
-        raise InputError(f"{number}: there are {count} {what}", where=where, allowed=allowed, code="out_of_range")
+        refuse(f"{number}: there are {count} {what}", where, f"1 to {count}", "out_of_range")
 
 
 def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
@@ -236,8 +229,7 @@ def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
     if apart > NEAR_ENTRY_MM:
         place = ", ".join(f"{mm:.1f}" for mm in to_lps(real[None], case.space)[0])
         what = f"the path from there to the target enters the skin {apart:.1f} mm away, at ({place}) mm {case.space}"
-        allowed = f"a point on the skin, to {NEAR_ENTRY_MM:g} mm"
-        raise InputError(what, where="--entry", allowed=allowed, code="entry_elsewhere")
+        refuse(what, "--entry", f"a point on the skin, to {NEAR_ENTRY_MM:g} mm", "entry_elsewhere")
 
 
 ANGLES = ("theta_deg", "beta_deg")
@@ -316,8 +308,7 @@ def _header(data: bytes, path: Path) -> list[str]:
 def _angle_rows(data: bytes, path: Path) -> tuple[Listed, ...]:
     header = _header(data, path)
     if sorted(header) not in (sorted(ANGLES), sorted((*ANGLES, "name"))):
-        what = f"columns {header}"[:200]
-        raise InputError(what, where=f"{path}, header", allowed=ALLOWED_ANGLES, code="wrong_columns")
+        refuse(f"columns {header}"[:200], f"{path}, header", ALLOWED_ANGLES, "wrong_columns")
     reader = csv.reader(io.StringIO(decode_text(data, str(path)), newline=""), strict=True)
     rows: list[Listed] = []
     try:
@@ -330,17 +321,16 @@ def _angle_rows(data: bytes, path: Path) -> tuple[Listed, ...]:
         where = f"{path}, line {reader.line_num}"
         raise InputError(f"{error}", where=where, allowed=ALLOWED_ANGLES, code="not_csv") from error
     if not rows:
-        raise InputError("no line", where=path, allowed=ALLOWED_ANGLES, code="empty")
+        refuse("no line", path, ALLOWED_ANGLES, "empty")
     return tuple(rows)
 
 
 def _angle_row(number: int, header: list[str], fields: list[str], where: str) -> Listed:
     if len(fields) != len(header):
-        what = f"{len(fields)} fields instead of {len(header)}"
-        raise InputError(what, where=where, allowed=ALLOWED_ANGLES, code="ragged_row")
+        refuse(f"{len(fields)} fields instead of {len(header)}", where, ALLOWED_ANGLES, "ragged_row")
     stated = dict(zip(header, (field.strip() for field in fields), strict=True))
     theta, beta = (parse_coordinate(stated[name], where) for name in ANGLES)
     for name, angle, most in zip(ANGLES, (theta, beta), GREATEST, strict=True):
         if not 0.0 <= angle <= most:
-            raise InputError(f"{name} {angle:g}", where=where, allowed=f"0 to {most:g}", code="out_of_range")
+            refuse(f"{name} {angle:g}", where, f"0 to {most:g}", "out_of_range")
     return Listed(number, stated.get("name", ""), None, parse_choice(theta, beta, None, None, None))

@@ -20,7 +20,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE, beyond_images
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, NO_MEMORY, Memory, user_cache
-from puncture_twin.planning.base.errors import Finding, InputError, Severity
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.progress import Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.text import brief
@@ -208,8 +208,7 @@ def prepare(
             case that does not say where its base is.
     """
     if engine not in ENGINES:
-        what = f"engine '{engine}' is not known"
-        raise InputError(what, where="--engine", allowed=", ".join(ENGINES), code="unknown_engine")
+        refuse(f"engine '{engine}' is not known", "--engine", ", ".join(ENGINES), "unknown_engine")
     watcher = watcher or Silent()
     stages = Stages(announce=partial(watcher.step, "stage"))
     with stages.time("case"):
@@ -217,8 +216,7 @@ def prepare(
         case = case if target_ct is None else case.aimed_at(target_ct)
         placement = load_placement(case)
     if arm and placement is None:
-        what = f"the arm is to be checked, but {NO_BASE}"
-        raise InputError(what, where=case.path, allowed=ALLOWED_BASE, code="no_base")
+        refuse(f"the arm is to be checked, but {NO_BASE}", case.path, ALLOWED_BASE, "no_base")
     with stages.time("anatomy"):
         cache = replace(user_cache(), memory=memory)
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), cache)

@@ -19,7 +19,7 @@ from puncture_twin.planning.anatomy.skin import SkinPaths
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within
 from puncture_twin.planning.case.case import Case
@@ -410,8 +410,7 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
     own = stated.get(case.target_structure, 1.0)
     if own != 1.0:
         message = f"breathing.weights: '{case.target_structure}' holds the target, and {own:g} is not its weight"
-        allowed = "1, or no weight for it: the amplitude is the target's"
-        raise InputError(message, where=case.path, allowed=allowed, code="breathing_weight")
+        refuse(message, case.path, "1, or no weight for it: the amplitude is the target's", "breathing_weight")
     of = breathing.weights.of
     weights = [of(name) if weight is None else stated.get(name, weight) for name, weight in fixed.items()]
     return MovingWeights(float(of(skin) or 0.0), np.array(weights, dtype=np.float64))

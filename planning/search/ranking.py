@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import AngleGrid, outward
@@ -85,9 +85,7 @@ def ranked_by(candidates: Candidates, cost: Floats) -> Candidates:
     rows = np.flatnonzero(candidates.safe)
     if cost.shape != (len(candidates),) or cost.dtype.kind not in "iufb" or not np.isfinite(cost[rows]).all():
         allowed = f"shape ({len(candidates)},), real numbers, finite for the {len(rows)} safe candidates"
-        raise InputError(
-            f"a cost of shape {cost.shape}, {cost.dtype}", where="rerank", allowed=allowed, code="wrong_shape"
-        )
+        refuse(f"a cost of shape {cost.shape}, {cost.dtype}", "rerank", allowed, "wrong_shape")
     ranks = np.zeros(len(candidates), np.int32)
     ranks[rows[np.argsort(cost[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
     ranking = Ranking(np.where(candidates.safe, cost, np.nan), ranks, candidates.ranking.pareto)

@@ -15,7 +15,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import away_from_singularities, flange_pose, slowed
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.collision.checker import CellChecker
@@ -92,8 +92,7 @@ def plan_sweep(
         NoAnswerError: The first directions are not allowed, or no approach to them was found.
     """
     if context.reach is None:
-        what = "the case does not say where the robot stands"
-        raise InputError(what, where=context.case.path, allowed=_BASE, code="no_base")
+        refuse("the case does not say where the robot stands", context.case.path, _BASE, "no_base")
     route = _allowed(context, _angles(start, end), progress)
     point = apply(context.reach.T_base_ct, context.case.target_ct)
     T_base_ct, frame = context.reach.T_base_ct, context.case.T_ct_entry[:3, :3]
@@ -134,7 +133,7 @@ def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:
     change = np.array([end[0] - start[0], (end[1] - start[1] + np.pi) % (2 * np.pi) - np.pi])
     count = int(np.ceil(np.abs(change).max() / STEP))
     if count == 0:
-        raise InputError("a sweep to where it starts", where="--to", allowed="another direction", code="no_motion")
+        refuse("a sweep to where it starts", "--to", "another direction", "no_motion")
     return np.asarray(start + np.linspace(0.0, 1.0, count + 1)[:, None] * change)
 
 

@@ -15,7 +15,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import away_from_singularities, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.collision.workcell import home_configuration
@@ -69,8 +69,7 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
         NoAnswerError: No place, or not this one, can be touched in so many poses, or no motion was found.
     """
     if context.reach is None:
-        allowed = "a case with [robot], placed in its base frame"
-        raise InputError("no robot", where=context.case.path, allowed=allowed, code="no_base")
+        refuse("no robot", context.case.path, "a case with [robot], placed in its base frame", "no_base")
     checkers = approach_checkers(context, PLANNED_PADDING_MM)
     places, most = _places(context) if place_base is None else [place_base], 0
     for place in places:

@@ -11,7 +11,7 @@ import numpy as np
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool, outside_surface
@@ -213,12 +213,11 @@ def registered(context: CaseContext, read: NamedPoints) -> Registration:
 def _task(context: CaseContext, q_insertion: Floats) -> _Task:
     placement = context.placement
     if context.reach is None or placement is None or placement.registration is None or context.case.errors is None:
-        raise InputError("no touches can be planned", where=context.case.path, allowed=ALLOWED, code="no_markers")
+        refuse("no touches can be planned", context.case.path, ALLOWED, "no_markers")
     found = placement.registration.markers
     if len(found) > MOST_MARKERS:
-        where = f"{context.case.path}: registration"
         what = f"{len(found)} markers"
-        raise InputError(what, where=where, allowed=f"at most {MOST_MARKERS}: see registration.use", code="too_many")
+        refuse(what, f"{context.case.path}: registration", f"at most {MOST_MARKERS}: see registration.use", "too_many")
     believed = MarkerPairs(found.names, found.points_ct, apply(placement.T_base_ct, found.points_ct))
     return _Task(context, believed, cast(Method, placement.registration.method), q_insertion)
 

@@ -14,7 +14,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, normals_of
@@ -149,11 +149,11 @@ def chance_model(case: Case, anatomy: Anatomy, engine: ClearanceEngine, error: P
     taken = [anatomy.checked[column].name for column in demanding(anatomy.checked)]
     if not TAKEN.isdisjoint(taken):
         message = f"structures {', '.join(sorted(TAKEN.intersection(taken)))}: p_touch_<name> is another column"
-        raise InputError(message, where=case.path, allowed="other names than any and joint", code="reserved_name")
+        refuse(message, case.path, "other names than any and joint", "reserved_name")
     mesh = anatomy.structure(case.target_structure).mesh
     if case.hit_radius_mm is None and not mesh.closed:
         message = f"the mesh of '{case.target_structure}' is open: what lies in it, and is hit, is not known"
-        raise InputError(message, where=case.path, allowed="target.hit_radius_mm, or a closed mesh", code="open_mesh")
+        refuse(message, case.path, "target.hit_radius_mm, or a closed mesh", "open_mesh")
     return ChanceModel(case, anatomy, engine, error, hit_model(case.hit_radius_mm, mesh, case.target_ct))
 
 
@@ -267,13 +267,13 @@ def check_limits(case: Case, anatomy: Anatomy, error_known: bool) -> None:
     if limited and not error_known:
         message = "search.min_hit and max_touch cannot be checked: only markers and the arm give the needle's error"
         allowed = "[registration] with markers, and a search with the arm; or no such limit"
-        raise InputError(message, where=case.path, allowed=allowed, code="no_needle_error")
+        refuse(message, case.path, allowed, "no_needle_error")
     names = [anatomy.checked[column].name for column in demanding(anatomy.checked)]
     unknown = sorted(set(settings.max_touch_of) - set(names))
     if unknown:
         message = f"search.max_touch_of '{unknown[0]}' is no structure that must not be touched"
         message += did_you_mean(unknown[0], names)
-        raise InputError(message, where=case.path, allowed=", ".join(names), code="unknown_structure")
+        refuse(message, case.path, ", ".join(names), "unknown_structure")
 
 
 def touch_limit(case: Case, name: str) -> float:

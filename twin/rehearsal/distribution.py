@@ -10,7 +10,7 @@ from scipy.special import chdtri
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
@@ -195,7 +195,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(case, registration)
     if error is None or registration is None:
-        raise InputError("no rooms can be drawn", where=case.path, allowed=ALLOWED, code="no_markers")
+        refuse("no rooms can be drawn", case.path, ALLOWED, "no_markers")
     q_touch = touches(case, registration.markers)
     bend = bend_along(context, outward_ct)
     believed = replace(_as_rehearsed(error, q_touch), bend=bend)

@@ -15,7 +15,7 @@ from puncture_twin.planning.arm.links import address_file, collision_links, mode
 from puncture_twin.planning.arm.tool import Tool, ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.mesh import joined
 from puncture_twin.twin.world.client import to_m, write_obj
 
@@ -74,7 +74,7 @@ def _check_weights(urdf: ArmUrdf) -> None:
         if not any(member.link.weighs for member in members):
             what = "it states no mass and inertia above 0, without which nothing can be simulated"
             here = f"{urdf.where}: link '{members[0].link.name}'"
-            raise InputError(what, where=here, allowed="an <inertial> of every moving link", code="no_inertia")
+            refuse(what, here, "an <inertial> of every moving link", "no_inertia")
 
 
 def _simplify(robot: ET.Element) -> None:

@@ -22,7 +22,7 @@ from puncture_twin.planning.anatomy.body.cut_ends import Box, Content, content_o
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown, TableSide, touching_tables
 from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned, measured_hu
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, grown
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume, canonical, in_order
 from puncture_twin.planning.geometry.parts import largest_part, middle_of, parts_of
 
@@ -192,8 +192,7 @@ def _found(
         trunk[first.box] = largest_part(first.mask)
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
-        allowed = f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
-        raise InputError(what, where=where, allowed=allowed, code="no_body")
+        refuse(what, where, f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body", "no_body")
     warnings: list[str] = []
     tables: tuple[TableSide, ...] = ()
     if shown.tables:
@@ -209,8 +208,7 @@ def _found(
         filled[box] |= filled_slices(limb)
     _fill_cut_lungs(filled, hu, voxel_ml, warnings)
     if filled.all():
-        what = "no air around the body"
-        raise InputError(what, where=where, allowed="a CT that shows the skin somewhere", code="no_air")
+        refuse("no air around the body", where, "a CT that shows the skin somewhere", "no_air")
     return filled, tables, warnings
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from puncture_twin.planning.arm.urdf.document import UrdfDocument, UrdfShape, parse_urdf
 from puncture_twin.planning.arm.urdf.lengths import ArmChain, arm_chain, ur_lengths
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, parse_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
@@ -55,13 +55,11 @@ def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tu
         for member in members:
             link, here = member.link, f"{document.where}: link '{member.link.name}'"
             if link.drawn and not link.collisions:
-                what = "it is drawn, and has no shape for contacts"
                 allowed = "a <collision>; the mesh of its <visual> will do"
-                raise InputError(what, where=here, allowed=allowed, code="no_collision_shape")
+                refuse("it is drawn, and has no shape for contacts", here, allowed, "no_collision_shape")
             if link.collisions and link.name in chain.beyond:
-                what = f"it is fixed beyond the flange '{chain.flange}'"
                 allowed = "the arm alone; what the flange carries is [tool] of the case"
-                raise InputError(what, where=here, allowed=allowed, code="shape_beyond_flange")
+                refuse(f"it is fixed beyond the flange '{chain.flange}'", here, allowed, "shape_beyond_flange")
             shapes += [
                 BodyShape(_mesh(shape, document, here, read), member.T_body_link @ shape.T_link_shape)
                 for shape in link.collisions
@@ -69,8 +67,7 @@ def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tu
         if not shapes:
             names = ", ".join(member.link.name for member in members)
             what = f"nothing has a collision shape between the joints {number} and {number + 1} (links {names})"
-            allowed = "one collision shape a link at least"
-            raise InputError(what, where=document.where, allowed=allowed, code="no_collision_shape")
+            refuse(what, document.where, "one collision shape a link at least", "no_collision_shape")
         found.append(tuple(shapes))
     return tuple(found)
 
@@ -90,9 +87,8 @@ def _mesh(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> Tr
 
 def _file(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> TriangleMesh:
     if Path(shape.address).suffix.lower() not in MESH_SUFFIXES:
-        what = f"mesh '{shape.address}' is of a kind that is not read"
         allowed = f"a file ending in {', '.join(MESH_SUFFIXES)}, for contacts"
-        raise InputError(what, where=here, allowed=allowed, code="unknown_format")
+        refuse(f"mesh '{shape.address}' is of a kind that is not read", here, allowed, "unknown_format")
     path = document.where.parent / shape.address
     try:
         return parse_mesh(read(shape.address), path, unit=Unit.M, space=Space.LOCAL, up=Up.Z, stretch=shape.size)

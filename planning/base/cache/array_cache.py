@@ -31,7 +31,7 @@ from puncture_twin.planning.base.cache.entry_file import (
     unpacked,
 )
 from puncture_twin.planning.base.cache.source_stamp import library_versions, module_unedited, source_stamp
-from puncture_twin.planning.base.errors import CacheWarning, InputError
+from puncture_twin.planning.base.errors import CacheWarning, InputError, refuse
 
 Value = TypeVar("Value")
 
@@ -223,8 +223,7 @@ def _most_bytes() -> int:
     if not stated:
         return MOST_BYTES
     if not (stated.isascii() and stated.isdigit() and len(stated) < 10):
-        what = f"{stated[:40]!r} is no size"
-        raise InputError(what, where=f"${SIZE_VARIABLE}", allowed="whole megabytes, such as 2000", code="not_a_number")
+        refuse(f"{stated[:40]!r} is no size", f"${SIZE_VARIABLE}", "whole megabytes, such as 2000", "not_a_number")
     return int(stated) * 1_000_000
 
 

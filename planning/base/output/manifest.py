@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import is_plain_file, read_input
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
 from puncture_twin.planning.base.strict_json import field, fitting, read_json, text, texts
@@ -140,15 +140,14 @@ def read_output(path: Path, *, max_bytes: int) -> Output:
     digest = hashlib.sha256(data).hexdigest()
     home = path.resolve()
     if home.name == MANIFEST_NAME:
-        what = "lists the files of a command and is none of them"
-        raise InputError(what, where=path, allowed="one that it lists", code="not_in_manifest")
+        refuse("lists the files of a command and is none of them", path, "one that it lists", "not_in_manifest")
     manifest = _set_of(home.parent)
     if manifest is None:
         return Output(path, data, digest, f"{path} lies outside of any output set: nothing tells whether it is whole")
     if manifest.files.get(home.name) != digest:
         wrong = "is not listed" if home.name not in manifest.files else "has other bytes than are listed"
         what = f"{wrong} in {MANIFEST_NAME} beside it: the folder's set is unfinished, or the file was edited"
-        raise InputError(what, where=path, allowed="what the command wrote: run it again", code="output_not_whole")
+        refuse(what, path, "what the command wrote: run it again", "output_not_whole")
     return Output(path, data, digest, "")
 
 
@@ -182,8 +181,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         return None
     document = _document(path)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        what = "is not that of an output folder"
-        raise InputError(what, where=path, allowed=ANOTHER_FOLDER, code="not_an_output_folder")
+        refuse("is not that of an output folder", path, ANOTHER_FOLDER, "not_an_output_folder")
     with fitting(path, ANOTHER_FOLDER):
         return _manifest(document)
 

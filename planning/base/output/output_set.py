@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import Manifest, read_manifest
 from puncture_twin.planning.base.output.publish import Draft, new_draft, publish, refuse_foreign, sweep
 from puncture_twin.planning.base.provenance import Input
@@ -141,7 +141,7 @@ def _sources(draft: Draft, made_from: Mapping[str, str]) -> tuple[str, ...]:
         if owner is not None:
             if draft.old.files[name] != digest:
                 allowed = f"another folder: what is made from one {name} does not belong beside another"
-                raise InputError(f"holds another {name}", where=draft.out, allowed=allowed, code="folder_of_another")
+                refuse(f"holds another {name}", draft.out, allowed, "folder_of_another")
             owners.append(owner)
     return tuple(owners)
 

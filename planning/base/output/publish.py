@@ -31,7 +31,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
     MAX_MANIFEST_BYTES,
@@ -117,8 +117,7 @@ def refuse_foreign(draft: Draft, files: Iterable[str]) -> None:
         foreign = _foreign_entry(draft.out, name)
         if foreign is not None:
             what = f"{name} is to be written, but the file {foreign} there comes from no run of this program"
-            allowed = "another folder, or this one without that file"
-            raise InputError(what, where=draft.out, allowed=allowed, code="foreign_file")
+            refuse(what, draft.out, "another folder, or this one without that file", "foreign_file")
 
 
 def _foreign_entry(out: Path, name: str) -> str | None:

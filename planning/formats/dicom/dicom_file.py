@@ -25,7 +25,7 @@ from pydicom.multival import MultiValue
 from pydicom.tag import BaseTag
 from pydicom.uid import UID
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.dicom.storage import BIG_ENDIAN, DEFLATED, IMPLICIT, META_START, is_dicom
 
 MAX_INFLATED_BYTES = 1 << 26
@@ -64,8 +64,7 @@ def parse_dicom(content: bytes, path: Path) -> Dataset:
         InputError: No DICOM, damaged, cut short, inflating to too much, or big endian.
     """
     if not is_dicom(content[:META_START]):
-        what = "no DICOM file: DICM does not stand at byte 128"
-        raise InputError(what, where=path, allowed=ALLOWED, code="wrong_format")
+        refuse("no DICOM file: DICM does not stand at byte 128", path, ALLOWED, "wrong_format")
     with refused_if_damaged(path):
         stream = io.BytesIO(content)
         meta = read_meta(stream)
@@ -93,8 +92,7 @@ def _behind_meta(tag: BaseTag, vr: str | None, length: int) -> bool:
 def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:
     """The data set's own bytes, inflated where they are deflated."""
     if not syntax:
-        what = "its meta information names no transfer syntax"
-        raise InputError(what, where=path, allowed=ALLOWED, code="missing_tag")
+        refuse("its meta information names no transfer syntax", path, ALLOWED, "missing_tag")
     if syntax == BIG_ENDIAN:
         refuse_big_endian(path)
     if syntax != DEFLATED:
@@ -106,14 +104,13 @@ def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:
         what = (
             f"inflates to more than {MAX_INFLATED_BYTES} bytes" if more else "cut short: its deflated data do not end"
         )
-        raise InputError(what, where=path, allowed=ALLOWED, code="file_damaged")
+        refuse(what, path, ALLOWED, "file_damaged")
     return memoryview(inflated)
 
 
 def refuse_big_endian(path: Path) -> NoReturn:
     """Raise the error of a file whose numbers are stored the other way round."""
-    what = f"transfer syntax {UID(BIG_ENDIAN).name} ({BIG_ENDIAN})"
-    raise InputError(what, where=path, allowed=how_to_convert(), code="transfer_syntax")
+    refuse(f"transfer syntax {UID(BIG_ENDIAN).name} ({BIG_ENDIAN})", path, how_to_convert(), "transfer_syntax")
 
 
 def how_to_convert() -> str:
@@ -149,7 +146,7 @@ def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[flo
         plain = tuple(float(one) for one in listed)
     if len(plain) != count or not all(map(math.isfinite, plain)):
         what = f"{name(keyword)} is missing" if found is None else f"{name(keyword)} is {str(found)[:100]}"
-        raise InputError(what, where=where, allowed=f"{count} finite number{'s' if count > 1 else ''}", code="bad_tag")
+        refuse(what, where, f"{count} finite number{'s' if count > 1 else ''}", "bad_tag")
     return plain
 
 
@@ -166,8 +163,7 @@ def whole(data: Dataset, keyword: str, *, low: int, high: int, where: str) -> in
     """
     found = number(data, keyword, where=where)
     if found != int(found) or not low <= found <= high:
-        what = f"{name(keyword)} is {found:g}"
-        raise InputError(what, where=where, allowed=f"a whole number from {low} to {high}", code="bad_tag")
+        refuse(f"{name(keyword)} is {found:g}", where, f"a whole number from {low} to {high}", "bad_tag")
     return int(found)
 
 
@@ -203,7 +199,7 @@ def items(data: Dataset, keyword: str, *, where: str) -> list[Dataset]:
     with refused_if_damaged(where):
         listed = list(found)
     if not all(isinstance(one, Dataset) for one in listed):
-        raise InputError(f"{name(keyword)} is no sequence", where=where, allowed="a sequence of items", code="bad_tag")
+        refuse(f"{name(keyword)} is no sequence", where, "a sequence of items", "bad_tag")
     return listed
 
 
@@ -343,8 +339,7 @@ class _Walk:
         return int(group << 16 | element)
 
     def _refuse(self, what: str, at: int, code: str = "file_damaged") -> NoReturn:
-        where = self._where
-        raise InputError(f"{what} (byte {at} of the data set)", where=where, allowed="a complete DICOM file", code=code)
+        refuse(f"{what} (byte {at} of the data set)", self._where, "a complete DICOM file", code)
 
 
 def _known(tag: int) -> bytes:

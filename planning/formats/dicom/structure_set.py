@@ -14,7 +14,7 @@ from pydicom.dataset import Dataset
 from skimage.morphology import convex_hull_image
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
 from puncture_twin.planning.formats.dicom.dicom_file import (
@@ -90,8 +90,7 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     data = parse_dicom(content(file), path)
     where = path.name
     if (sop_class := sop_class_of(data, where=where)) != STRUCTURE_SET:
-        what = f"SOP class {sop_class or 'missing'}"
-        raise InputError(what, where=path, allowed="a DICOM RTSTRUCT", code="wrong_format")
+        refuse(f"SOP class {sop_class or 'missing'}", path, "a DICOM RTSTRUCT", "wrong_format")
     names = _names(data, ct, path)
     unique_names(list(names.values()), path)
     grid = _slices_grid(ct)
@@ -114,8 +113,7 @@ def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
     for item in items(data, "StructureSetROISequence", where=path.name):
         roi = whole(item, "ROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
         if roi in found:
-            what = f"two regions have the number {roi}"
-            raise InputError(what, where=path, allowed="each number once", code="duplicate_number")
+            refuse(f"two regions have the number {roi}", path, "each number once", "duplicate_number")
         check_frame_of_reference(text(item, "ReferencedFrameOfReferenceUID", where=path.name), ct, path)
         found[roi] = text(item, "ROIName", where=path.name)
     return found
@@ -124,14 +122,13 @@ def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
 def _regions(data: Dataset, names: dict[int, str], grid: VolumeGrid, path: Path) -> dict[int, _Region]:
     found: dict[int, _Region] = {}
     if not has(data, "ROIContourSequence"):
-        what = f"{name('ROIContourSequence')} is missing: was the file cut?"
-        raise InputError(what, where=path, allowed="contours", code="missing_tag")
+        refuse(f"{name('ROIContourSequence')} is missing: was the file cut?", path, "contours", "missing_tag")
     T_index_ct = np.asarray(np.linalg.inv(grid.T_ct_index), np.float64)
     for item in items(data, "ROIContourSequence", where=path.name):
         roi = whole(item, "ReferencedROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
         if roi not in names or roi in found:
             what = f"contours of region {roi}, which is {'listed twice' if roi in found else 'not listed'}"
-            raise InputError(what, where=path, allowed="one list of contours for each region", code="unknown_region")
+            refuse(what, path, "one list of contours for each region", "unknown_region")
         label = f"{path.name}, {names[roi]!r}"
         listed = items(item, "ContourSequence", where=label)
         closed = [one for one in listed if text(one, "ContourGeometricType", where=label) in CLOSED]
@@ -146,17 +143,14 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
     slices = np.unique(np.round(index[:, 2]))
     at = points_ct[0].round(2).tolist()
     if len(slices) != 1 or np.abs(index[:, 2] - slices[0]).max() > ON_SLICE:
-        allowed = "contours in the slices of the CT on which they were drawn"
         what = f"the contour through {at} lies between the CT's slices"
-        raise InputError(what, where=label, allowed=allowed, code="contour_outside_ct")
+        refuse(what, label, "contours in the slices of the CT on which they were drawn", "contour_outside_ct")
     if not 0 <= slices[0] < grid.shape[2]:
-        allowed = "contours within the CT on which they were drawn"
         what = f"the contour through {at} lies beyond the CT's slices"
-        raise InputError(what, where=label, allowed=allowed, code="contour_outside_ct")
+        refuse(what, label, "contours within the CT on which they were drawn", "contour_outside_ct")
     length = float(np.abs(index[:, :2] - np.roll(index[:, :2], 1, axis=0)).sum())
     if length > MAX_LENGTH:
-        what = f"the contour through {at} is {length:.3g} pixels long"
-        raise InputError(what, where=label, allowed=f"{MAX_LENGTH}", code="too_long")
+        refuse(f"the contour through {at} is {length:.3g} pixels long", label, f"{MAX_LENGTH}", "too_long")
     return Contour(int(slices[0]), index[:, :2])
 
 
@@ -169,9 +163,8 @@ def _points(item: Dataset, label: str) -> Floats:
         flat = np.array(parts, dtype=np.float64) if parts != [b""] else np.zeros(0)
     count = len(flat) // 3
     if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
-        what = f"{name('ContourData')} holds {len(flat)} numbers"
         allowed = "three finite numbers for each of at least three points"
-        raise InputError(what, where=label, allowed=allowed, code="wrong_count")
+        refuse(f"{name('ContourData')} holds {len(flat)} numbers", label, allowed, "wrong_count")
     if has(item, "NumberOfContourPoints"):
         whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
     return flat.reshape(-1, 3)

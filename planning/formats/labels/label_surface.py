@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from skimage.measure import marching_cubes
 
 from puncture_twin.planning.base.arrays import Bools
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.volumes.volume_files import canonical
@@ -48,8 +48,7 @@ def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> Triangle
     if box is None:
         named = labelmap.names or {}
         shown = ", ".join(f"{n} {named[n]}" if n in named else str(n) for n in labelmap.labels_present())
-        what = f"no voxel has label {label}"
-        raise InputError(what, where=where, allowed=f"the labels present: {shown}", code="label_absent")
+        refuse(f"no voxel has label {label}", where, f"the labels present: {shown}", "label_absent")
     mask = labelmap.labels[box] == label
     T_ct_box = labelmap.T_ct_index.copy()
     T_ct_box[:3, 3] += labelmap.T_ct_index[:3, :3] @ [axis.start for axis in box]

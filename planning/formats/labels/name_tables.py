@@ -15,7 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL
 
@@ -60,11 +60,10 @@ def parse_names(data: bytes, path: Path) -> dict[int, str]:
         if label is None:
             continue
         if label in names:
-            what = f"id {label} stands twice"
-            raise InputError(what, where=entry.where, allowed="each id once", code="duplicate_label")
+            refuse(f"id {label} stands twice", entry.where, "each id once", "duplicate_label")
         names[label] = entry.name.strip()
     if not names:
-        raise InputError("the naming holds no label", where=path, allowed=allowed, code="empty")
+        refuse("the naming holds no label", path, allowed, "empty")
     return names
 
 
@@ -72,12 +71,10 @@ def _label(entry: _Entry, allowed: str) -> int | None:
     """The number of an entry; None for the background."""
     text = entry.number.strip()
     if not (text.isascii() and text.isdigit() and len(text) < 7 and int(text) <= MAX_LABEL):
-        what = f"label {text[:40]!r} of {entry.name[:60]!r}"
-        raise InputError(what, where=entry.where, allowed=allowed, code="bad_label")
+        refuse(f"label {text[:40]!r} of {entry.name[:60]!r}", entry.where, allowed, "bad_label")
     if int(text) == 0:
         if _plain(entry.name) not in BACKGROUND:
-            what = f"label 0 is {entry.name[:60]!r}"
-            raise InputError(what, where=entry.where, allowed="0 for the background only", code="bad_label")
+            refuse(f"label 0 is {entry.name[:60]!r}", entry.where, "0 for the background only", "bad_label")
         return None
     return int(text)
 
@@ -94,8 +91,7 @@ def _csv_entries(data: bytes, path: Path) -> Iterator[_Entry]:
             continue
         where = f"{path}, line {line}"
         if len(row) != len(rows[0]):
-            what = f"{len(row)} fields, not {len(rows[0])}: {row}"
-            raise InputError(what, where=where, allowed=ALLOWED_CSV, code="ragged_row")
+            refuse(f"{len(row)} fields, not {len(rows[0])}: {row}", where, ALLOWED_CSV, "ragged_row")
         yield _Entry(row[number], row[name], where)
 
 
@@ -116,8 +112,7 @@ def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
     number = next((plain.index(one) for one in NUMBER_COLUMNS if one in plain and plain.index(one) != name), None)
     if name is None or number is None:
         shown = ",".join(header)[:100] or "missing"
-        what = f"header {shown!r} names no column of labels and names"
-        raise InputError(what, where=path, allowed=ALLOWED_CSV, code="wrong_columns")
+        refuse(f"header {shown!r} names no column of labels and names", path, ALLOWED_CSV, "wrong_columns")
     return number, name
 
 
@@ -125,15 +120,14 @@ def _json_entries(data: bytes, path: Path) -> Iterator[_Entry]:
     tree = parse_json(data, where=path, allowed=ALLOWED_JSON)
     table = tree.get("labels", tree) if isinstance(tree, dict) else None
     if not isinstance(table, dict):
-        raise InputError("no object of labels", where=path, allowed=ALLOWED_JSON, code="wrong_format")
+        refuse("no object of labels", path, ALLOWED_JSON, "wrong_format")
     for key, value in table.items():
         number, name = (key, value) if isinstance(value, str) else (value, key)
         if isinstance(value, list):
             what = f"{str(key)[:60]!r} is a list of labels (a region): name its labels one by one"
-            raise InputError(what, where=path, allowed=ALLOWED_JSON, code="labels_of_regions")
+            refuse(what, path, ALLOWED_JSON, "labels_of_regions")
         if isinstance(number, bool) or not isinstance(number, str | int) or not isinstance(name, str):
-            what = f"entry {str(key)[:60]!r} is no pair of a number and a name"
-            raise InputError(what, where=path, allowed=ALLOWED_JSON, code="wrong_format")
+            refuse(f"entry {str(key)[:60]!r} is no pair of a number and a name", path, ALLOWED_JSON, "wrong_format")
         yield _Entry(str(number), name, str(path))
 
 

@@ -17,9 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.strict_json import parse_json
-from puncture_twin.planning.formats.guard import refuse
 from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
 from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join
 

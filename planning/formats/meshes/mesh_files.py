@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.formats.mesh_guard import guard_mesh, twice_areas
 from puncture_twin.planning.formats.meshes.obj import read_obj
@@ -121,7 +121,7 @@ def _z_up(vertices: NDArray[np.float64], up: Up | None, path: Path) -> NDArray[n
     """Points (n, 3) of a file, rotated by a quarter about x where its y is up."""
     if up is None and path.suffix.lower() == ".glb":
         allowed = 'up = "y" (turned to z up) or up = "z" (kept as it is), or another format'
-        raise InputError(UP_NOT_STATED, where=path, allowed=allowed, code="up_not_stated")
+        refuse(UP_NOT_STATED, path, allowed, "up_not_stated")
     return vertices if up is not Up.Y else vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
 
 
@@ -163,8 +163,7 @@ def mesh_extent(path: Path) -> MeshExtent:
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     raw = reader(data, str(path))
     if not np.isfinite(raw.vertices).all() or len(raw.vertices) == 0:
-        what = "a vertex is not finite, or there is none"
-        raise InputError(what, where=path, allowed="finite vertices", code="not_finite")
+        refuse("a vertex is not finite, or there is none", path, "finite vertices", "not_finite")
     box = np.stack([raw.vertices.min(axis=0), raw.vertices.max(axis=0)]).astype(np.float64)
     return MeshExtent(box, raw.space or _stated_space(data))
 
@@ -173,7 +172,7 @@ def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         allowed = "a file ending in " + ", ".join(MESH_SUFFIXES)
-        raise InputError(f"unknown mesh format {path.suffix!r}", where=path, allowed=allowed, code="unknown_format")
+        refuse(f"unknown mesh format {path.suffix!r}", path, allowed, "unknown_format")
     return _READERS[suffix]
 
 

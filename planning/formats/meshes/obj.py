@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import decode_text
-from puncture_twin.planning.formats.guard import refuse
 from puncture_twin.planning.formats.raw_mesh import RawMesh, triangulate
 
 _IGNORED = frozenset({"vt", "vn", "vp", "o", "g", "s", "mg", "usemtl", "mtllib", "l", "p", "usemap", "maplib"})

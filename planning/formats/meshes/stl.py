@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import decode_text
-from puncture_twin.planning.formats.guard import refuse
 from puncture_twin.planning.formats.raw_mesh import RawMesh
 
 _HEADER_BYTES = 84

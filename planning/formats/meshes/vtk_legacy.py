@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.guard import refuse
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
 from puncture_twin.planning.formats.raw_mesh import MAX_TOKEN_LENGTH, MAX_VERTICES, RawMesh, triangulate
 

@@ -16,8 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.guard import refuse
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
 from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join, token_array, triangulate
 from puncture_twin.planning.geometry.spaces import Space

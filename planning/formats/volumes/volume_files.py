@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import absence, is_plain_file, read_input
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.formats.volumes import nrrd_header
@@ -97,7 +97,7 @@ def read_volume(path: Path) -> Volume:
         InputError: Anything wrong with the file; nothing else comes out, whatever its bytes.
     """
     if not is_plain_file(path):
-        raise InputError(f"the file {absence(path)}", where=path, allowed="a volume file", code="no_such_file")
+        refuse(f"the file {absence(path)}", path, "a volume file", "no_such_file")
     _parser(path)  # an unknown ending is refused before anything is read
     content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     beside = data_file(content, path)
@@ -126,7 +126,7 @@ def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volum
         what = "it does not fit this machine's memory"
         raise InputError(what, where=path, allowed="a smaller one", code="out_of_memory") from error
     if values.dtype.kind == "f" and not np.isfinite(values).all():
-        raise InputError("a voxel is NaN or infinite", where=path, allowed="finite values", code="not_finite")
+        refuse("a voxel is NaN or infinite", path, "finite values", "not_finite")
     return Volume(values, header.T_ct_index, path, header.fields)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader, check_exact_size
 
 DEFLATE_RATIO = 1033
@@ -40,7 +40,7 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
     """
     if promised > len(content) * DEFLATE_RATIO:
         what = f"{len(content)} compressed bytes cannot hold the {promised} bytes that the header promises"
-        raise InputError(what, where=where, allowed="a complete file", code="size_mismatch")
+        refuse(what, where, "a complete file", "size_mismatch")
     found = np.empty(promised, np.uint8)
     count = 0
     try:
@@ -127,7 +127,7 @@ def _numbers(text: bytes, count: int, dtype: np.dtype[Any], where: Path) -> NDAr
     allowed = f"plain numbers of type {dtype}"
     pattern = FLOAT_TEXT if dtype.kind == "f" else INTEGER_TEXT
     if len(text) > count * TEXT_BYTES or pattern.fullmatch(text) is None:
-        raise InputError("the data hold something else than numbers", where=where, allowed=allowed, code="not_a_number")
+        refuse("the data hold something else than numbers", where, allowed, "not_a_number")
     words = text.split()
     check_exact_size(len(words), count, where=where)
     try:

@@ -16,7 +16,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import load_couch, load_skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.tables import NO_RESIDUALS, MarkerSection, RegistrationSection, other_readings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -247,7 +247,7 @@ def _apart(case: Case, registration: Registration, T_base_ct: Floats) -> Apart:
 
 
 def _refuse(case: Case, what: str) -> None:
-    raise InputError(what, where=f"{case.path}: registration.transform", allowed=ALLOWED, code="transform_implausible")
+    refuse(what, f"{case.path}: registration.transform", ALLOWED, "transform_implausible")
 
 
 class CheckedPlacement(NamedTuple):

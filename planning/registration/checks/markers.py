@@ -22,7 +22,7 @@ from scipy.special import fdtri
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -172,12 +172,12 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> tuple[str
     given = f"as named, FRE is {test.fre_mm:.2f} mm"
     if better:
         what = f"the marker names look permuted: {min(better, key=lambda one: one.fre_mm).text()}; {given}"
-        raise InputError(what, where=where, allowed="the names as the markers were touched", code="markers_permuted")
+        refuse(what, where, "the names as the markers were touched", "markers_permuted")
     excluded = [place_excluded(case, skin.mesh, one.T_base_ct) for one in found]
     possible = [one for one, why in zip(found, excluded, strict=True) if not why]
     if possible and not _accepted(case):
         what = f"a slip in the marker names would pass unnoticed: {_worst(possible)}; {given}"
-        raise InputError(what, where=where, allowed=ALLOWED_NAMES, code="markers_ambiguous")
+        refuse(what, where, ALLOWED_NAMES, "markers_ambiguous")
     warnings = () if complete else (f"of {len(registration.markers)} markers only swaps of two names were tested",)
     if possible:
         return (*warnings, f"marker names: {_worst(possible)}; accepted by accept_symmetry, {given}")
@@ -235,11 +235,11 @@ def check_axes(
         fits = ", or ".join(
             f"with {name} they lie on the skin to {one.fit.scatter_mm:.1f} mm (rms)" for name, one in alike.items()
         )
-        raise InputError(
+        refuse(
             f"markers_ct look like coordinates of other axes: {fits}, as given {_as_given(registration, given, best)}",
-            where=f"{case.path}: registration",
-            allowed="markers_ct in the axes (LPS, RAS) that the case or their file states",
-            code="other_axes",
+            f"{case.path}: registration",
+            "markers_ct in the axes (LPS, RAS) that the case or their file states",
+            "other_axes",
         )
     return tuple(
         f"markers_ct with {name} would lie on the skin to {slip.fit.scatter_mm:.1f} mm rms, as given to "

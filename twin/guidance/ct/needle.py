@@ -10,7 +10,7 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.special import ndtr
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.ct.markers import (
@@ -121,8 +121,7 @@ def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bo
     away = target_ct - found.tip_ct
     lateral = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
     what = f"the needle ends at other metal, which hides its tip; its axis passes the target by {lateral:.1f} mm"
-    allowed = f"a tip {SEEN_MM:g} mm clear of wider metal and its blur"
-    raise InputError(what, where=volume.path, allowed=allowed, code="tip_hidden")
+    refuse(what, volume.path, f"a tip {SEEN_MM:g} mm clear of wider metal and its blur", "tip_hidden")
 
 
 def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats, hidden: Bools) -> tuple[Metal, _Line]:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, Strict, model_validator
 
 from puncture_twin.planning.arm.ur import UrModel, ur_model
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.toml_types import Coordinate, Length, Name, Number, Section, Vector
@@ -245,8 +245,7 @@ def load_servo_case(path: Path | str) -> ServoCase:
     markers = parse_points(named["markers"], path.parent / file.head.markers, default_space=Space.LOCAL)
     targets = parse_points(named["targets"], path.parent / file.head.targets, default_space=Space.LOCAL)
     if len(markers.names) < MIN_MARKERS:
-        what = f"head.markers: {len(markers.names)} markers"
-        raise InputError(what, where=path, allowed="3 or more", code="too_few_markers")
+        refuse(f"head.markers: {len(markers.names)} markers", path, "3 or more", "too_few_markers")
     return ServoCase(path, file, model, skin, markers, targets, files.inputs)
 
 

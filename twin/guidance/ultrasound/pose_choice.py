@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate, active_columns, parameter_units
@@ -271,8 +271,7 @@ def choose_poses(
         InputError: More poses wanted than there are candidates, or none.
     """
     if not 0 < n <= len(candidates):
-        what = f"{n} poses of {len(candidates)} candidates"
-        raise InputError(what, where="pose choice", allowed="1 to all of them", code="out_of_range")
+        refuse(f"{n} poses of {len(candidates)} candidates", "pose choice", "1 to all of them", "out_of_range")
     prior = prior.estimate if isinstance(prior, Calibration) else prior
     design = _design(candidates, _Belief(noise, prior, None), recorded)
     chosen: list[int] = []

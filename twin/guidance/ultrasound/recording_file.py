@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic, decode_text, is_folder, read_input
 from puncture_twin.planning.formats.points import joint_readings, row_numbers
 from puncture_twin.planning.geometry.rigid import pose
@@ -62,14 +62,13 @@ def parse_recording(content: bytes, file: Path) -> Recording:
         raise InputError(what, where=file, allowed="one line per pose, fields of numbers", code="not_csv") from error
     header = tuple(cell.strip() for cell in rows[0]) if rows else ()
     if header not in KINDS:
-        what = f"columns {', '.join(header)[:200]}"
         allowed = ", ".join(columns(False, (3, 1), 24))
-        raise InputError(what, where=f"{file}, header", allowed=allowed, code="wrong_columns")
+        refuse(f"columns {', '.join(header)[:200]}", f"{file}, header", allowed, "wrong_columns")
     pixels, (width, shaft), behind = KINDS[header]
     places = (f"{file}, row {i}" for i in range(2, len(rows) + 1))
     values = np.array([row_numbers(row, header, header[1:], at) for row, at in zip(rows[1:], places, strict=True)])
     if values.size == 0:
-        raise InputError("no pose", where=file, allowed="one row per pose", code="empty")
+        refuse("no pose", file, "one row per pose", "empty")
     names = tuple(row[0].strip() for row in rows[1:])
     try:
         first = 26 + width + shaft

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
@@ -55,8 +55,7 @@ def parse_two(
         InputError: None or more than two, or one angle alone.
     """
     if len(theta_deg) != len(beta_deg):
-        what = "one angle alone gives no direction"
-        raise InputError(what, where="--theta, --beta", allowed="both, as often", code="one_angle")
+        refuse("one angle alone gives no direction", "--theta, --beta", "both, as often", "one_angle")
     choices = [parse_choice(*pair, None, None, None) for pair in zip(theta_deg, beta_deg, strict=True)]
     choices += [parse_choice(None, None, one, None, None) for one in rank]
     choices += [parse_choice(None, None, None, one, None) for one in window]
@@ -64,11 +63,10 @@ def parse_two(
     if len(choices) == 1:
         choices = [BEST_OF_ALL, *choices]
     if len(choices) == 2 and choices[0] == choices[1]:
-        what = "the same direction twice"
-        raise InputError(what, where="compare", allowed="two, or one that is not the best", code="same_direction")
+        refuse("the same direction twice", "compare", "two, or one that is not the best", "same_direction")
     if len(choices) != 2:
         allowed = "two, such as --rank 1 --window 2, or one, which is compared with the best"
-        raise InputError(f"{len(choices)} choices", where="compare", allowed=allowed, code="wrong_count")
+        refuse(f"{len(choices)} choices", "compare", allowed, "wrong_count")
     return choices[0], choices[1]
 
 
@@ -81,10 +79,10 @@ def two_plans(source: Path, other: Path | None, case: Path | None, chosen: bool)
     allowed = "PLAN_A PLAN_B [--case CASE], or CASE with one choice or two"
     if not is_plan(source):
         if other is not None or case is not None:
-            raise InputError("a case and another file", where="compare", allowed=allowed, code="conflicting_options")
+            refuse("a case and another file", "compare", allowed, "conflicting_options")
         return None
     if other is None or not is_plan(other) or chosen:
-        raise InputError("a plan is compared with a plan", where=source, allowed=allowed, code="conflicting_options")
+        refuse("a plan is compared with a plan", source, allowed, "conflicting_options")
     return source, other
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
@@ -38,16 +38,13 @@ def lists_of(
         InputError: Two lists, a list of directions beside a choice, a picture of a list, or a folder without a list.
     """
     if entries is not None and targets is not None:
-        raise InputError("two lists", where="--entries, --targets", allowed="one of them", code="conflicting_options")
+        refuse("two lists", "--entries, --targets", "one of them", "conflicting_options")
     if entries is not None and choice != BEST:
-        what = "a list of entries beside a choice"
-        raise InputError(what, where="--entries", allowed="the list alone", code="conflicting_options")
+        refuse("a list of entries beside a choice", "--entries", "the list alone", "conflicting_options")
     if (entries or targets) is not None and picture is not None:
-        what = "a picture is of one candidate"
-        raise InputError(what, where="--picture", allowed="check without a list", code="conflicting_options")
+        refuse("a picture is of one candidate", "--picture", "check without a list", "conflicting_options")
     if (entries or targets) is None and out_dir is not None:
-        what = "one candidate is printed, not written"
-        raise InputError(what, where="--out", allowed="--entries or --targets", code="conflicting_options")
+        refuse("one candidate is printed, not written", "--out", "--entries or --targets", "conflicting_options")
     return (entries or targets) is not None
 
 

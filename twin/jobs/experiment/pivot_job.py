@@ -14,7 +14,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import PARAMETERS, check_recording, flange_pose
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
@@ -80,8 +80,7 @@ def refuse_of_twin(*options: object) -> None:
         InputError: One of them is stated.
     """
     if any(option is not None for option in options):
-        allowed = "JOINTS.csv alone, or the twin's options"
-        raise InputError("touches that were read", where="pivot", allowed=allowed, code="conflicting_options")
+        refuse("touches that were read", "pivot", "JOINTS.csv alone, or the twin's options", "conflicting_options")
 
 
 def pivot_case(case: Case, joints: Path) -> PivotRun:
@@ -110,7 +109,7 @@ def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> 
         InputError: As `pivot_case`.
     """
     if case.errors is None:
-        raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm", code="no_noise")
+        refuse("no noise is declared", case.path, "[errors] touch_mm", "no_noise")
     model, tip_mm = case.robot.model, case.needle.length_mm
     poses = flange_pose(model, q)
     check_one_place(names, poses[:, :3, 3] + tip_mm * poses[:, :3, 2], poses[:, :3, :3], where=where)
@@ -208,8 +207,7 @@ def parse_place(text: str | None) -> Floats | None:
         return None
     numbers = [parse_coordinate(part.strip(), "--at") for part in text.split(",")]
     if len(numbers) != 3:
-        what = f"{len(numbers)} numbers"
-        raise InputError(what, where="--at", allowed="X,Y,Z in mm, in the robot's base frame", code="wrong_count")
+        refuse(f"{len(numbers)} numbers", "--at", "X,Y,Z in mm, in the robot's base frame", "wrong_count")
     return np.array(numbers)
 
 
@@ -229,10 +227,9 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
     """
     case = context.case
     if not LEAST_POSES <= poses <= MOST_POSES:
-        what = f"{poses} poses"
-        raise InputError(what, where="--poses", allowed=f"{LEAST_POSES} to {MOST_POSES}", code="out_of_range")
+        refuse(f"{poses} poses", "--poses", f"{LEAST_POSES} to {MOST_POSES}", "out_of_range")
     if case.errors is None:
-        raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm", code="no_noise")
+        refuse("no noise is declared", case.path, "[errors] touch_mm", "no_noise")
     with writing(out, "pivot", inputs=case.inputs, names=(PIVOT, SUMMARY), note=context.watcher.note) as draft:
         with context.stages.time("pivot plan"):
             count = partial(context.watcher.count, "motions")

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import FORMAT, read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
@@ -217,9 +217,8 @@ def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
 def _refuse_two_beds(context: CaseContext, request: ScanRequest) -> None:
     own = [one.name for one in context.case.obstacles if one.frame == "ct"]
     if own and request.beside is not None and request.beside.bed != "none":
-        what = f"the case has what stands in the scanner: {', '.join(own)}"
         allowed = "none, or a case without obstacles in the frame ct"
-        raise InputError(what, where="--bed", allowed=allowed, code="two_beds")
+        refuse(f"the case has what stands in the scanner: {', '.join(own)}", "--bed", allowed, "two_beds")
 
 
 def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volume) -> tuple[Floats, Floats]:
@@ -230,8 +229,7 @@ def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volu
         return scene.target, find_needle(volume, scene.target).tip_ct
     mask = image.labels[solid.layer] == solid.label
     if not mask.any():
-        what = f"'{name}' is not in the image"
-        raise InputError(what, where="scan", allowed="a field of view that shows the target", code="outside_image")
+        refuse(f"'{name}' is not in the image", "scan", "a field of view that shows the target", "outside_image")
     return middle_of(solid.mesh.triangles), read_lesion(volume, mask)
 
 
@@ -397,8 +395,7 @@ def parse_beside(arms: str, bed: str, lines: int) -> OutsideObjects | None:
     """
     for option, word, known in (("--arms", arms, get_args(Arms)), ("--bed", bed, get_args(Bed))):
         if word not in known:
-            what = f"'{word[:40]}' is not known"
-            raise InputError(what, where=option, allowed=", ".join(known), code="unknown_choice")
+            refuse(f"'{word[:40]}' is not known", option, ", ".join(known), "unknown_choice")
     wanted = OutsideObjects(
         next(k for k in get_args(Arms) if k == arms), next(k for k in get_args(Bed) if k == bed), lines
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.formats.points import parse_coordinate
@@ -111,11 +111,9 @@ def sweep_end(source: Path, to: str | None, *, sweep: bool, alone: bool) -> Angl
         InputError: No sweep, or none of one case.
     """
     if not sweep:
-        what = "a sweep ends there"
-        raise InputError(what, where="--to", allowed="--sweep --to THETA,BETA", code="conflicting_options")
+        refuse("a sweep ends there", "--to", "--sweep --to THETA,BETA", "conflicting_options")
     if is_plan(source) or not alone:
-        what = "a sweep is of one case"
-        raise InputError(what, where="--sweep", allowed="a case, no plan, no --seeds", code="conflicting_options")
+        refuse("a sweep is of one case", "--sweep", "a case, no plan, no --seeds", "conflicting_options")
     return parse_angles(to)
 
 
@@ -129,8 +127,7 @@ def parse_angles(text: str | None) -> Angles | None:
         return None
     numbers = [parse_coordinate(part.strip(), "--to") for part in text.split(",")]
     if len(numbers) != 2 or not (0 <= numbers[0] <= 180 and 0 <= numbers[1] <= 360):
-        allowed = "THETA,BETA in degrees, 0 to 180 and 0 to 360"
-        raise InputError(f"'{text[:40]}'", where="--to", allowed=allowed, code="not_a_number")
+        refuse(f"'{text[:40]}'", "--to", "THETA,BETA in degrees, 0 to 180 and 0 to 360", "not_a_number")
     return float(np.radians(numbers[0])), float(np.radians(numbers[1]))
 
 
@@ -148,8 +145,7 @@ def _ends(context: CaseContext, choice: Choice, to: Angles | None) -> tuple[Angl
     windows = find_windows(found)
     near = int(np.argmax(found.outward_ct @ chosen.candidates.outward_ct[row]))
     if not windows.of_row[near]:
-        what = "the direction lies in no window of the grid"
-        raise InputError(what, where="--sweep", allowed="--to THETA,BETA", code="no_window")
+        refuse("the direction lies in no window of the grid", "--sweep", "--to THETA,BETA", "no_window")
     rows = windows.rows(int(windows.of_row[near]))
     far = int(rows[np.argmin(found.outward_ct[rows] @ found.outward_ct[near])])
     return start, (float(found.theta[far]), float(found.beta[far]))

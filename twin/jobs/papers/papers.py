@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.twin.experiment.chen2019 import (
     AS_FOUND,
@@ -192,14 +192,11 @@ def reproduced(
         InputError: A paper that is not known, or has no such experiment; a folder that cannot be written to.
     """
     if paper not in PAPERS:
-        what = f"paper '{paper}' is not known"
-        raise InputError(what, where="reproduce", allowed=", ".join(PAPERS), code="unknown_choice")
+        refuse(f"paper '{paper}' is not known", "reproduce", ", ".join(PAPERS), "unknown_choice")
     if experiment and paper != "chen2019":
-        what = f"{paper} has no such experiment"
-        raise InputError(what, where="--experiment", allowed="reproduce chen2019", code="unknown_choice")
+        refuse(f"{paper} has no such experiment", "--experiment", "reproduce chen2019", "unknown_choice")
     if runs and not experiment:
-        what = "--runs are of the experiment"
-        raise InputError(what, where="--runs", allowed="reproduce chen2019 --experiment", code="conflicting_options")
+        refuse("--runs are of the experiment", "--runs", "reproduce chen2019 --experiment", "conflicting_options")
     return chen2019_experiment(out_dir, seeds, runs, watcher) if experiment else PAPERS[paper](out_dir, seeds)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import load_anatomy, load_skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError, InputListError
+from puncture_twin.planning.base.errors import InputListError, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import Input, inputs_document
@@ -80,8 +80,7 @@ def register_report(
     if markers_base is None:
         return registration_report(source)
     if target is None:
-        what = "two lists of markers need a target"
-        raise InputError(what, where="register", allowed="--target X,Y,Z in mm", code="missing_option")
+        refuse("two lists of markers need a target", "register", "--target X,Y,Z in mm", "missing_option")
     return lists_report(source, markers_base, target, space, fle_mm)
 
 
@@ -127,7 +126,7 @@ def lists_report(
     where = "--target"
     numbers = [parse_coordinate(part.strip(), where) for part in target.split(",")]
     if len(numbers) != 3:
-        raise InputError(f"{len(numbers)} numbers", where=where, allowed="X,Y,Z in mm", code="wrong_count")
+        refuse(f"{len(numbers)} numbers", where, "X,Y,Z in mm", "wrong_count")
     content = [read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)) for path in (markers_ct, markers_base)]
     read = [parse_points(content[0], markers_ct, default_space=space), parse_points(content[1], markers_base)]
     target_ct = to_lps(np.array([numbers]), space)[0]

@@ -14,7 +14,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
@@ -58,8 +58,7 @@ def table_of(source: Path, choice: Choice) -> Path | None:
         InputError: One candidate is chosen, or a plan is the source.
     """
     if choice != BEST or is_plan(source):
-        what = "a table holds all candidates"
-        raise InputError(what, where=source, allowed=f"{ALLOWED}; no choice", code="conflicting_options")
+        refuse("a table holds all candidates", source, f"{ALLOWED}; no choice", "conflicting_options")
     if source.suffix.lower() == ".parquet":
         return source
     table = source / TABLE
@@ -104,7 +103,7 @@ def _table(data: bytes, path: Path) -> pa.Table:
         what = f"no Parquet file ({str(error)[:100]})"
         raise InputError(what, where=path, allowed=ALLOWED, code="not_parquet") from error
     if b"run" not in (table.schema.metadata or {}) or not {*ROUNDED, "verdict"} <= set(table.column_names):
-        raise InputError("no table of candidates", where=path, allowed=ALLOWED, code="no_such_file")
+        refuse("no table of candidates", path, ALLOWED, "no_such_file")
     return table
 
 

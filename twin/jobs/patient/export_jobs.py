@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
@@ -86,8 +86,7 @@ def refuse_format(name: str) -> None:
     """
     known = (*FORMATS, MOVEIT, SLICER, *CANDIDATE_FORMATS)
     if name not in known:
-        what = f"format '{name}' is not known"
-        raise InputError(what, where="--format", allowed=", ".join(known), code="unknown_format")
+        refuse(f"format '{name}' is not known", "--format", ", ".join(known), "unknown_format")
 
 
 def export_source(
@@ -117,13 +116,11 @@ def export_source(
     planned_case = case_of(source, case, choice)
     if format_name == SLICER:
         if is_plan(source):
-            allowed = "a case, with --rank, --window, --theta or --entry"
-            raise InputError("slicer shows a case", where=source, allowed=allowed, code="missing_option")
+            refuse("slicer shows a case", source, "a case, with --rank, --window, --theta or --entry", "missing_option")
         shown = export_to_slicer(prepare(source, watcher=watcher), out, choice)
         return Export(shown, shown.summary(), shown.text())
     if format_name == MOVEIT and planned_case is None:
-        what = "moveit's scene is the case's"
-        raise InputError(what, where=source, allowed="export plan.json --case CASE", code="missing_option")
+        refuse("moveit's scene is the case's", source, "export plan.json --case CASE", "missing_option")
     context = None if planned_case is None else prepare(planned_case, watcher=watcher)
     if format_name == MOVEIT and context is not None:
         done = export_to_moveit(context, source if is_plan(source) else None, out, choice)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.output.publish import Draft
@@ -61,8 +61,7 @@ def certify_options(wanted: bool, size_deg: float | None, touch: float | None) -
     """
     for option, value in (("--certify-touch", touch), ("--certify-size", size_deg)):
         if value is not None and not wanted:
-            what = "of a certificate that nobody asked for"
-            raise InputError(what, where=option, allowed="beside --certify", code="conflicting_options")
+            refuse("of a certificate that nobody asked for", option, "beside --certify", "conflicting_options")
     return CertifyOptions(CERTIFY_DEG if size_deg is None else size_deg, touch) if wanted else None
 
 
@@ -152,8 +151,7 @@ def rehearsed_case(source: Path, case: Path | None, choice: Choice) -> Path:
         InputError: A plan without its case, or see there.
     """
     if (found := case_of(source, case, choice)) is None:
-        what = "a plan needs its case"
-        raise InputError(what, where=source, allowed="rehearse plan.json --case CASE", code="missing_option")
+        refuse("a plan needs its case", source, "rehearse plan.json --case CASE", "missing_option")
     return found
 
 
@@ -166,8 +164,7 @@ def demo_case(context: CaseContext, out: Path) -> Run:
 def _refuse_without_arm(context: CaseContext) -> None:
     if context.reach is None:
         what = "the case does not say where the robot stands, so nothing can be planned"
-        allowed = "[registration] with markers_ct and markers_base, or [robot.mount]"
-        raise InputError(what, where=context.case.path, allowed=allowed, code="no_base")
+        refuse(what, context.case.path, "[registration] with markers_ct and markers_base, or [robot.mount]", "no_base")
 
 
 def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
@@ -360,10 +357,8 @@ def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
     """
     if is_plan(source):
         if choice != BEST:
-            allowed = "a case, where one is to be chosen"
-            raise InputError("a plan has its direction", where=source, allowed=allowed, code="conflicting_options")
+            refuse("a plan has its direction", source, "a case, where one is to be chosen", "conflicting_options")
         return case
     if case is not None:
-        allowed = "CASE alone, or plan.json --case CASE"
-        raise InputError("two cases", where="--case", allowed=allowed, code="conflicting_options")
+        refuse("two cases", "--case", "CASE alone, or plan.json --case CASE", "conflicting_options")
     return source

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.plan.plan import Plan
@@ -105,8 +105,7 @@ def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:
     _check_png(path)
     budget = report.get("budget")
     if budget is None:
-        what = "no error budget to draw"
-        raise InputError(what, where="--picture", allowed="a case with [errors] and an arm", code="no_error_budget")
+        refuse("no error budget to draw", "--picture", "a case with [errors] and an arm", "no_error_budget")
     inputs = read_inputs(report["inputs"])
     with writing(path.parent, f"register {path.name}", inputs=inputs, names=(path.name,), note=lambda _: None) as draft:
         draw_budget(budget, draft.folder / path.name)
@@ -174,7 +173,6 @@ def _budget(context: CaseContext, q_insertion: Floats) -> Mapping[str, Any] | No
 
 def _check_png(path: Path) -> None:
     if path.suffix.lower() != ".png":
-        raise InputError(f"'{path.name}' is no PNG's name", where="--picture", allowed="FILE.png", code="bad_file_name")
+        refuse(f"'{path.name}' is no PNG's name", "--picture", "FILE.png", "bad_file_name")
     if not path.parent.is_dir():
-        what = "there is no such folder"
-        raise InputError(what, where=path.parent, allowed="a folder that is there", code="not_a_folder")
+        refuse("there is no such folder", path.parent, "a folder that is there", "not_a_folder")

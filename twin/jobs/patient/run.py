@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
@@ -52,8 +52,7 @@ def room_count(rooms: int | None, physics: int) -> RoomCount | None:
         InputError: More in the simulator than there are.
     """
     if physics > (rooms or 0):
-        what = "--physics runs some of the rooms"
-        raise InputError(what, where="--physics", allowed="--seeds N --physics K, K <= N", code="conflicting_options")
+        refuse("--physics runs some of the rooms", "--physics", "--seeds N --physics K, K <= N", "conflicting_options")
     return None if rooms is None else RoomCount(rooms, physics)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.twin.guidance.stereo.cameras.bundle import (
     CAMERA_PARAMETERS,
     Bundle,
@@ -145,38 +145,33 @@ def _check_shapes(points: Floats, pixels: Floats, names: Sequence[str] | None, w
     count = len(points)
     if points.shape != (count, 3) or pixels.shape != (count, 2) or (names is not None and len(names) != count):
         what = f"points of shape {points.shape}, pixels of shape {pixels.shape}"
-        raise InputError(what, where=where, allowed="(n, 3), (n, 2), and n names if any", code="wrong_shape")
+        refuse(what, where, "(n, 3), (n, 2), and n names if any", "wrong_shape")
 
 
 def _check_points(points: Floats, pixels: Floats, names: Sequence[str], where: str | Path) -> None:
     lost = np.asarray(~np.isfinite(pixels).all(axis=1))
     if lost.any():
-        what = f"ball not found: {_listed(names, lost)}"
-        raise InputError(what, where=where, allowed="every ball seen", code="ball_not_found")
+        refuse(f"ball not found: {_listed(names, lost)}", where, "every ball seen", "ball_not_found")
     wrong = np.asarray(~np.isfinite(points).all(axis=1))
     if wrong.any():
-        what = f"position not finite: {_listed(names, wrong)}"
-        raise InputError(what, where=where, allowed="finite mm", code="not_finite")
+        refuse(f"position not finite: {_listed(names, wrong)}", where, "finite mm", "not_finite")
     distinct = len(np.unique(points, axis=0))
     if distinct < MIN_POINTS:
-        what = f"{distinct} distinct points"
-        raise InputError(what, where=where, allowed=f"{MIN_POINTS} or more, not in a plane", code="too_few_points")
+        refuse(f"{distinct} distinct points", where, f"{MIN_POINTS} or more, not in a plane", "too_few_points")
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[2] < COPLANAR * spread[0]:
         what = f"the points are coplanar: {spread[2] / spread[0]:.2g} as thick as long"
         allowed = f"a set at least {COPLANAR:g} as thick as long, such as a 3 x 2 x 2 grid"
-        raise InputError(what, where=where, allowed=allowed, code="points_coplanar")
+        refuse(what, where, allowed, "points_coplanar")
 
 
 def _check_linear(linear: LinearFit, points: Floats, pixels: Floats, names: Sequence[str], where: str | Path) -> None:
     if linear.condition > CRITICAL:
-        what = f"the points leave the camera free (condition {linear.condition:.2g})"
         allowed = "points that are not on a plane and a line, or on a twisted cubic through the camera"
-        raise InputError(what, where=where, allowed=allowed, code="undetermined")
+        refuse(f"the points leave the camera free (condition {linear.condition:.2g})", where, allowed, "undetermined")
     behind = np.asarray(points @ linear.M[2, :3] + linear.M[2, 3] <= 0)
     if behind.any():
-        what = f"behind the camera: {_listed(names, behind)}"
-        raise InputError(what, where=where, allowed="all in front of it", code="behind_camera")
+        refuse(f"behind the camera: {_listed(names, behind)}", where, "all in front of it", "behind_camera")
     misses = np.linalg.norm(project(linear.M, points) - pixels, axis=1)
     _check_misses(misses, names, where)
 
@@ -185,7 +180,7 @@ def _check_fit(bundle: Bundle, points: Floats, names: Sequence[str], where: str 
     unseen = np.asarray(~np.isfinite(bundle.cameras[0].project(points)).all(axis=1))
     if unseen.any():
         what = f"behind the camera or beyond its lens: {_listed(names, unseen)}"
-        raise InputError(what, where=where, allowed="all in its view", code="behind_camera")
+        refuse(what, where, "all in its view", "behind_camera")
     _check_misses(np.linalg.norm(bundle.residuals_px, axis=1), names, where)
 
 
@@ -193,7 +188,7 @@ def _check_misses(misses: Floats, names: Sequence[str], where: str | Path) -> No
     worst = int(np.argmax(misses))
     if misses[worst] > MAX_RESIDUAL_PX:
         what = f"{names[worst]} misses by {misses[worst]:.1f} px: swapped, moved or found wrongly"
-        raise InputError(what, where=where, allowed=f"residuals up to {MAX_RESIDUAL_PX:g} px", code="point_misses")
+        refuse(what, where, f"residuals up to {MAX_RESIDUAL_PX:g} px", "point_misses")
 
 
 def _listed(names: Sequence[str], rows: NDArray[np.bool_]) -> str:

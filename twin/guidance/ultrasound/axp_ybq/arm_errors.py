@@ -24,7 +24,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import PARAMETERS, check_flanges, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
@@ -123,8 +123,7 @@ def arm_errors(declared: DeclaredArms, recording: Recording) -> ArmErrors:
     """
     q_probe, q_needle = recording.q_probe, recording.q_needle
     if q_probe is None or q_needle is None:
-        what = "the arms' errors need the joints"
-        raise InputError(what, where="recording", allowed="columns A_q1_deg to B_q6_deg", code="missing_column")
+        refuse("the arms' errors need the joints", "recording", "columns A_q1_deg to B_q6_deg", "missing_column")
     for arm, q, T, of in ((declared.probe, q_probe, recording.A, "A"), (declared.needle, q_needle, recording.B, "B")):
         names = [f"{of} in pose {name}" for name in recording.names]
         check_flanges(arm.model, q, T, names=names, where="recording")

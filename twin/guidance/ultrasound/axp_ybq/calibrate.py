@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibration_of, with_length
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
@@ -79,8 +79,7 @@ def calibrate(
         Degenerate: The poses cannot show every unknown. It names the motion and proposes further poses.
     """
     if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
-        what = f"needle length {needle_length_mm}"
-        raise InputError(what, where="needle_length_mm", allowed="a positive number, mm", code="not_positive")
+        refuse(f"needle length {needle_length_mm}", "needle_length_mm", "a positive number, mm", "not_positive")
     _check(recording, known_tip, scale, start)
     errors = None if arms is None else arm_errors(arms, recording)
     poses = recording if errors is None else without_play(recording, errors)
@@ -100,17 +99,15 @@ def calibrate(
 
 def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: Estimate | None) -> None:
     if recording.pixels and not scale:
-        what = "the tip is in pixels"
-        raise InputError(what, where="recording", allowed="mm, or mm per pixel to be found (scale)", code="wrong_unit")
+        refuse("the tip is in pixels", "recording", "mm, or mm per pixel to be found (scale)", "wrong_unit")
     if known_tip is not None and (np.shape(known_tip) != (3,) or not np.isfinite(known_tip).all()):
-        what = f"known tip {known_tip}"
-        raise InputError(what, where="known_tip", allowed="three finite numbers, mm, frame end2", code="not_finite")
+        refuse(f"known tip {known_tip}", "known_tip", "three finite numbers, mm, frame end2", "not_finite")
     least = LEAST_POSES if known_tip is None else LEAST_POSES_KNOWN_TIP
     if start is not None:
         least = len(active_columns(tip=known_tip is None, scale=scale, direction=False)) // 3 + 1
     if len(recording) < least:
         allowed = f"{least} or more" + (f", better {ADVISED_POSES}" if least == LEAST_POSES else "")
-        raise InputError(f"{len(recording)} poses", where="recording", allowed=allowed, code="too_few_poses")
+        refuse(f"{len(recording)} poses", "recording", allowed, "too_few_poses")
 
 
 def _solve(

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import Finding, InputError, Severity
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
     DIRECTION,
@@ -147,7 +147,7 @@ def agreed_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.
     backward = np.asarray(seen @ axis < 0.0)
     if backward[kept].sum() > 0.5 * kept.sum():
         what = f"{_counted(recording.names, backward, REVERSED)}: by it the tip would lie behind the flange"
-        raise InputError(what, where="recording", allowed=ALLOWED, code="directions_reversed")
+        refuse(what, "recording", ALLOWED, "directions_reversed")
     agrees = (angles <= max(FAR * middle / HALF_NORMAL, LEAST_ANGLE)) & ~backward
     total = (agrees & kept) @ seen
     V = np.asarray(total / np.linalg.norm(total))
@@ -175,7 +175,7 @@ def _refuse_scattered(estimate: Estimate, recording: Recording, kept: NDArray[np
         other = float(np.median(_common_axis(directions_end2(estimate, replace(recording, v=v)), kept)[1][kept]))
         if other < min(BETTER * middle, SCATTERED_RAD):
             what += f"; they would agree ({np.degrees(other):.1f} deg) if {slip}"
-    raise InputError(what, where="recording", allowed=ALLOWED, code="directions_scattered")
+    refuse(what, "recording", ALLOWED, "directions_scattered")
 
 
 def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection) -> tuple[Finding, ...]:

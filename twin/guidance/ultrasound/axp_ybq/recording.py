@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from puncture_twin.planning.formats.points import joint_readings
@@ -93,7 +93,7 @@ class Recording:
         names = tuple(self.names) or tuple(str(i + 1) for i in range(n))
         if n == 0 or len(names) != n or len(set(names)) != n:
             what = f"{n} poses and {len(set(names))} different names"
-            raise InputError(what, where="recording", allowed="one name per pose", code="duplicate_name")
+            refuse(what, "recording", "one name per pose", "duplicate_name")
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "A", _rigid(self.A, "A", names))
         object.__setattr__(self, "B", _rigid(self.B, "B", names))
@@ -103,14 +103,12 @@ class Recording:
         if self.shaft_mm is not None:
             object.__setattr__(self, "shaft_mm", _lengths(self.shaft_mm, self.v, names))
         if (self.q_probe is None) != (self.q_needle is None):
-            what = "joints of one arm only"
-            raise InputError(what, where="recording", allowed="those of both, or none", code="joints_of_one_arm")
+            refuse("joints of one arm only", "recording", "those of both, or none", "joints_of_one_arm")
         for key in ("q_probe", "q_needle"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, _angles(getattr(self, key), key, names))
         if (self.turn_probe is None) != (self.turn_needle is None) or (self.turn_probe is not None and not self.joints):
-            what = "turns without joints, or of one arm only"
-            raise InputError(what, where="recording", allowed="both, with joints", code="joints_of_one_arm")
+            refuse("turns without joints, or of one arm only", "recording", "both, with joints", "joints_of_one_arm")
         for key in ("turn_probe", "turn_needle"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, _signs(getattr(self, key), key, names))
@@ -147,8 +145,7 @@ class Recording:
         """
         widths = [None if r.v is None else r.v.shape[1] for r in (self, other)]
         if widths[0] != widths[1] or self.pixels != other.pixels:
-            what = "two recordings that hold different things"
-            raise InputError(what, where="recording", allowed="the same columns", code="tables_differ")
+            refuse("two recordings that hold different things", "recording", "the same columns", "tables_differ")
         A, B, P = (np.concatenate([getattr(r, key) for r in (self, other)]) for key in "ABP")
         parts: dict[str, Any] = {key: _both(getattr(self, key), getattr(other, key)) for key in OPTIONAL}
         return Recording(A, B, P, pixels=self.pixels, **parts)
@@ -163,7 +160,7 @@ def _finite(values: Floats, what: str, names: tuple[str, ...], *, widths: tuple[
     array = np.array(values, dtype=np.float64)
     if array.ndim != 2 or len(array) != len(names) or array.shape[1] not in widths:
         wanted = " or ".join(f"({len(names)}, {width})" for width in widths)
-        raise InputError(f"{what} has shape {array.shape}", where="recording", allowed=wanted, code="wrong_shape")
+        refuse(f"{what} has shape {array.shape}", "recording", wanted, "wrong_shape")
     bad = np.asarray(~(np.isfinite(array) & (np.abs(array) <= MAX_COORDINATE_MM)).all(axis=1))
     _refuse_first(
         bad, names, what, "is not finite or out of range", f"numbers within {MAX_COORDINATE_MM:g}", "not_finite"
@@ -180,8 +177,7 @@ def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
 
 def _lengths(values: Floats, v: Floats | None, names: tuple[str, ...]) -> Floats:
     if v is None:
-        what = "shaft_mm without directions"
-        raise InputError(what, where="recording", allowed="beside v, or not at all", code="missing_column")
+        refuse("shaft_mm without directions", "recording", "beside v, or not at all", "missing_column")
     array = _finite(np.reshape(values, (-1, 1)), "shaft_mm", names, widths=(1,))[:, 0]
     _refuse_first(
         array < LEAST_SHAFT_MM, names, "shaft_mm", "is too little", f"at least {LEAST_SHAFT_MM:g} mm", "out_of_range"
@@ -199,8 +195,7 @@ def _signs(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
 def _rigid(T: Floats, what: str, names: tuple[str, ...]) -> Floats:
     array = np.array(T, dtype=np.float64)
     if array.shape != (len(names), 4, 4):
-        allowed = f"({len(names)}, 4, 4)"
-        raise InputError(f"{what} has shape {array.shape}", where="recording", allowed=allowed, code="wrong_shape")
+        refuse(f"{what} has shape {array.shape}", "recording", f"({len(names)}, 4, 4)", "wrong_shape")
     _finite(array.reshape(len(names), 16), what, names, widths=(16,))
     R = array[:, :3, :3]
     error = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2))
@@ -227,4 +222,4 @@ def _refuse_first(
 ) -> None:
     if bad.any():
         name = names[int(np.argmax(bad))]
-        raise InputError(f"{what} of pose {name} {problem}", where="recording", allowed=allowed, code=code)
+        refuse(f"{what} of pose {name} {problem}", "recording", allowed, code)

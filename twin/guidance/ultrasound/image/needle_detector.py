@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager
 
@@ -192,8 +192,7 @@ def detect(image: Pixels, imager: Imager, settings: DetectorSettings | None = No
     settings = settings or DetectorSettings()
     if image.shape != (imager.rows, imager.columns):
         size = f"({imager.rows}, {imager.columns})"
-        what = f"picture of shape {image.shape}"
-        raise InputError(what, where="needle detector", allowed=f"{size}, the imager's", code="wrong_shape")
+        refuse(f"picture of shape {image.shape}", "needle detector", f"{size}, the imager's", "wrong_shape")
     relative = over_background(image, imager)
     segment = _segment(relative, imager, settings)
     length = float(np.linalg.norm(segment.end - segment.start))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 
 Complexes = NDArray[np.complexfloating]
 """Single precision inside: the display has 256 greys."""
@@ -328,6 +328,5 @@ def _require_usable(needle: NeedleInImage) -> None:
     tip, direction = np.asarray(needle.tip_image), np.asarray(needle.direction_image)
     usable = tip.shape == (3,) and direction.shape == (3,) and bool(np.isfinite([*tip, *direction]).all())
     if not usable or abs(float(np.linalg.norm(direction)) - 1.0) > UNIT:
-        what = f"needle at {tip.tolist()} along {direction.tolist()}"
         allowed = "a finite tip (3,) in mm and a unit direction (3,)"
-        raise InputError(what, where="B-mode picture", allowed=allowed, code="not_finite")
+        refuse(f"needle at {tip.tolist()} along {direction.tolist()}", "B-mode picture", allowed, "not_finite")
