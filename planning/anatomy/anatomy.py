@@ -229,13 +229,11 @@ def _check_names(case: Case, structures: list[Structure]) -> None:
     if twice:
         refuse(f"structure '{twice[0]}' stands twice", case.path, "unique names", "duplicate_name")
     if case.target_structure not in names:
-        refuse(
+        what = (
             f"target.structure '{case.target_structure}' is no structure of the case"
-            f"{did_you_mean(case.target_structure, names)}",
-            case.path,
-            ", ".join(names),
-            "unknown_structure",
+            f"{did_you_mean(case.target_structure, names)}"
         )
+        refuse(what, case.path, ", ".join(names), "unknown_structure")
 
 
 def _check_demands(case: Case, structures: list[Structure]) -> None:

@@ -92,6 +92,8 @@ def atomic(path: Path) -> Iterator[Path]:
     temporary.chmod(0o644)
     try:
         yield temporary
+        if path.is_dir():
+            refuse("is a folder", _shown(path), "the name of a file", "unwritable")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -127,18 +129,19 @@ def _shown(path: Path) -> str:
     return str(path).encode("utf-8", "replace").decode("utf-8")[:200]
 
 
-def read_input(path: Path, *, max_bytes: int, where: str) -> bytes:
+def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> bytes:
     """All bytes of a file.
 
     Args:
         path: The file.
         max_bytes: A larger one is refused before it is read.
         where: How the error names it.
+        allowed: What is wanted there; empty for any file.
 
     Raises:
         InputError: If it is missing, no regular file, empty, too large, or not readable.
     """
-    allowed = f"a readable file of 1 to {max_bytes} bytes"
+    allowed = allowed or f"a readable file of 1 to {max_bytes} bytes"
     try:
         if not path.exists():
             other = _other_case(path)

@@ -11,6 +11,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.files import read_input
 
 MAX_BYTES = 1_000_000
 """Such a file is written by hand; a larger one is something else."""
@@ -77,13 +78,7 @@ def read_toml_bytes(path: Path, allowed: str) -> bytes:
     Raises:
         InputError: Unreadable, or too large.
     """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            refuse("larger than 1 MB, not written by hand", path, allowed, "file_size")
-        return path.read_bytes()
-    except OSError as error:
-        what = f"cannot be read ({error.strerror})"
-        raise InputError(what, where=path, allowed=allowed, code="unreadable") from error
+    return read_input(path, max_bytes=MAX_BYTES, where=str(path), allowed=allowed)
 
 
 def parse_toml(

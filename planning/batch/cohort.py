@@ -18,7 +18,7 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 from pydantic import Field
 
 from puncture_twin.planning.base.errors import InputError, one_line, refuse
-from puncture_twin.planning.base.files import is_folder, read_input
+from puncture_twin.planning.base.files import decode_text, is_folder, read_input
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.base.toml_file import SchemaOne, parse_toml
@@ -155,10 +155,7 @@ def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
 
 def _rows(content: bytes, path: Path) -> Any:
     """Lines of a CSV as a reader that counts them."""
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"is not UTF-8 ({error})", where=path, allowed="a CSV in UTF-8", code="not_text") from error
+    text = decode_text(content, str(path))
     if "\0" in text or max(map(len, text.splitlines()), default=0) > LONGEST_CELL:
         refuse("is no CSV", path, f"text, lines of at most {LONGEST_CELL} characters", "not_csv")
     return csv.reader(io.StringIO(text), strict=False)

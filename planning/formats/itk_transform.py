@@ -268,20 +268,12 @@ def _groups(h5py: Any, file: Any, where: str) -> list[Any]:
         refuse(f"HDF5 without {_GROUP}", where, ALLOWED, "wrong_format")
     parent = _own(h5py, file, _GROUP, h5py.Group, where)
     if not 0 < len(parent) <= MAX_PARTS + 1:
-        refuse(
-            f"{len(parent)} transforms",
-            where,
-            f"1, or at most {MAX_PARTS} parts of a CompositeTransform",
-            "wrong_count",
-        )
+        what = f"{len(parent)} transforms"
+        refuse(what, where, f"1, or at most {MAX_PARTS} parts of a CompositeTransform", "wrong_count")
     names = [str(number) for number in range(len(parent))]
     if set(parent) != set(names):
-        refuse(
-            f"{_GROUP} with {', '.join(sorted(parent))[:60]}",
-            where,
-            f"transforms numbered {', '.join(names)}",
-            "wrong_format",
-        )
+        what = f"{_GROUP} with {', '.join(sorted(parent))[:60]}"
+        refuse(what, where, f"transforms numbered {', '.join(names)}", "wrong_format")
     return [_own(h5py, parent, name, h5py.Group, where) for name in names]
 
 
@@ -319,12 +311,8 @@ class _Members:
         if data is None or data.size > MAX_NUMBERS:
             return np.empty(0)
         if data.dtype not in (np.float64, np.float32) or data.ndim != 1:
-            refuse(
-                f"{data.name} of {data.dtype} with shape {data.shape}",
-                self._where,
-                "a list of floats or doubles",
-                "wrong_type",
-            )
+            what = f"{data.name} of {data.dtype} with shape {data.shape}"
+            refuse(what, self._where, "a list of floats or doubles", "wrong_type")
         return np.asarray(data[()], dtype=np.float64)
 
     def _dataset(self, name: str) -> Any:

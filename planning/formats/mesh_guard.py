@@ -52,9 +52,8 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
     surface = _without_unused(points, indices)
     _check_not_tiny(surface.points, where=where)
     if not _any_area(surface):
-        refuse(
-            f"none of the {len(indices)} triangles has an area", where, "at least one triangle with an area", "no_area"
-        )
+        what = f"none of the {len(indices)} triangles has an area"
+        refuse(what, where, "at least one triangle with an area", "no_area")
     return TriangleMesh(surface.points, surface.indices)
 
 

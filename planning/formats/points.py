@@ -15,9 +15,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 import re
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.base.files import decode_text, read_input
+from puncture_twin.planning.base.files import atomic, decode_text, read_input
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.formats.guard import guard_points
@@ -153,21 +151,20 @@ def write_points(path: Path, points: NamedPoints) -> None:
     labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)
     numbers = points.points if points.joints is None else np.hstack([points.points, np.degrees(points.joints)])
     rows = [[*label, *map(repr, row)] for label, row in zip(labels, numbers.tolist(), strict=True)]
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    except OSError as error:
-        what = f"cannot be written ({error})"
-        raise InputError(what, where=path, allowed="a folder to write to", code="unwritable") from error
-    part = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([header, *rows])
-        part.replace(path)
-    except OSError as error:
-        what = f"cannot be written ({error})"
-        raise InputError(what, where=path, allowed="a file name of a folder", code="unwritable") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with atomic(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([header, *rows])
+
+
+def parse_triple(text: str, where: str, allowed: str = "X,Y,Z in mm") -> tuple[float, float, float]:
+    """Three numbers as they are typed, with commas between them.
+
+    Raises:
+        InputError: More or fewer, or one that is no finite number.
+    """
+    numbers = [parse_coordinate(part.strip(), where) for part in text.split(",")]
+    if len(numbers) != 3:
+        refuse(f"{len(numbers)} numbers", where, allowed, "wrong_count")
+    return numbers[0], numbers[1], numbers[2]
 
 
 class RawPoints(NamedTuple):
@@ -214,7 +211,9 @@ _ALLOWED = (
 )
 
 
-class _Row(NamedTuple):
+class CsvLine(NamedTuple):
+    """A line of a CSV: its number in the file, from 1, and its fields."""
+
     line: int
     fields: list[str]
 
@@ -229,7 +228,7 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
     Raises:
         InputError: If the header or a line is not understood; the error names the line.
     """
-    rows = list(_rows(data, where))
+    rows = list(csv_lines(data, where, _ALLOWED))
     if not rows:
         refuse("no line", where, _ALLOWED, "empty")
     header = [field.strip() for field in rows[0].fields]
@@ -258,15 +257,20 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
     )
 
 
-def _rows(data: bytes, where: str) -> Iterator[_Row]:
+def csv_lines(data: bytes, where: str, allowed: str) -> Iterator[CsvLine]:
+    """The lines of a CSV that are not empty.
+
+    Raises:
+        InputError: It is no CSV; names the line, and what is ``allowed``.
+    """
     reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
     try:
         for fields in reader:
             if any(field.strip() for field in fields):
-                yield _Row(reader.line_num, fields)
+                yield CsvLine(reader.line_num, fields)
     except csv.Error as error:
-        what = f"{error}"
-        raise InputError(what, where=f"{where}, line {reader.line_num}", allowed=_ALLOWED, code="not_csv") from error
+        place = f"{where}, line {reader.line_num}"
+        raise InputError(f"is no CSV ({error})", where=place, allowed=allowed, code="not_csv") from error
 
 
 def _unit(header: list[str], where: str) -> Unit | None:
@@ -387,12 +391,8 @@ def _slicer_unit(value: object, where: str) -> Unit:
         return Unit.MM
     text = value[0] if isinstance(value, list) and value else value
     if not isinstance(text, str):
-        refuse(
-            f"coordinateUnits {str(value)[:40]!r}",
-            where,
-            'such as "mm" or ["mm", "UCUM", "millimeter"]',
-            "unknown_unit",
-        )
+        what = f"coordinateUnits {str(value)[:40]!r}"
+        refuse(what, where, 'such as "mm" or ["mm", "UCUM", "millimeter"]', "unknown_unit")
     return parse_unit(text, where=where)
 
 

@@ -60,12 +60,8 @@ def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: st
     if len(counts) == 0:
         refuse("no face", where, "at least one triangle", "empty")
     if counts.min() < 3:
-        refuse(
-            f"face {int(np.argmin(counts))} has {counts.min()} corners",
-            where,
-            "3 or more corners per face",
-            "wrong_count",
-        )
+        what = f"face {int(np.argmin(counts))} has {counts.min()} corners"
+        refuse(what, where, "3 or more corners per face", "wrong_count")
     if (counts == 3).all():
         return corners.reshape(-1, 3)
     total = int(counts.sum() - 2 * len(counts))

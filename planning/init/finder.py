@@ -258,10 +258,8 @@ class _Looker:
             yield
         except InputError as error:
             way = f"; or --ignore {name}, so that what it shows counts as free" if name else ""
-            code, numbers = error.code, error.numbers
-            self._found.problems.append(
-                type(error)(error.what, where=error.where, allowed=error.allowed + way, code=code, numbers=numbers)
-            )
+            error.allowed += way
+            self._found.problems.append(error)
 
     def _volumes(self, names: Sequence[str]) -> None:
         """CTs and label maps one by one; masks together, as a folder of masks where it holds nothing else."""

@@ -208,12 +208,8 @@ def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence
     if naming is None:
         passed = f"no table beside it names all of its labels: {first_few(others)}"
         tables = passed if others else "no table of names is beside it"
-        refuse(
-            NUMBERING_UNSURE.format(tables=tables),
-            place.folder / source,
-            f"--naming with {', '.join(BUILT_IN)} or a table (CSV, JSON) that names every label",
-            "labels_without_names",
-        )
+        allowed = f"--naming with {', '.join(BUILT_IN)} or a table (CSV, JSON) that names every label"
+        refuse(NUMBERING_UNSURE.format(tables=tables), place.folder / source, allowed, "labels_without_names")
     return naming, (NUMBERING_FOUND.format(source=source, naming=naming), *(f"{source}: {one}" for one in others))
 
 

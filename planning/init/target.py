@@ -13,7 +13,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.evidence.target import Likely, likely_target
-from puncture_twin.planning.formats.points import parse_coordinate
+from puncture_twin.planning.formats.points import parse_triple
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -54,10 +54,7 @@ def parse_point(text: str, space: Space) -> Floats:
     Raises:
         InputError: Not three numbers.
     """
-    numbers = [parse_coordinate(part.strip(), "--target") for part in text.split(",")]
-    if len(numbers) != 3:
-        refuse(f"{len(numbers)} numbers", "--target", "X,Y,Z in mm", "wrong_count")
-    return np.asarray(to_lps(np.array([numbers]), space)[0])
+    return np.asarray(to_lps(np.array([parse_triple(text, "--target")]), space)[0])
 
 
 def typed_target(
@@ -105,13 +102,12 @@ def _refuse_lesion_elsewhere(point_ct: Floats, outlines: Outlines, space: Space)
     """A point in no structure is a slip, whatever space was stated, where the other space puts it into a lesion."""
     holders = _other_holders(point_ct, outlines)
     if space is not Space.LOCAL and likely_target(holders) is Likely.LESION:
-        refuse(
+        what = (
             f"target ({point_text(point_ct, space)}) lies in no structure"
-            f"{_other_reading(point_ct, outlines, space, ())}",
-            "--target",
-            "the other --space; or --hit-radius MM, where a target in no structure is meant",
-            "target_in_no_structure",
+            f"{_other_reading(point_ct, outlines, space, ())}"
         )
+        allowed = "the other --space; or --hit-radius MM, where a target in no structure is meant"
+        refuse(what, "--target", allowed, "target_in_no_structure")
 
 
 def _own_target(point_ct: Floats, outlines: Outlines, holders: Sequence[str], radius_mm: float) -> Target:

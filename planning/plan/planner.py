@@ -20,7 +20,7 @@ from puncture_twin.planning.reach.survey import ReachAnswer
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import reach_request
-from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chance_model import satisfies_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
@@ -51,8 +51,7 @@ def make_plan(context: CaseContext, candidates: Candidates, *, seed: int, rows: 
         NoAnswerError: No candidate is safe, or none of the best can be come to.
     """
     if context.reach is None:
-        allowed = "[registration] with markers, or [robot.mount]"
-        refuse("the case does not say where the robot stands", context.case.path, allowed, "no_base")
+        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
     last = "no candidate is safe"
     for row in (candidates.ranked if rows is None else rows)[:MAX_TRIES]:
         try:

@@ -102,13 +102,11 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
         refuse(what, where, "both sides in mm", "wrong_unit")
     span = max(_span(markers.points_ct), _span(markers.points_base))
     if span < LEAST_SPAN_MM:
-        refuse(
+        what = (
             f"markers {', '.join(markers.names)} span {span:.2g} mm, no more than a needle tells apart: a likely slip "
-            "of unit (m or cm as mm) on both sides",
-            where,
-            f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least",
-            "wrong_unit",
+            "of unit (m or cm as mm) on both sides"
         )
+        refuse(what, where, f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least", "wrong_unit")
 
 
 def _span(points: Floats) -> float:

@@ -130,23 +130,19 @@ def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, 
     mirrored = _least_squares(markers.points_ct, markers.points_base, mirrored=True)
     best = _rms(apply(mirrored, markers.points_ct) - markers.points_base)
     if _rms(residuals) > MIRROR_GAIN * best + 1.0:
-        refuse(
+        what = (
             f"markers {', '.join(markers.names)} match only mirrored (rms {best:.2f} mm against "
-            f"{_rms(residuals):.2f} mm){better_names(markers, target_ct, _rms(residuals))}",
-            where,
-            "both sides right-handed: check LPS/RAS and the marker names",
-            "markers_mirrored",
+            f"{_rms(residuals):.2f} mm){better_names(markers, target_ct, _rms(residuals))}"
         )
+        refuse(what, where, "both sides right-handed: check LPS/RAS and the marker names", "markers_mirrored")
     lengths = np.linalg.norm(residuals, axis=1)
     worst = int(np.argmax(lengths))
     if lengths[worst] > MAX_RESIDUAL_MM:
-        refuse(
+        what = (
             f"marker {markers.names[worst]} misses by {lengths[worst]:.1f} mm: swapped, moved or mistyped"
-            f"{better_names(markers, target_ct, _rms(residuals))}",
-            where,
-            f"residuals up to {MAX_RESIDUAL_MM:g} mm",
-            "marker_misses",
+            f"{better_names(markers, target_ct, _rms(residuals))}"
         )
+        refuse(what, where, f"residuals up to {MAX_RESIDUAL_MM:g} mm", "marker_misses")
 
 
 MAX_NUMBERS = 20_000_000

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -14,12 +12,18 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import decode_text, read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
-from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_coordinate, parse_points
+from puncture_twin.planning.formats.points import (
+    MAX_FILE_BYTES,
+    csv_lines,
+    parse_coordinate,
+    parse_points,
+    parse_triple,
+)
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
@@ -175,7 +179,8 @@ def parse_choice(
     angles = None if theta_deg is None or beta_deg is None else (np.radians(theta_deg), np.radians(beta_deg))
     if entry is not None and entry.lower().endswith(FILES):
         return Choice(entry_file=Path(entry))
-    return Choice(angles, rank, window, None if entry is None else _parse_point(entry))
+    entry_mm = None if entry is None else parse_triple(entry, "--entry", "X,Y,Z in mm, in the case's space")
+    return Choice(angles, rank, window, entry_mm)
 
 
 def with_file_read(case: Case, choice: Choice) -> Choice:
@@ -197,14 +202,6 @@ def with_file_read(case: Case, choice: Choice) -> Choice:
         refuse(f"neither end is the target: {away.min():.1f} mm away from it", path, allowed, "line_misses_target")
     x, y, z = to_lps(points[[int(np.argmax(away))]], case.space)[0].tolist()  # the change of signs undoes itself
     return replace(choice, entry_mm=(x, y, z), read=(content_input("entry", str(path), data),))
-
-
-def _parse_point(text: str) -> tuple[float, float, float]:
-    where = "--entry"
-    numbers = [parse_coordinate(part.strip(), where) for part in text.split(",")]
-    if len(numbers) != 3:
-        refuse(f"{len(numbers)} numbers", where, "X,Y,Z in mm, in the case's space", "wrong_count")
-    return numbers[0], numbers[1], numbers[2]
 
 
 def _entry_ct(case: Case, choice: Choice) -> Floats:
@@ -309,20 +306,10 @@ def _angle_rows(data: bytes, path: Path) -> tuple[Listed, ...]:
     header = _header(data, path)
     if sorted(header) not in (sorted(ANGLES), sorted((*ANGLES, "name"))):
         refuse(f"columns {header}"[:200], f"{path}, header", ALLOWED_ANGLES, "wrong_columns")
-    reader = csv.reader(io.StringIO(decode_text(data, str(path)), newline=""), strict=True)
-    rows: list[Listed] = []
-    try:
-        next(reader)
-        for fields in reader:
-            if any(field.strip() for field in fields):
-                where = f"{path}, line {reader.line_num}"
-                rows.append(_angle_row(len(rows) + 1, header, fields, where))
-    except csv.Error as error:
-        where = f"{path}, line {reader.line_num}"
-        raise InputError(f"{error}", where=where, allowed=ALLOWED_ANGLES, code="not_csv") from error
-    if not rows:
+    lines = list(csv_lines(data, str(path), ALLOWED_ANGLES))[1:]
+    if not lines:
         refuse("no line", path, ALLOWED_ANGLES, "empty")
-    return tuple(rows)
+    return tuple(_angle_row(i, header, fields, f"{path}, line {line}") for i, (line, fields) in enumerate(lines, 1))
 
 
 def _angle_row(number: int, header: list[str], fields: list[str], where: str) -> Listed:

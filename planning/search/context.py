@@ -55,7 +55,7 @@ COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "dir
 """The unit of each engine's progress."""
 
 NO_BASE = "the case does not say where the robot's base is"
-ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]; or a check without the arm"
+ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ def prepare(
         case = case if target_ct is None else case.aimed_at(target_ct)
         placement = load_placement(case)
     if arm and placement is None:
-        refuse(f"the arm is to be checked, but {NO_BASE}", case.path, ALLOWED_BASE, "no_base")
+        refuse(NO_BASE, case.path, f"{ALLOWED_BASE}; or a check without the arm", "no_base")
     with stages.time("anatomy"):
         cache = replace(user_cache(), memory=memory)
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), cache)

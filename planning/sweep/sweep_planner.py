@@ -28,7 +28,7 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.reach.reach import approach_goals
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.reach.survey import ReachRequest
-from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
 from puncture_twin.planning.search.explain import reason_text
 
 
@@ -92,7 +92,7 @@ def plan_sweep(
         NoAnswerError: The first directions are not allowed, or no approach to them was found.
     """
     if context.reach is None:
-        refuse("the case does not say where the robot stands", context.case.path, _BASE, "no_base")
+        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
     route = _allowed(context, _angles(start, end), progress)
     point = apply(context.reach.T_base_ct, context.case.target_ct)
     T_base_ct, frame = context.reach.T_base_ct, context.case.T_ct_entry[:3, :3]
@@ -123,9 +123,6 @@ def plan_sweep(
         sweep,
         stopped,
     )
-
-
-_BASE = "[registration] with markers, or [robot.mount]"
 
 
 def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:

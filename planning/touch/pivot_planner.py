@@ -20,7 +20,7 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
 from puncture_twin.planning.touch.touch_planner import PLANNED_PADDING_MM, approach_checkers
 from puncture_twin.planning.touch.tour_motions import (
     ApproachCheckers,
@@ -69,7 +69,7 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
         NoAnswerError: No place, or not this one, can be touched in so many poses, or no motion was found.
     """
     if context.reach is None:
-        refuse("no robot", context.case.path, "a case with [robot], placed in its base frame", "no_base")
+        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
     checkers = approach_checkers(context, PLANNED_PADDING_MM)
     places, most = _places(context) if place_base is None else [place_base], 0
     for place in places:

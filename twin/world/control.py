@@ -311,13 +311,11 @@ def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> No
     """
     ratio = stability_ratio(stiffness, J, M, dt)
     if not ratio < MOST_RATIO:
-        refuse(
+        what = (
             f"a stiffness of {stiffness.translation_n_m:g} N/m at steps of {1e3 * dt:g} ms would diverge: "
-            f"sqrt(K/m) dt = {ratio:.2f}",
-            "impedance",
-            f"below {MOST_RATIO}: less stiffness or a shorter step",
-            "control_unstable",
+            f"sqrt(K/m) dt = {ratio:.2f}"
         )
+        refuse(what, "impedance", f"below {MOST_RATIO}: less stiffness or a shorter step", "control_unstable")
 
 
 @dataclass(frozen=True, eq=False)

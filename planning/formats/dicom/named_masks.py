@@ -79,9 +79,5 @@ def check_frame_of_reference(stated: str, ct: CtSeries, where: Path) -> None:
     """
     if stated != ct.frame_of_reference or not stated:
         what = f"lies in the frame of reference {stated or 'not stated'}, the CT {ct.path.name} in "
-        refuse(
-            f"{what}{ct.frame_of_reference or 'one that is not stated'}",
-            where,
-            "structures that were drawn on this CT, or on one that was registered to it",
-            "other_frame_of_reference",
-        )
+        allowed = "structures that were drawn on this CT, or on one that was registered to it"
+        refuse(f"{what}{ct.frame_of_reference or 'one that is not stated'}", where, allowed, "other_frame_of_reference")

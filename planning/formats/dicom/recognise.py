@@ -221,12 +221,9 @@ def choose_series(path: Path) -> SeriesFiles:
     read = {one.name: Entry(one.name, FILE) for one in found}
     left = unaccounted(folder, (*others, *read.values()), lambda path: path.name in read)
     if lost := [one for one in left if _may_be_slice(one, names)]:
-        refuse(
-            f"beside the slices lies what is not read, and may be a slice: {first_few([one.line for one in lost])}",
-            path,
-            "every slice of the series as a whole DICOM file (fetch it, copy it again, or move it elsewhere)",
-            "slices_not_read",
-        )
+        what = f"beside the slices lies what is not read, and may be a slice: {first_few([one.line for one in lost])}"
+        allowed = "every slice of the series as a whole DICOM file (fetch it, copy it again, or move it elsewhere)"
+        refuse(what, path, allowed, "slices_not_read")
     aside = [one for one in found if one.name not in set(names)]
     below = [one for one in others if one.what == FOLDER and _holds_dicom(folder / one.name)]
     return SeriesFiles(folder, names, slices[0].series_uid, _notes(aside, below, path))

@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL
 
@@ -96,12 +97,12 @@ def _csv_entries(data: bytes, path: Path) -> Iterator[_Entry]:
 
 
 def _rows(data: bytes, path: Path) -> list[list[str]]:
+    text = decode_text(data, str(path))
     try:
-        text = data.decode("utf-8-sig")
         first = text.partition("\n")[0]
         separator = max((",", ";", "\t"), key=first.count)
         return list(csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator))
-    except (UnicodeDecodeError, csv.Error) as error:
+    except csv.Error as error:
         raise InputError(f"is no CSV text ({error})", where=path, allowed=ALLOWED_CSV, code="not_csv") from error
 
 
@@ -132,11 +133,7 @@ def _json_entries(data: bytes, path: Path) -> Iterator[_Entry]:
 
 
 def _list_entries(data: bytes, path: Path) -> Iterator[_Entry]:
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"is no text ({error})", where=path, allowed=ALLOWED_LIST, code="not_text") from error
-    for line, text in enumerate(lines, start=1):
+    for line, text in enumerate(decode_text(data, str(path)).splitlines(), start=1):
         if text.strip() and not text.lstrip().startswith("#"):
             yield _list_entry(text, f"{path}, line {line}")
 

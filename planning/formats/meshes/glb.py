@@ -183,32 +183,20 @@ def _check_supported(document: Document, where: str) -> None:
         refuse(f"glTF version {document.asset.version[:20]!r}", where, "version 2", "unknown_version")
     for name in document.extensions_required:
         if not name.startswith(_HARMLESS):
-            refuse(
-                f"needs the extension {name[:60]!r}",
-                where,
-                "glTF without compression or other extensions",
-                "unsupported_feature",
-            )
+            what = f"needs the extension {name[:60]!r}"
+            refuse(what, where, "glTF without compression or other extensions", "unsupported_feature")
     for index, node in enumerate(document.nodes):
         if node.skin is not None or _INSTANCING in node.extensions:
-            refuse(
-                f"node {index} is bent by a skin or instanced",
-                where,
-                "rigid meshes, one per node",
-                "unsupported_feature",
-            )
+            what = f"node {index} is bent by a skin or instanced"
+            refuse(what, where, "rigid meshes, one per node", "unsupported_feature")
 
 
 def _check_sizes(document: Document, size: int, where: str) -> None:
     """Hold the buffer against the BIN chunk, and the views against the buffer."""
     for buffer in document.buffers:
         if buffer.uri is not None:
-            refuse(
-                f"the buffer lies outside of the BIN chunk ({buffer.uri[:60]!r})",
-                where,
-                "one whole GLB file",
-                "data_elsewhere",
-            )
+            what = f"the buffer lies outside of the BIN chunk ({buffer.uri[:60]!r})"
+            refuse(what, where, "one whole GLB file", "data_elsewhere")
         if buffer.byte_length > size:
             what = f"buffer 0 states {buffer.byte_length} bytes, {size} are there"
             refuse(what, where, "a buffer as long as it says", "size_mismatch")
@@ -270,19 +258,11 @@ class _Glb:
             if node.mesh is None:
                 continue
             if node.mesh >= len(meshes):
-                refuse(
-                    f"node {index} uses mesh {node.mesh}",
-                    self.where,
-                    f"one of the {len(meshes)} meshes",
-                    "index_out_of_range",
-                )
+                what = f"node {index} uses mesh {node.mesh}"
+                refuse(what, self.where, f"one of the {len(meshes)} meshes", "index_out_of_range")
             if index not in T_scene_node:
-                refuse(
-                    f"node {index} holds a mesh but is not in the scene",
-                    self.where,
-                    "every mesh in the one scene",
-                    "mesh_not_placed",
-                )
+                what = f"node {index} holds a mesh but is not in the scene"
+                refuse(what, self.where, "every mesh in the one scene", "mesh_not_placed")
             placed.append((node.mesh, T_scene_node[index]))
         lost = set(range(len(meshes))) - {mesh for mesh, _ in placed}
         if lost or not placed:
@@ -347,9 +327,8 @@ class _Glb:
     def _primitive(self, primitive: Primitive, where: str) -> RawMesh:
         position = primitive.attributes.get("POSITION")
         if primitive.mode != TRIANGLES:
-            refuse(
-                f"primitive mode {primitive.mode}", where, f"{TRIANGLES} (separate triangles)", "unsupported_feature"
-            )
+            what = f"primitive mode {primitive.mode}"
+            refuse(what, where, f"{TRIANGLES} (separate triangles)", "unsupported_feature")
         if position is None or primitive.targets:
             refuse("no POSITION, or morph targets", where, "a rigid mesh with POSITION", "unsupported_feature")
         accessor = self._accessor(position, where)
@@ -358,12 +337,8 @@ class _Glb:
         vertices = self._array(position, np.dtype("<f4"), 3, where).astype(np.float64)
         indices = np.arange(len(vertices)) if primitive.indices is None else self._indices(primitive.indices, where)
         if len(indices) % 3 or len(indices) > 3 * MAX_TRIANGLES:
-            refuse(
-                f"{len(indices)} indices",
-                where,
-                f"three per triangle, at most {MAX_TRIANGLES} triangles",
-                "wrong_count",
-            )
+            what = f"{len(indices)} indices"
+            refuse(what, where, f"three per triangle, at most {MAX_TRIANGLES} triangles", "wrong_count")
         if indices.max() >= len(vertices):
             refuse(f"index {indices.max()} out of range", where, f"0 to {len(vertices) - 1}", "index_out_of_range")
         return RawMesh(vertices, indices.reshape(-1, 3))
@@ -371,41 +346,25 @@ class _Glb:
     def _indices(self, index: int, where: str) -> Ints:
         kind = self._accessor(index, where)
         if kind.component_type not in _INDEX_TYPES or kind.type != "SCALAR":
-            refuse(
-                f"indices of type {kind.component_type} {kind.type}",
-                where,
-                f"SCALAR of {list(_INDEX_TYPES)}",
-                "wrong_type",
-            )
+            what = f"indices of type {kind.component_type} {kind.type}"
+            refuse(what, where, f"SCALAR of {list(_INDEX_TYPES)}", "wrong_type")
         return self._array(index, _INDEX_TYPES[kind.component_type], 1, where).reshape(-1).astype(np.int64)
 
     def _accessor(self, index: int, where: str) -> Accessor:
         if index >= len(self.document.accessors):
-            refuse(
-                f"accessor {index} of {len(self.document.accessors)}",
-                where,
-                "an accessor of the file",
-                "index_out_of_range",
-            )
+            what = f"accessor {index} of {len(self.document.accessors)}"
+            refuse(what, where, "an accessor of the file", "index_out_of_range")
         return self.document.accessors[index]
 
     def _array(self, index: int, dtype: np.dtype[Any], width: int, where: str) -> NDArray[Any]:
         """The numbers of an accessor, shape (count, width)."""
         accessor, views = self._accessor(index, where), self.document.buffer_views
         if accessor.buffer_view is None or accessor.sparse is not None or accessor.normalized:
-            refuse(
-                f"accessor {index} is sparse, normalized or without data",
-                where,
-                "plain data in a buffer view",
-                "unsupported_feature",
-            )
+            what = f"accessor {index} is sparse, normalized or without data"
+            refuse(what, where, "plain data in a buffer view", "unsupported_feature")
         if accessor.buffer_view >= len(views):
-            refuse(
-                f"accessor {index} uses bufferView {accessor.buffer_view}",
-                where,
-                "a view of the file",
-                "index_out_of_range",
-            )
+            what = f"accessor {index} uses bufferView {accessor.buffer_view}"
+            refuse(what, where, "a view of the file", "index_out_of_range")
         view, row = views[accessor.buffer_view], dtype.itemsize * width
         stride = view.byte_stride or row
         needed = accessor.byte_offset + (accessor.count - 1) * stride + row
@@ -429,7 +388,6 @@ def _local(node: Node, where: str) -> Floats:
         T[:3, 3] = node.translation
     determinant = np.linalg.det(T[:3, :3])
     if not np.isfinite(determinant) or determinant == 0.0 or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-        refuse(
-            f"transform with determinant {determinant:.4g}, last row {T[3].tolist()}", where, allowed, "not_invertible"
-        )
+        what = f"transform with determinant {determinant:.4g}, last row {T[3].tolist()}"
+        refuse(what, where, allowed, "not_invertible")
     return T

@@ -90,14 +90,9 @@ def _check_complete(content: _Content, text: str, where: str) -> None:
     unused = len(content.vertices) - len(set(content.corners))
     if unused:
         what = f"{unused} vertices that no face uses: the face list may be cut"
-        refuse(
-            what, where, "an OBJ whose faces use every vertex, or a format that states its counts", "unused_vertices"
-        )
+        allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
+        refuse(what, where, allowed, "unused_vertices")
     stated = sum(int(first or second) for first, second in _STATED_COUNT.findall(text))
     if stated > len(content.counts):
-        refuse(
-            f"comments count {stated} faces, {len(content.counts)} are there",
-            where,
-            "as many as counted",
-            "size_mismatch",
-        )
+        what = f"comments count {stated} faces, {len(content.counts)} are there"
+        refuse(what, where, "as many as counted", "size_mismatch")

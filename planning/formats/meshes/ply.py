@@ -187,12 +187,8 @@ class _Cursor:
                 refuse(f"data ends inside {prop.name}", self.where, _ALLOWED, "file_cut")
             stated = np.frombuffer(self.body, prop.count_dtype, 1, position)[0]
             if not 0 <= stated <= len(self.body) or stated != int(stated):
-                refuse(
-                    f"{prop.name} of length {stated}",
-                    self.where,
-                    "lengths from 0, whole, inside the file",
-                    "out_of_range",
-                )
+                what = f"{prop.name} of length {stated}"
+                refuse(what, self.where, "lengths from 0, whole, inside the file", "out_of_range")
             length = int(stated)
         if start + length * prop.dtype.itemsize > len(self.body):
             refuse(f"data ends inside {prop.name}", self.where, _ALLOWED, "file_cut")

@@ -70,12 +70,8 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
     if points is None or polygons is None:
         refuse("no points or no polygons: the file is cut, or holds no surface", where, _ALLOWED, "empty")
     if polygons.corners.min() < 0 or polygons.corners.max() >= len(points):
-        refuse(
-            f"vertex indices {polygons.corners.min()} to {polygons.corners.max()}",
-            where,
-            f"0 to {len(points) - 1}",
-            "index_out_of_range",
-        )
+        what = f"vertex indices {polygons.corners.min()} to {polygons.corners.max()}"
+        refuse(what, where, f"0 to {len(points) - 1}", "index_out_of_range")
     return RawMesh(points, triangulate(polygons.corners, polygons.counts, where))
 
 
@@ -168,12 +164,8 @@ def _pass_over(cursor: _Cursor, words: list[str], where: str) -> None:
 def _count(words: list[str], index: int, most: int, where: str) -> int:
     text = words[index] if index < len(words) else ""
     if not (text.isascii() and text.isdigit() and len(text) <= 12 and int(text) <= most):
-        refuse(
-            f"count {text[:20]!r} in {' '.join(words)[:60]!r}",
-            where,
-            f"a whole number from 0 to {most}",
-            "out_of_range",
-        )
+        what = f"count {text[:20]!r} in {' '.join(words)[:60]!r}"
+        refuse(what, where, f"a whole number from 0 to {most}", "out_of_range")
     return int(text)
 
 
@@ -221,12 +213,8 @@ class _Cursor:
     def _from_bytes(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         size = count * dtype.itemsize
         if self._at + size > len(self._data):
-            refuse(
-                f"{count} numbers of {size} bytes do not fit into the file: it is cut",
-                self._where,
-                _ALLOWED,
-                "file_cut",
-            )
+            what = f"{count} numbers of {size} bytes do not fit into the file: it is cut"
+            refuse(what, self._where, _ALLOWED, "file_cut")
         values = np.frombuffer(self._data, dtype, count, self._at)
         self._at += size
         return values

@@ -128,9 +128,8 @@ def _piece(piece: ElementTree.Element, encoding: Encoding, where: str) -> RawMes
     counts = np.diff(offsets, prepend=0)
     corners = _whole(piece, "connectivity", int(offsets[-1]), encoding, where)
     if corners.min() < 0 or corners.max() >= n_points:
-        refuse(
-            f"vertex indices {corners.min()} to {corners.max()}", where, f"0 to {n_points - 1}", "index_out_of_range"
-        )
+        what = f"vertex indices {corners.min()} to {corners.max()}"
+        refuse(what, where, f"0 to {n_points - 1}", "index_out_of_range")
     return RawMesh(points.reshape(-1, 3).astype(np.float64), triangulate(corners, counts, where))
 
 
@@ -227,12 +226,8 @@ def _stream(element: ElementTree.Element, form: str, encoding: Encoding, where: 
         return _Stream((element.text or "").strip().encode(), base64=True)
     offset = element.get("offset", "")
     if not (offset.isascii() and offset.isdigit() and len(offset) <= 15) or int(offset) >= len(encoding.appended):
-        refuse(
-            f"offset {offset[:20]!r} into {len(encoding.appended)} appended bytes",
-            where,
-            _ALLOWED_ARRAYS,
-            "index_out_of_range",
-        )
+        what = f"offset {offset[:20]!r} into {len(encoding.appended)} appended bytes"
+        refuse(what, where, _ALLOWED_ARRAYS, "index_out_of_range")
     return _Stream(encoding.appended[int(offset) :], encoding.appended_base64)
 
 
@@ -287,9 +282,8 @@ def _inflate(data: bytes, size: int, where: str) -> bytes:
         what = f"compressed block is damaged ({error})"
         raise InputError(what, where=where, allowed=_ALLOWED_ARRAYS, code="file_damaged") from error
     if len(block) != size or not unpacker.eof:
-        refuse(
-            f"compressed block of {len(block)} bytes instead of {size}, or cut", where, _ALLOWED_ARRAYS, "size_mismatch"
-        )
+        what = f"compressed block of {len(block)} bytes instead of {size}, or cut"
+        refuse(what, where, _ALLOWED_ARRAYS, "size_mismatch")
     return block
 
 

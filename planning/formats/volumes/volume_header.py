@@ -155,13 +155,11 @@ def refuse_lost_grid(labels: VolumeGrid, image: VolumeGrid, *, where: Path) -> N
     apart = max(float(np.abs(np.subtract(*ends)).max()) for ends in (boxes.min(axis=1), boxes.max(axis=1)))
     if sorted(labels.shape) == sorted(image.shape) and not labels.T_ct_index[:3, 3].any() and apart > ONE_PLACE_MM:
         sizes, steps = (" x ".join(f"{one:.4g}" for one in some) for some in (labels.shape, labels.spacing_mm))
-        refuse(
+        what = (
             f"has the CT's {sizes} voxels, but begins at 0, 0, 0 in steps of {steps} mm, up to {apart:.0f} mm away: "
-            "where its voxels lie was lost",
-            where,
-            "labels on the grid of their CT: copy its origin, spacing and direction",
-            "grid_lost",
+            "where its voxels lie was lost"
         )
+        refuse(what, where, "labels on the grid of their CT: copy its origin, spacing and direction", "grid_lost")
 
 
 def check_exact_size(actual: int, promised: int, *, where: Path) -> None:

@@ -82,8 +82,7 @@ def parse_recording(content: bytes, file: Path) -> Recording:
         joints = (q_probe, q_needle, turn_probe, turn_needle)
         return Recording(A, B, values[:, 24:26], v, names, pixels, *joints, shaft_mm)
     except InputError as error:
-        where = f"{file}: {error.where}"
-        raise InputError(error.what, where=where, allowed=error.allowed, code=error.code) from error
+        raise error.at(f"{file}: {error.where}") from error
 
 
 def write_recording(recording: Recording, path: Path) -> None:

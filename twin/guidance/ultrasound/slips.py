@@ -65,9 +65,7 @@ def checked_calibration(recording: Recording, case: SelfcalCase | None, where: P
         rms_mm = _residual_mm(lambda r: _read(r, r.A, r.B, r.P), recording)
         if rms_mm > SUSPECT_MM:
             _refuse_slip(recording, rms_mm, where)
-        if error.code:
-            raise InputError(error.what, where=where, allowed=error.allowed, code=error.code) from error
-        raise
+        raise error.at(where) from error
     if found.rms_mm > SUSPECT_MM:
         _refuse_slip(recording, found.rms_mm, where)
     if found.rms_mm > SOUND_MM:

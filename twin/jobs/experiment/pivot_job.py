@@ -22,8 +22,8 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points import (
     MAX_FILE_BYTES,
     NamedPoints,
-    parse_coordinate,
     parse_joint_recording,
+    parse_triple,
     write_points,
 )
 from puncture_twin.planning.search.context import CaseContext
@@ -203,12 +203,7 @@ def parse_place(text: str | None) -> Floats | None:
     Raises:
         InputError: Not three numbers.
     """
-    if text is None:
-        return None
-    numbers = [parse_coordinate(part.strip(), "--at") for part in text.split(",")]
-    if len(numbers) != 3:
-        refuse(f"{len(numbers)} numbers", "--at", "X,Y,Z in mm, in the robot's base frame", "wrong_count")
-    return np.array(numbers)
+    return None if text is None else np.array(parse_triple(text, "--at", "X,Y,Z in mm, in the robot's base frame"))
 
 
 def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats | None, seed: int) -> PivotTourRun:

@@ -22,7 +22,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
-from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_coordinate, parse_points
+from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_points, parse_triple
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
@@ -123,10 +123,7 @@ def lists_report(
     Raises:
         InputError: Lists that cannot be read, matched or trusted, or a target that is no point.
     """
-    where = "--target"
-    numbers = [parse_coordinate(part.strip(), where) for part in target.split(",")]
-    if len(numbers) != 3:
-        refuse(f"{len(numbers)} numbers", where, "X,Y,Z in mm", "wrong_count")
+    numbers = parse_triple(target, "--target")
     content = [read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)) for path in (markers_ct, markers_base)]
     read = [parse_points(content[0], markers_ct, default_space=space), parse_points(content[1], markers_base)]
     target_ct = to_lps(np.array([numbers]), space)[0]
@@ -137,7 +134,7 @@ def lists_report(
     registration = register(pairs, **stated, **given)
     report = registration_summary(registration)
     report["case"] = f"{markers_ct} and {markers_base}"
-    report["target_mm"], report["space"] = numbers, str(space)
+    report["target_mm"], report["space"] = list(numbers), str(space)
     named = zip(("markers_ct", "markers_base"), (markers_ct, markers_base), content, strict=True)
     report["inputs"] = inputs_document(
         tuple(Input(role, str(path), hashlib.sha256(data).hexdigest()) for role, path, data in named)

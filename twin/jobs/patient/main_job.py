@@ -25,7 +25,7 @@ from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
 from puncture_twin.planning.search.choice import BEST, Choice, Pick, choose, choose_stated, with_file_read
-from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
 
@@ -163,8 +163,7 @@ def demo_case(context: CaseContext, out: Path) -> Run:
 
 def _refuse_without_arm(context: CaseContext) -> None:
     if context.reach is None:
-        what = "the case does not say where the robot stands, so nothing can be planned"
-        refuse(what, context.case.path, "[registration] with markers_ct and markers_base, or [robot.mount]", "no_base")
+        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
 
 
 def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:

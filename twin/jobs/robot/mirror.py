@@ -21,6 +21,7 @@ from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points import joint_readings, parse_joint_recording
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE
 
 MAX_RECORDING_BYTES = 200_000_000
 """An hour at 125 states a second is 60 MB."""
@@ -107,8 +108,7 @@ class Mirror:
         """
         checked = checked_placement(case, user_cache())
         if checked is None:
-            what = "the case does not say where the robot stands"
-            refuse(what, case.path, "[registration] with markers, or [robot.mount]", "no_base")
+            refuse(NO_BASE, case.path, ALLOWED_BASE, "no_base")
         return cls(case.robot.model, checked.placement.T_base_ct, case.needle.length_mm, case.target_ct)
 
     def show(self, state: RecordedState) -> Mirrored:
