@@ -39,7 +39,10 @@ def calibrate_planar(
     """
     if pixels.ndim != 4 or pixels.shape[1] < MIN_VIEWS or np.any(board[:, 2] != 0):
         raise InputError(
-            f"pixels of shape {pixels.shape}", where=where, allowed=f"(cameras, views >= {MIN_VIEWS}, k, 2), z = 0"
+            f"pixels of shape {pixels.shape}",
+            where=where,
+            allowed=f"(cameras, views >= {MIN_VIEWS}, k, 2), z = 0",
+            code="too_few_points",
         )
     alone = [_one(board, views, size, sigma_px, where) for views in pixels]
     if len(alone) == 1:
@@ -90,7 +93,12 @@ def _focal(homographies: list[Floats], where: str) -> float:
         right += [-h1[2] * h2[2], h2[2] ** 2 - h1[2] ** 2]
     inverse = float(np.dot(left, right) / np.dot(left, left))
     if not (np.isfinite(inverse) and inverse > 0):
-        raise InputError("the views do not fix the focal length", where=where, allowed="boards tilted several ways")
+        raise InputError(
+            "the views do not fix the focal length",
+            where=where,
+            allowed="boards tilted several ways",
+            code="undetermined",
+        )
     return float(1 / np.sqrt(inverse))
 
 

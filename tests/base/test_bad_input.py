@@ -442,7 +442,7 @@ def test_that_nothing_is_found_is_the_one_object_of_json(capfd):
     """Exit code 1, and the counts of the reasons."""
 
     def command():
-        raise NoAnswerError("nothing is safe", counts={"crossed": 3})
+        raise NoAnswerError("nothing is safe", counts={"crossed": 3}, code="no_safe_direction")
 
     assert exit_code_of(command, print, as_json=True) == 1
     error = json.loads(capfd.readouterr().out.splitlines()[0])["error"]

@@ -227,7 +227,10 @@ def test_a_lock_of_the_dead_locks_nothing(tmp_path):
     assert names(tmp_path) == set()
 
 
-@pytest.mark.parametrize("failure", [InputError("x", where="y", allowed="z"), KeyboardInterrupt(), NoAnswerError("no")])
+@pytest.mark.parametrize(
+    "failure",
+    [InputError("x", where="y", allowed="z", code="odd"), KeyboardInterrupt(), NoAnswerError("no", code="odd")],
+)
 def test_whatever_ends_a_run_early_leaves_the_old_set(planned, failure):
     """A refusal, Ctrl-C, no answer: byte for byte what was there."""
     before = {name: (planned / name).read_bytes() for name in names(planned)}
