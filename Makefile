@@ -108,6 +108,7 @@ docs: install
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,docs]'
 	$(BIN)/python docs/command_line.py
 	$(BIN)/python docs/default_roles.py
+	$(BIN)/python docs/sentences.py
 	$(BIN)/mkdocs build --quiet
 
 pictures: demo
