@@ -5,6 +5,7 @@ alone: the tests ask the codes.
 """
 
 import ast
+import re
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -40,12 +41,16 @@ SLOTS = ("what", "where", "allowed", "code")
 """Of `refuse`, in order; the errors name what follows the first."""
 FINDING_SLOTS = ("code", "severity", "what", "numbers", "allowed")
 FINDING_NAMES = {"sentence": "what", "way_out": "allowed"}
+SEVERITY = re.compile(r"Severity\.(\w+)")
 VALUES = {"ValueError", "TypeError"}
 VALUE = "{...}"
 CAUSE = "its cause's"
 """Where an error is passed on, with more words."""
 STRICT = ("strict_json", "pydantic")
 """What modules import whose ValueErrors a person reads."""
+
+
+Function = ast.FunctionDef | None
 
 
 class Row(NamedTuple):
@@ -62,7 +67,7 @@ class Scope(NamedTuple):
     """Where a call stands: its module, its function (or None), its line, and what the parameters are bound to."""
 
     module: ast.Module
-    function: ast.FunctionDef | None
+    function: Function
     line: int
     bound: "dict[str, tuple[ast.expr, Scope]]"
 
@@ -143,9 +148,7 @@ def slots(call: ast.Call) -> dict[str, ast.expr]:
     return given | {FINDING_NAMES.get(one.arg, one.arg): one.value for one in call.keywords if one.arg}
 
 
-def calls_in(
-    node: ast.AST, function: ast.FunctionDef | None = None
-) -> Iterator[tuple[ast.Call, ast.FunctionDef | None]]:
+def calls_in(node: ast.AST, function: Function = None) -> Iterator[tuple[ast.Call, Function]]:
     """Every call, with the function that it stands in."""
     for child in ast.iter_child_nodes(node):
         inside = child if isinstance(child, ast.FunctionDef) else function
@@ -161,14 +164,13 @@ def rows_of(call: ast.Call, scope: Scope, room: str) -> Iterator[Row]:
     if not scope.bound and taken.intersection(scope.parameters()) and scope.function.name != "__init__":
         yield from helper_rows(call, scope, room)
         return
-    kind = KINDS[name_of(call)] or ast.unparse(parts["severity"]).removeprefix("Severity.").lower()
+    severity = SEVERITY.fullmatch(ast.unparse(parts["severity"])) if "severity" in parts else None
+    kind = KINDS[name_of(call)] or (severity[1].lower() if severity else "finding")
     codes = texts(parts["code"], scope) if "code" in parts else ["bad_value"]
     for code in dict.fromkeys(codes):
         for text in dict.fromkeys(texts(parts.get("what"), scope)):
             allowed = " / ".join(dict.fromkeys(texts(parts.get("allowed"), scope)))
-            yield Row(
-                code, kind if kind in {"1", "2", "note", "warning", "refusal"} else "finding", room, text, allowed
-            )
+            yield Row(code, kind, room, text, allowed)
 
 
 def helper_rows(call: ast.Call, scope: Scope, room: str) -> Iterator[Row]:

@@ -1,10 +1,25 @@
-"""Commands that must be refused."""
+"""What must be refused: by its code, and the one line of a command."""
 
+from contextlib import contextmanager
+
+import pytest
+
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import BAD_INPUT
 
 
-def refused(arguments, capfd):
+@contextmanager
+def refused(code, *values, by=InputError):
+    """Within, an error of this code is raised that names these values; yields it as pytest does."""
+    with pytest.raises(by) as caught:
+        yield caught
+    assert caught.value.code == code, caught.value
+    unnamed = [value for value in values if str(value) not in str(caught.value)]
+    assert not unnamed, caught.value
+
+
+def refused_line(arguments, capfd):
     """Run a command that must be refused; returns its one line."""
     assert main([str(argument) for argument in arguments]) == BAD_INPUT
     captured = capfd.readouterr()

@@ -20,7 +20,7 @@ from case_world import (
     write_labels,
     write_markers,
 )
-from refusals import refused
+from refusals import refused_line
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.run_twin import main
@@ -359,7 +359,7 @@ def test_a_broken_input_is_refused(name, folder, tmp_path, capfd):
     """Whatever is broken: exit code 2, one line, no file."""
     spoil, message = BREAKS[name]
     spoil(folder)
-    line = refused(["search", folder, "--no-arm", "--out", tmp_path / "out"], capfd)
+    line = refused_line(["search", folder, "--no-arm", "--out", tmp_path / "out"], capfd)
     assert message in line
     assert not (tmp_path / "out").exists()
 
@@ -399,7 +399,7 @@ def test_a_wrong_command_line_is_refused(arguments, message, folder, capfd):
     (folder / "case.toml").write_text(whole(text[: text.index("[registration]")]))
     (folder / "manifest.json").write_text("{}")
     named = {"CASE": folder, "MANIFEST": folder / "manifest.json"}
-    assert message in refused([named.get(a, a) for a in arguments], capfd)
+    assert message in refused_line([named.get(a, a) for a in arguments], capfd)
 
 
 def test_open_and_inverted_meshes_work_with_a_warning(folder, tmp_path, capfd):

@@ -13,7 +13,7 @@ from case_world import (
     write_balls,
     write_markers,
 )
-from refusals import refused
+from refusals import refused_line
 
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
@@ -82,7 +82,7 @@ def test_markers_that_lie_on_the_couch_are_refused_with_every_reading_that_fits(
     points = on_skin(DIRECTIONS, np.zeros(3))
     here = case(points * [-1, -1, 1], points)
     for command in (["register", here], ["search", here, "--no-arm", "--out", here / "out"]):
-        line = refused(command, capfd)
+        line = refused_line(command, capfd)
         assert BEHIND in line and "with x and y negated" in line and "or with y and z negated" in line
         assert "x and z negated" not in line and "where no needle touches it" in line
     assert not (here / "out").exists()
@@ -92,7 +92,7 @@ def test_of_two_half_turns_the_one_that_lies_off_the_skin_is_not_named(case, cap
     """The body lies higher in the image, so y and z negated is in the air: it was named where its rms was less."""
     center = np.array([0.0, 0.0, 40.0])
     points = on_skin(DIRECTIONS, center)
-    line = refused(["register", case(points * [-1, -1, 1], points, center)], capfd)
+    line = refused_line(["register", case(points * [-1, -1, 1], points, center)], capfd)
     assert BEHIND in line and "with x and y negated" in line and "y and z negated" not in line
 
 
