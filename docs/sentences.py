@@ -19,8 +19,8 @@ HEAD = """# Sentences
 
 What the program says where it refuses an input (exit code 2), answers no (1), or finds something odd in inputs that fit
 (a finding, with its severity). The code says what kind of mistake it is, and is the same wherever that kind is found;
-`--json` prints it. `{...}` stands for a value, or for words that depend on the input. `bad_value` is also what a key of
-a case or of a JSON file refuses; Pydantic's own words for a key of another type are not listed.
+`--json` prints it. `{...}` stands for a value, or for words that depend on the input. `bad_value` is also a key of
+another type or range, in Pydantic's own words.
 
 *Written by `python docs/sentences.py` from the source, and held beside it by a test.*
 
@@ -35,11 +35,13 @@ KINDS = {
     "NoAnswerError": "1",
     "ValueError": "2",
     "TypeError": "2",
+    "SchemaError": "2",
     "Finding": "",
 }
 SLOTS = ("what", "where", "allowed", "code")
 """Of `refuse`, in order; the errors name what follows the first."""
 FINDING_SLOTS = ("code", "severity", "what", "numbers", "allowed")
+SCHEMA_SLOTS = ("what", "code")
 FINDING_NAMES = {"sentence": "what", "way_out": "allowed"}
 SEVERITY = re.compile(r"Severity\.(\w+)")
 VALUES = {"ValueError", "TypeError"}
@@ -143,7 +145,7 @@ def assigned(name: str, nodes: list[ast.stmt], line: int) -> list[ast.expr]:
 def slots(call: ast.Call) -> dict[str, ast.expr]:
     """The parts of a refusal or a finding by their names."""
     kind = name_of(call)
-    order = FINDING_SLOTS if kind == "Finding" else SLOTS
+    order = FINDING_SLOTS if kind == "Finding" else SCHEMA_SLOTS if kind == "SchemaError" else SLOTS
     given = dict(zip(order, call.args, strict=False))
     return given | {FINDING_NAMES.get(one.arg, one.arg): one.value for one in call.keywords if one.arg}
 

@@ -94,6 +94,14 @@ class InputListError(InputError):
     most_what = 900
 
 
+class SchemaError(ValueError):
+    """What a file's schema refuses: a sentence about keys, and its code."""
+
+    def __init__(self, what: str, code: str) -> None:
+        self.code = code
+        super().__init__(what)
+
+
 class NoAnswerError(PlanningError):
     """The work was done and the answer is no. The command line exits with code 1.
 

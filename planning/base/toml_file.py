@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ValidationError
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import InputError, SchemaError, refuse
 from puncture_twin.planning.base.files import read_input
 
 MAX_BYTES = 1_000_000
@@ -43,7 +43,7 @@ _TOKEN = re.compile(
 
 def _one(value: object) -> object:
     if value != 1 or not isinstance(value, int) or isinstance(value, bool):
-        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1")
+        raise SchemaError(f"schema {value!r} is not known; this version reads schema = 1", "unknown_version")
     return value
 
 
@@ -117,7 +117,7 @@ def parse_toml(
         place, said = _said(data, first["loc"], first["msg"].removeprefix("Value error, "), first["type"])
         value = "" if isinstance(first["input"], dict | list | tuple | None) else f" (given: {first['input']!r:.60})"
         allowed = f"the keys, types and ranges of {keys}"
-        code = CODES.get(first["type"], "bad_value")
+        code = getattr(first.get("ctx", {}).get("error"), "code", CODES.get(first["type"], "bad_value"))
         raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed, code=code) from error
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, StringConstraints, ValidationError, model_validator
 
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import InputError, SchemaError, refuse
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import parse_toml, read_toml_bytes
 from puncture_twin.planning.case.toml_types import (
@@ -112,7 +112,7 @@ class ChecksFile(Section):
     @model_validator(mode="after")
     def _refuse_nothing(self) -> ChecksFile:
         if not (self.check or self.window or self.plan):
-            raise ValueError(f"nothing is expected; there are no {ALLOWED}")
+            raise SchemaError(f"nothing is expected; there are no {ALLOWED}", "missing_key")
         return self
 
     def tables(self) -> dict[str, tuple[Expectation, ...]]:
