@@ -7,6 +7,7 @@ import pytest
 import scipy
 import SimpleITK as sitk  # noqa: N813
 from case_world import whole
+from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN, ball
 from puncture_twin.planning.anatomy.body.body_mask import body_mask, filled_slices
@@ -376,7 +377,7 @@ def test_two_cts_are_refused(scene):
     folder, _ = scene("alone")
     (folder / "other.nii.gz").write_bytes((folder / "ct.nii.gz").read_bytes())
     path = write_case(folder, more='[ct]\nfile = "other.nii.gz"', name="two")
-    with pytest.raises(InputError, match="is not the CT of the skin"):
+    with refused("several_cts"):
         prepare(path, arm=False)
 
 
@@ -384,7 +385,7 @@ def test_two_cts_are_refused(scene):
 def test_a_level_of_air_that_cannot_be_is_refused(scene, level):
     """``air_hu`` between air and fat."""
     folder, _ = scene("alone")
-    with pytest.raises(InputError, match="air_hu"):
+    with refused("bad_value", "air_hu"):
         load_case(write_case(folder, more=f"[ct]\nair_hu = {level!r}".replace("'", '"'), name="level"))
 
 
@@ -529,9 +530,8 @@ def test_a_ct_that_is_shifted_against_the_skin_is_refused(scene):
         if not shift:
             assert "labels_beside_image" not in {one.code for one in prepare(path, arm=False).anatomy.findings}
             continue
-        with pytest.raises(InputError) as caught:
+        with refused("labels_beside_image"):
             prepare(path, arm=False)
-        assert caught.value.code == "labels_beside_image"
 
 
 def test_a_table_beside_a_long_image_is_drawn_as_far_as_is_plausible(tmp_path):
@@ -552,7 +552,7 @@ def test_a_ct_of_another_place_is_refused(scene):
     write_trunk(folder, parts, supine.grid())
     crop(folder, np.s_[:, :, :], move_mm=(1000.0, 0.0, 0.0))
     path = write_case(folder, skin=TRUNK_SKIN, more='[ct]\nfile = "crop.nii.gz"', name="elsewhere")
-    with pytest.raises(InputError, match="does not show the target"):
+    with refused("target_outside_ct"):
         prepare(path, arm=False)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from kept_checkers import built
+from refusals import refused
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.tool import SIDES, Tool, gantry_boxes
@@ -145,17 +146,17 @@ def test_an_arm_through_the_wall_is_a_collision_that_names_the_gantry(in_gantry)
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (("bore_diameter_mm = 700.0", "bore_diameter_mm = 70.0"), "gantry.bore_diameter_mm"),
-        (("tilt_deg = 0.0", "tilt_deg = 80.0"), "gantry.tilt_deg"),
-        (("tilt_deg = 0.0", 'up = "head"'), "gantry: axis and up are parallel"),
-        (("wall_mm", "wal_mm"), "did you mean 'wall_mm'"),
+        (("bore_diameter_mm = 700.0", "bore_diameter_mm = 70.0"), "bad_value gantry.bore_diameter_mm"),
+        (("tilt_deg = 0.0", "tilt_deg = 80.0"), "bad_value gantry.tilt_deg"),
+        (("tilt_deg = 0.0", 'up = "head"'), "axes_parallel"),
+        (("wall_mm", "wal_mm"), "unknown_key wall_mm"),
     ],
 )
 def test_gantries_that_make_no_sense_are_refused(in_gantry, change, match):
     """By key."""
     path = in_gantry()
     path.write_text(path.read_text().replace(*change))
-    with pytest.raises(InputError, match=match):
+    with refused(*match.split()):
         load_case(path)
 
 
@@ -163,7 +164,7 @@ def test_a_gantry_that_does_not_go_around_the_patient_is_refused(in_gantry):
     """A bore narrower than he is, or beside him."""
     path = in_gantry()
     path.write_text(path.read_text().replace("bore_diameter_mm = 700.0", "bore_diameter_mm = 300.0"))
-    with pytest.raises(InputError, match="wall stands .* mm in the patient"):
+    with refused("gantry_in_patient"):
         prepare(path)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from refusals import refused
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.spatial.transform import Rotation
 
@@ -403,15 +404,15 @@ def test_a_way_back_within_the_way_is_found():
 
 def test_accelerations_are_held_to_the_limit_alone(plan):
     """A motion well below every speed limit, but 1 % above the acceleration's, is refused; at it, it is not."""
-    for factor, refused in ((1.0, False), (1.005**-1, True)):
+    for factor, caught in ((1.0, False), (1.005**-1, True)):
         part = Trajectory(plan.approach.times_s * factor, plan.approach.q)
         assert (part.max_speeds() < 0.7 * UR3.max_speeds).all()
         try:
             check_trajectory(UR3, part, time_resolution_s=1e-9, what="approach", where=SOURCE)
         except InputError as error:
-            assert refused and "rad/s^2" in str(error)
+            assert caught and "rad/s^2" in str(error)
         else:
-            assert not refused
+            assert not caught
 
 
 def free_checker(*boxes):
@@ -502,12 +503,12 @@ def hurried(plan, phase, factor):
 
 
 TOO_MUCH = {
-    "a hurried approach": (lambda p: hurried(p, "approach", 0.6), "approach"),
-    "a hurried insertion": (lambda p: hurried(p, "insertion", 0.05), "insertion"),
-    "an elbow beyond half a turn": (lambda p: bent_elbow(p), "elbow_joint at 18|leaves the joint limits"),
+    "a hurried approach": (lambda p: hurried(p, "approach", 0.6), "tip_too_fast"),
+    "a hurried insertion": (lambda p: hurried(p, "insertion", 0.05), "tip_too_fast"),
+    "an elbow beyond half a turn": (lambda p: bent_elbow(p), "joint_beyond_limits"),
     "an elbow whose limit was rounded away": (
         lambda p: bent_elbow(p, math.pi + 1e-8),
-        "elbow_joint at 180|leaves the joint limits",
+        "joint_beyond_limits",
     ),
 }
 
@@ -524,7 +525,7 @@ def bent_elbow(plan, angle=3.2):
 def test_a_plan_beyond_the_limits_is_not_exported(plan, what, name, tmp_path):
     """One line, and not even a folder."""
     change, message = TOO_MUCH[what]
-    with pytest.raises(InputError, match=message):
+    with refused(message):
         export_plan(change(plan), name, tmp_path / "out", source=tmp_path / "plan.json")
     assert not (tmp_path / "out").exists()
 
@@ -540,7 +541,7 @@ def branch_change(plan):
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_change_of_branch_is_not_exported(plan, name, tmp_path):
     """Between two samples that are both on the line the needle would swing through the patient."""
-    with pytest.raises(InputError, match="leaves the straight path by"):
+    with refused("not_straight"):
         export_plan(branch_change(plan), name, tmp_path / "out", source=tmp_path / "plan.json")
     assert not (tmp_path / "out").exists()
 
@@ -548,7 +549,7 @@ def test_a_change_of_branch_is_not_exported(plan, name, tmp_path):
 def test_a_program_ends_on_the_plans_own_branch(plan):
     """The straight move leads where its start's branch leads, and that must be where the plan ends."""
     changed = branch_change(plan)
-    with pytest.raises(InputError, match="own branch"):
+    with refused("not_read_back"):
         check_program(read_urscript(script(changed), where=SOURCE), changed, where=SOURCE)
 
 
@@ -576,7 +577,7 @@ def test_a_plan_that_contradicts_itself_is_not_exported(plan, name, tmp_path):
         replace(plan, needle_length_mm=math.nan),
         replace(plan, needle_length_mm=plan.needle_length_mm + 1.0),
     ):
-        with pytest.raises(InputError):
+        with refused("not_straight"):
             export_plan(broken, name, tmp_path / "out", source=tmp_path / "plan.json")
     assert not (tmp_path / "out").exists()
 
@@ -706,38 +707,41 @@ def test_a_program_that_is_not_the_plan_does_not_read_back(plan, what):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.replace("elbow_joint, wrist_1_joint", "wrist_1_joint, elbow_joint"), "six joints"),
-        (lambda t: t.replace("insertion:", "retraction:"), "six joints|points"),
-        (lambda t: t.replace("sec: 0, nanosec: 0}}\n", "sec: 0, nanosec: 1}}\n", 1), "nanosecond"),
-        (lambda t: re.sub(r"positions: \[[^,]*,", "positions: [", t, count=1), "approach"),
-        (lambda t: re.sub(r"positions: \[[^,]*,", "positions: [nan,", t, count=1), "not finite"),
-        (lambda t: re.sub(r"positions: \[[^,]*,", "positions: [0.1,", t, count=1), "read back"),
-        (lambda t: re.sub(r"velocities: \[[^,]*,", "velocities: [99.0,", t, count=1), "shoulder_pan_joint at 99"),
-        (lambda t: t + "    - {}\n", "line"),
+        (lambda t: t.replace("elbow_joint, wrist_1_joint", "wrist_1_joint, elbow_joint"), "missing_message"),
+        (lambda t: t.replace("insertion:", "retraction:"), "missing_message"),
+        (lambda t: t.replace("sec: 0, nanosec: 0}}\n", "sec: 0, nanosec: 1}}\n", 1), "times_not_rising"),
+        (lambda t: re.sub(r"positions: \[[^,]*,", "positions: [", t, count=1), "bad_value"),
+        (lambda t: re.sub(r"positions: \[[^,]*,", "positions: [nan,", t, count=1), "not_finite"),
+        (lambda t: re.sub(r"positions: \[[^,]*,", "positions: [0.1,", t, count=1), "not_read_back"),
+        (
+            lambda t: re.sub(r"velocities: \[[^,]*,", "velocities: [99.0,", t, count=1),
+            "joint_too_fast shoulder_pan_joint 99",
+        ),
+        (lambda t: t + "    - {}\n", "wrong_format"),
     ],
 )
 def test_messages_that_are_not_the_plan_do_not_read_back(plan, change, message):
     """The same for ROS."""
     text = ros2_text(plan, case_checked=False)
     assert change(text) != text
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         check_sampled(read_ros2(change(text), UR3, where=SOURCE), plan, time_resolution_s=1e-9, where=SOURCE)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.replace("q1_rad,q2_rad", "q2_rad,q1_rad"), "header"),
-        (lambda t: t + "retraction,0,0,0,0,0,0,0\n", "retraction"),
-        (lambda t: t + "insertion,99,0,0,0,0,0\n", "cells"),
-        (lambda t: t + "insertion,x,0,0,0,0,0,0\n", "row"),
-        (lambda t: t + "insertion,99,0,0,0,0,0,0\n", "read back"),
+        (lambda t: t.replace("q1_rad,q2_rad", "q2_rad,q1_rad"), "wrong_columns"),
+        (lambda t: t + "retraction,0,0,0,0,0,0,0\n", "not_a_number retraction"),
+        (lambda t: t + "insertion,99,0,0,0,0,0\n", "ragged_row"),
+        (lambda t: t + "insertion,x,0,0,0,0,0,0\n", "not_a_number"),
+        (lambda t: t + "insertion,99,0,0,0,0,0,0\n", "not_read_back"),
     ],
 )
 def test_a_table_that_is_not_the_plan_does_not_read_back(plan, change, message):
     """The same for the table."""
     text = change(csv_text(plan, case_checked=False))
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         check_sampled(read_csv(text, where=SOURCE), plan, time_resolution_s=0.0, where=SOURCE)
 
 
@@ -746,7 +750,7 @@ def test_samples_closer_than_a_nanosecond_are_refused_for_ros(plan, tmp_path):
     times, q = plan.approach.times_s.copy(), plan.approach.q.copy()
     times[1], q[1] = 1e-10, q[0]
     close = replace(plan, approach=Trajectory(times, q))
-    with pytest.raises(InputError, match="plan.json: approach: two samples within a nanosecond"):
+    with refused("times_not_rising", "plan.json"):
         export_plan(close, "ros2", tmp_path / "out", source=SOURCE)
     assert not (tmp_path / "out").exists()
 
@@ -777,5 +781,5 @@ def test_absurd_times_are_refused_in_bounded_work(plan, smooth, name, tmp_path):
 
 def test_an_unknown_format_is_refused(plan, tmp_path):
     """With the three that are known."""
-    with pytest.raises(InputError, match="urscript, ros2, csv"):
+    with refused("unknown_format"):
         export_plan(plan, "krl", tmp_path, source=SOURCE)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from refusals import refused
 
 from puncture_twin.planning.arm.kinematics import check_arm, check_flanges, flange_pose
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
@@ -33,9 +34,9 @@ def rtde(model, q):
 
 def code_of(call, *arguments, **named):
     """Of the refusal."""
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         call(*arguments, **named)
-    return refused.value.code
+    return caught.value.code
 
 
 @given(st.lists(st.floats(-359.0, 359.0), min_size=6, max_size=6), st.integers(1, 4))
@@ -50,7 +51,7 @@ def test_what_an_arm_can_read_passes_in_both_units(angles, rows):
 
 def test_angles_in_the_other_unit_are_refused():
     """Degrees under rad are beyond any joint; radians under deg all lie within 6.3."""
-    with pytest.raises(InputError, match="degrees\\?;"):
+    with refused("joints_beyond"):
         joint_readings(POSES, "rad", where="here")
     assert code_of(joint_readings, POSES, "rad", where="here") == "joints_beyond"
     assert code_of(joint_readings, np.radians(POSES), "deg", where="here") == "joints_unit"
@@ -70,7 +71,7 @@ def test_rows_are_named_and_wrist_3_may_turn_on():
     q[3, 5] = np.radians(600.0)
     joint_readings(q, "rad", where="here")
     q[4, 1] = 7.0
-    with pytest.raises(InputError, match=r"joint 2 of e at 7 rad.*can read;"):
+    with refused("joints_beyond"):
         joint_readings(q, "rad", where="here", names=tuple("abcdefghi"))
 
 
@@ -138,9 +139,8 @@ def test_joints_of_another_arm_are_named(recorded, tool):
         if name == recorded:
             check_arm(model, q, points, [np.zeros(3), NEEDLE], **stated)
         else:
-            with pytest.raises(InputError, match=rf"those of a .*\b{recorded}\b.* do not") as refused:
+            with refused("joints_of_another_arm", recorded):
                 check_arm(model, q, points, [np.zeros(3), NEEDLE], **stated)
-            assert refused.value.code == "joints_of_another_arm"
 
 
 def test_a_controller_s_own_calibration_passes():

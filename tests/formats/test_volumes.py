@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
 from hypothesis import HealthCheck, given, settings, strategies as st
+from refusals import refused
 
 from puncture_twin.planning.anatomy.scan import nearest
 from puncture_twin.planning.base.errors import InputError
@@ -384,9 +385,8 @@ def test_labels_that_lost_their_grid_are_refused(shift: float, turned: bool) -> 
     T[:3, 3] += shift
     image, start = VolumeGrid(SHAPE, T, {}), np.diag([2.0, 3.0, 4.0, 1.0])
     if shift:
-        with pytest.raises(InputError) as caught:
+        with refused("grid_lost"):
             refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
-        assert caught.value.code == "grid_lost"
     else:
         refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
     refuse_lost_grid(VolumeGrid((4, 5, 7), start, {}), image, where=Path("labels.nii"))
@@ -468,11 +468,11 @@ def test_damaged_and_hostile_files_are_refused_by_name(tmp_path: Path, case: tup
 def test_paths_that_are_no_volume_files(tmp_path: Path) -> None:
     """A folder, nothing at all, and an unknown ending are refused."""
     (tmp_path / "folder.nii").mkdir()
-    with pytest.raises(InputError, match="is a folder"):
+    with refused("no_such_file"):
         read_volume(tmp_path / "folder.nii")
-    with pytest.raises(InputError, match="is not there"):
+    with refused("no_such_file"):
         read_volume(tmp_path / "none.nii.gz")
-    with pytest.raises(InputError, match="unknown file ending"):
+    with refused("unknown_format"):
         read_volume(write(tmp_path, "a.img", WHOLE))
 
 
@@ -480,7 +480,7 @@ def test_a_link_beside_a_nrrd_may_not_lead_away(tmp_path: Path) -> None:
     """A data file that is a link into another folder is refused."""
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.raw").symlink_to(write(tmp_path, "a.raw", VALUES.tobytes(order="F")))
-    with pytest.raises(InputError, match="link to another folder"):
+    with refused("outside_folder"):
         read_volume(write(tmp_path / "in", "a.nhdr", nrrd_bytes(("data", "data file: a.raw"), data=b"")))
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from case_world import coarse_carton
+from refusals import refused
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import SpeedLimits, flange_pose, tip_speeds
@@ -44,7 +45,7 @@ def test_a_plan_whose_own_configuration_breaks_a_limit_is_refused(carton, planne
     _check_limits(planned.plan, carton, "plan.json")
     case = replace(carton.case, search=replace(carton.case.search, **limit))
     strict = replace(carton, case=case, chance=replace(carton.chance, case=case))
-    with pytest.raises(InputError, match="does not keep search.min_hit and max_touch"):
+    with refused("limits_not_kept"):
         _check_limits(planned.plan, strict, "plan.json")
 
 
@@ -234,24 +235,24 @@ def test_a_plan_that_contradicts_itself_is_refused(name, document):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "file of 0 bytes"),
-        (b'{"version": 3', "JSON cannot be read"),
-        (b'{"version": 3}', "is missing"),
-        (b'{"version": 2}', "version 2; allowed: .* plan again"),
-        (b'{"version": 1}', "version 1"),
-        (b"[1, 2]", "version None"),
-        (b'{"version": 3, "x": NaN}', "NaN is not a finite number"),
-        (b'{"version": 3, "x": 1e999}', "1e999 is not a finite number"),
-        (b'{"version": 3, "seed": 1, "seed": 2}', "key 'seed' stands twice"),
-        (b"\xff\xfe\x00", "JSON cannot be read"),
-        (b"[" * 100_000, "JSON cannot be read"),
+        (b"", "file_size"),
+        (b'{"version": 3', "not_json"),
+        (b'{"version": 3}', "missing_key"),
+        (b'{"version": 2}', "unknown_version"),
+        (b'{"version": 1}', "unknown_version"),
+        (b"[1, 2]", "unknown_version None"),
+        (b'{"version": 3, "x": NaN}', "not_json"),
+        (b'{"version": 3, "x": 1e999}', "not_json"),
+        (b'{"version": 3, "seed": 1, "seed": 2}', "not_json seed"),
+        (b"\xff\xfe\x00", "not_json"),
+        (b"[" * 100_000, "not_json"),
     ],
 )
 def test_what_is_no_plan_is_refused(data, message, tmp_path):
     """Garbage, half a file, deep nesting: one line."""
     path = tmp_path / "plan.json"
     path.write_bytes(data)
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         read_plan(path)
 
 
@@ -260,7 +261,7 @@ def test_a_plan_of_other_inputs_is_refused(carton, document):
     content, write = document
     changed = [one | {"sha256": "0" * 64} if one["path"] == "touch.csv" else one for one in content["inputs"]]
     path = write(inputs=changed)
-    with pytest.raises(InputError, match=r"input 'markers_base \(touch.csv\)' is not the one"):
+    with refused("input_changed", "markers_base", "touch.csv"):
         check_plan(read_plan(path), carton, path)
 
 
@@ -268,7 +269,7 @@ def test_a_plan_for_another_patient_pose_is_refused(carton, planned):
     """T_base_ct must be the case's own, bit for bit."""
     moved = np.array(planned.plan.T_base_ct)
     moved[0, 3] += 1e-6
-    with pytest.raises(InputError, match="T_base_ct is not the case's"):
+    with refused("plan_of_another"):
         check_plan(replace(planned.plan, T_base_ct=moved), carton, "plan.json")
 
 
@@ -285,7 +286,7 @@ def test_a_plan_for_another_patient_pose_is_refused(carton, planned):
 )
 def test_a_plan_that_flatters_itself_is_refused(carton, planned, key, value):
     """Numbers that people read are computed again, and a plan that states others is refused."""
-    with pytest.raises(InputError, match="the case gives"):
+    with refused("plan_of_another"):
         check_plan(replace(planned.plan, **{key: value}), carton, "plan.json")
 
 
@@ -297,7 +298,7 @@ def test_a_plan_states_the_warnings_of_its_case(carton, document):
     for other in (stood[1:], [*stood, "another"]):
         assert "its warnings are not those of the case" in refusal(write(warnings=other), carton)
     for wrong in ("none", [1], None):
-        with pytest.raises(InputError, match="warnings"):
+        with refused("bad_value"):
             read_plan(write(warnings=wrong))
 
 
@@ -383,7 +384,7 @@ def test_an_unsafe_direction_is_refused_on_loading(carton, planned):
     """A plan whose direction goes through bolt H is refused by the search, whatever its motion says."""
     theta, beta = np.radians(45), np.radians(270)
     outward_ct = carton.check(theta, beta).outward_ct[0]
-    with pytest.raises(InputError, match=r"its direction is rejected: too_close \(bolt_h\)"):
+    with refused("direction_rejected", "too_close", "bolt_h"):
         check_plan(replace(planned.plan, theta=theta, beta=beta, outward_ct=outward_ct), carton, "plan.json")
 
 
@@ -401,6 +402,6 @@ def test_no_safe_candidate_means_no_plan(carton, found):
         verdict=replace(found.verdict, reason=np.full(len(found), Reason.TOO_CLOSE.value)),
         ranking=Ranking.none(len(found)),
     )
-    with pytest.raises(NoAnswerError, match="no candidate is safe") as caught:
+    with refused("no_plan", by=NoAnswerError) as caught:
         make_plan(carton, none, seed=0)
     assert caught.value.counts == {"too_close": len(found)}

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.special import chdtri
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.fits import (
     ReadingNoise,
@@ -119,7 +119,7 @@ def test_residuals_far_beyond_the_declaration_are_refused_and_can_be_accepted():
     base = apply(T_TRUE, MARKERS) + np.random.default_rng(0).normal(0, 4.0, MARKERS.shape)
     pairs = MarkerPairs(tuple("ABCDEF"), MARKERS, base)
     settings = {"method": "weighted", "target_ct": np.array([50.0, 130.0, 63.0]), "noise": noise(6)}
-    with pytest.raises(InputError, match="do not agree with the declared errors"):
+    with refused("residuals_too_large"):
         register(pairs, **settings)
     found = register(pairs, **settings, accept_residuals=True)
     assert found.uncertainty.test.scaled
@@ -131,5 +131,5 @@ def test_residuals_far_beyond_the_declaration_are_refused_and_can_be_accepted():
 def test_weights_need_a_declaration():
     """Method weighted without errors is refused."""
     pairs = MarkerPairs(tuple("ABCDEF"), MARKERS, apply(T_TRUE, MARKERS))
-    with pytest.raises(InputError, match="weighs by declared errors"):
+    with refused("method_without_errors"):
         register(pairs, method="weighted", target_ct=np.zeros(3))

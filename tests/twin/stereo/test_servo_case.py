@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.links import collision_links
@@ -63,7 +64,7 @@ def test_mistakes_are_named(tmp_path, old, new, what):
 
 def test_a_missing_case_is_named(tmp_path):
     """A folder without one."""
-    with pytest.raises(InputError, match=r"servo\.toml: cannot be read"):
+    with refused("no_such_file", "servo.toml"):
         load_servo_case(tmp_path)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
@@ -44,7 +45,7 @@ def test_arrays_are_read_only_and_directions_unit(recording):
 def test_a_shafts_length_needs_a_direction_and_is_one(recording):
     """Without directions, or with a length that shows none, the recording is bad input that says so."""
     parts = (recording.A, recording.B, recording.P)
-    with pytest.raises(InputError, match="shaft_mm without directions"):
+    with refused("missing_column"):
         Recording(*parts, shaft_mm=np.full(6, 20.0))
     for wrong in (0.5, -3.0, np.nan, np.inf):
         with pytest.raises(InputError, match="shaft_mm of pose 1 is"):
@@ -79,7 +80,7 @@ def test_a_broken_recording_is_refused(recording, key, change, says):
 
 def test_names_must_be_unique(recording):
     """Two poses of one name could not be told apart in a report."""
-    with pytest.raises(InputError, match="one name per pose"):
+    with refused("duplicate_name"):
         Recording(recording.A, recording.B, recording.P, names=("a",) * 6)
 
 
@@ -107,7 +108,7 @@ def test_a_broken_file_is_refused(recording, tmp_path, edit, says):
 
 def test_a_missing_file_is_refused(tmp_path):
     """A folder without a recording says which file it lacks."""
-    with pytest.raises(InputError, match="recording.csv: no such file"):
+    with refused("no_such_file"):
         read_recording(tmp_path)
 
 
@@ -116,5 +117,5 @@ def test_recordings_join_and_divide(recording):
     whole = recording.subset(np.arange(2)).joined(recording.subset(slice(2, 6)))
     for key in "ABPv":
         np.testing.assert_array_equal(getattr(whole, key), getattr(recording, key))
-    with pytest.raises(InputError, match="different things"):
+    with refused("tables_differ"):
         recording.joined(Recording(recording.A, recording.B, recording.P))
