@@ -72,12 +72,12 @@ def test_a_step_larger_than_the_range_is_refused(tmp_path, theta, step):
         load_case(path)
 
 
-@pytest.mark.parametrize(("x_axis", "refused"), [("[1.0, 0.0, 0.01]", False), ("[1.0, 0.0, 0.2]", True)])
-def test_the_axes_of_a_mount_stand_at_a_right_angle(tmp_path, x_axis, refused):
-    """Rounding is taken; 11 degrees off the right angle are refused, and the angle is said."""
+@pytest.mark.parametrize(("x_axis", "wrong"), [("[1.0, 0.0, 0.01]", False), ("[1.0, 0.0, 0.2]", True)])
+def test_the_axes_of_a_mount_stand_at_a_right_angle(tmp_path, x_axis, wrong):
+    """Rounding is taken; 11 degrees off the right angle are wrong, and the angle is said."""
     mount = f"[robot.mount]\nposition_mm = [0, -500, 0]\nx_axis = {x_axis}\nz_axis = [0, 0, 1]"
     path = write_case(tmp_path, ('[registration]\nmarkers_ct = "markers_ct.csv"\nmarkers_base = "touch.csv"', mount))
-    if refused:
+    if wrong:
         with refused("axes_not_square", "78.7"):
             load_case(path)
     else:

@@ -65,20 +65,20 @@ def test_a_hundredth_of_its_length_is_the_least_width_of_a_set(side, size):
     assert registered(wide, wide).fre_mm == pytest.approx(0, abs=1e-9)
 
 
-@pytest.mark.parametrize(("ct", "base", "refused"), [(1, 4.9, 0), (1, 5.1, 1), (4.9, 1, 0), (5.1, 1, 1)])
-def test_five_times_as_wide_is_a_slip_of_unit(ct, base, refused):
+@pytest.mark.parametrize(("ct", "base", "wrong"), [(1, 4.9, 0), (1, 5.1, 1), (4.9, 1, 0), (5.1, 1, 1)])
+def test_five_times_as_wide_is_a_slip_of_unit(ct, base, wrong):
     """Either way; below that it is residuals that must explain it (here of 4 mm)."""
-    if refused:
+    if wrong:
         with refused("wrong_unit"):
             registered(cross(ct), cross(base))
     else:
         assert registered(cross(ct), cross(base)).fre_mm == pytest.approx(3.9)
 
 
-@pytest.mark.parametrize(("size", "refused"), [(0.05, 1), (2.49, 1), (2.51, 0)])
-def test_markers_that_span_less_than_5_mm_are_in_another_unit(size, refused):
+@pytest.mark.parametrize(("size", "wrong"), [(0.05, 1), (2.49, 1), (2.51, 0)])
+def test_markers_that_span_less_than_5_mm_are_in_another_unit(size, wrong):
     """Both lists in metres fit each other, with an exit code of 0 and a patient of half a millimetre."""
-    if refused:
+    if wrong:
         text = rf"markers a, b, c, d span {2 * size:.2g} mm, .* slip of unit \(m or cm as mm\) on both sides"
         with pytest.raises(InputError, match=text):
             registered(cross(size), cross(size))
@@ -93,12 +93,12 @@ def test_a_marker_that_misses_by_more_than_15_mm_is_named():
         registered(cross(), cross(50 + 14.0, 50 - 15.1), accept_residuals=True)
 
 
-@pytest.mark.parametrize(("moved", "proper", "refused"), [(0, 0.8, 0), (0, 1.2, 1), (5, 10.7, 0), (5, 11.3, 1)])
-def test_a_mirrored_fit_that_is_twice_as_good_and_a_millimetre_more_is_a_mirrored_side(moved, proper, refused):
+@pytest.mark.parametrize(("moved", "proper", "wrong"), [(0, 0.8, 0), (0, 1.2, 1), (5, 10.7, 0), (5, 11.3, 1)])
+def test_a_mirrored_fit_that_is_twice_as_good_and_a_millimetre_more_is_a_mirrored_side(moved, proper, wrong):
     """Mirrored at z = 0 the heights miss by 2 h each, and beside them all markers by as much as they were moved."""
     height = 0.5 * np.sqrt(proper**2 - moved**2)
     ct, base = cross(height=height), cross(50.0 + moved, 50.0 - moved, -height)
-    if refused:
+    if wrong:
         with refused("markers_mirrored", moved, "00", f"{proper:.2f}"):
             registered(ct, base, accept_residuals=True)
     else:

@@ -135,7 +135,7 @@ def test_a_patient_off_the_table_is_told(tmp_path, top_mm, says):
 
 
 @pytest.mark.parametrize(
-    ("box", "refused"),
+    ("box", "wrong"),
     [
         (table(BELOW_MM - 50.0), False),
         (table(BELOW_MM + 18.0), False),
@@ -148,10 +148,10 @@ def test_a_patient_off_the_table_is_told(tmp_path, top_mm, says):
         (("rail", (330.0, 200.0, 150.0), (400.0, 40.0, 40.0)), False),
     ],
 )
-def test_a_patient_in_a_box_of_the_robots_frame_is_refused(tmp_path, box, refused):
+def test_a_patient_in_a_box_of_the_robots_frame_is_refused(tmp_path, box, wrong):
     """Deeper than 30 mm, or beyond its middle; and a box wholly within the patient. A mattress may give way."""
     path = stating(tmp_path, boxes=[box])
-    if not refused:
+    if not wrong:
         assert prepare(path, arm=False)
         return
     with refused("transform_implausible", "30", box[0]) as told:
