@@ -13,7 +13,6 @@ from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN, ball
 from puncture_twin.planning.anatomy.body.body_mask import body_mask, filled_slices
 from puncture_twin.planning.anatomy.body.unscanned import BLANK_HU, find_unscanned, measured_hu
 from puncture_twin.planning.anatomy.second_witness import Named
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.certify.checker import verify
@@ -407,7 +406,7 @@ def test_what_a_person_declares_stands_in_every_result(scene):
 def test_what_cannot_be_declared_is_refused(scene, line):
     """The key is named."""
     folder, _ = scene("alone")
-    with pytest.raises(InputError, match=line.split()[0]):
+    with refused("bad_value", line.split()[0]):
         load_case(write_case(folder, more=f"[ct]\n{line}", name="undeclared"))
 
 

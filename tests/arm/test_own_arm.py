@@ -19,7 +19,6 @@ from puncture_twin.planning.arm.links import collision_links, own_arm
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.arm.urdf.lengths import StatedLimits
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 
@@ -132,7 +131,7 @@ def test_what_is_not_understood_is_refused_with_its_place(plain, tmp_path, kind)
     """One line that names the file, and the joint or link where there is one."""
     case = REFUSED[kind]
     path = edited(plain, tmp_path, *case["changes"])
-    with pytest.raises(InputError, match=case["says"].replace("(", r"\(").replace(")", r"\)")) as error:
+    with refused(*case["says"].split()) as error:
         arm(path)
     assert "toy.urdf" in str(error.value) and "\n" not in str(error.value)
 
@@ -141,12 +140,12 @@ def test_what_is_not_understood_is_refused_with_its_place(plain, tmp_path, kind)
     ("joint", "change", "says"),
     [
         (2, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0), None),  # along its own axis, and all after it: a longer d4
-        (2, (0.0, 2.0, 0.0, 0.0, 0.0, 0.0), "axis 3 .'j3'. passes 2 mm beside"),
-        (3, (0.0, 0.0, 0.0, 0.0, 0.01, 0.0), "axis 4 .'j4'. points along"),
-        (3, (0.0, 0.0, 0.0, 0.0, 0.0, 1.5), "axis 5 .'j5'. points along"),  # another zero
-        (4, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0), "axis 5 .'j5'. passes 1 mm beside"),
-        (1, (3.0, 0.0, 0.0, 0.0, 0.0, 0.0), "axis 2 .'j2'. passes 3 mm beside"),
-        (5, (0.0, 0.0, 0.0, 0.0, 0.0, 0.5), "the flange 'tool0' is .* turned by 28.65 degrees"),
+        (2, (0.0, 2.0, 0.0, 0.0, 0.0, 0.0), "arm_not_as_ur j3"),
+        (3, (0.0, 0.0, 0.0, 0.0, 0.01, 0.0), "arm_not_as_ur j4"),
+        (3, (0.0, 0.0, 0.0, 0.0, 0.0, 1.5), "arm_not_as_ur j5"),  # another zero
+        (4, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0), "arm_not_as_ur j5"),
+        (1, (3.0, 0.0, 0.0, 0.0, 0.0, 0.0), "arm_not_as_ur j2"),
+        (5, (0.0, 0.0, 0.0, 0.0, 0.0, 0.5), "arm_not_as_ur 28.65"),
     ],
 )
 def test_an_arm_that_is_not_built_as_a_ur_is_refused_at_its_joint(plain, tmp_path, joint, change, says):
@@ -162,7 +161,7 @@ def test_an_arm_that_is_not_built_as_a_ur_is_refused_at_its_joint(plain, tmp_pat
     if says is None:
         assert (arm(path).lengths - LENGTHS).tolist() == [0, 0, 0, 1, 0, 0]
         return
-    with pytest.raises(InputError, match=says):
+    with refused(*says.split()):
         arm(path)
 
 
@@ -231,14 +230,14 @@ def test_meshes_are_the_same_body_however_they_are_written(plain, tmp_path, what
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (('filename="ulna.stl"', 'filename="ulna.stl" scale="0.3 0.3 0.3"'), "gap of|do not meet"),
+        (('filename="ulna.stl"', 'filename="ulna.stl" scale="0.3 0.3 0.3"'), "forearm"),
         (
             ('<geometry><mesh filename="ulna.stl"', '<origin xyz="0 0.3 0"/><geometry><mesh filename="ulna.stl"'),
-            "do not meet",
+            "forearm",
         ),
         (
             ('<geometry><mesh filename="roll.stl"', '<origin xyz="0 0 0.4"/><geometry><mesh filename="roll.stl"'),
-            "gap of",
+            "wrist",
         ),
     ],
 )

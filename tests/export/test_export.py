@@ -668,29 +668,35 @@ def test_no_number_of_the_program_has_an_exponent(plan):
 
 
 TAMPERED = {
-    "no wait": (lambda t: re.sub(r'  popup\("Needle.*\n', "", t), "wait"),
+    "no wait": (lambda t: re.sub(r'  popup\("Needle.*\n', "", t), "insertion_unguarded"),
     "a wait after the insertion": (
         lambda t: re.sub(r'(  popup\("Needle.*\n)((?:.*\n)*?)(    movel\(target_m.*\n)', r"\2\3\1", t),
-        "wait",
+        "insertion_unguarded",
     ),
-    "no guard": (lambda t: t.replace("if tool_contact(direction=get_target_tcp_speed()) > 0:", "if False:"), "guarded"),
-    "a faster way back": (lambda t: re.sub(r"    movel\(standoff_m, a=0.", "    movel(standoff_m, a=1.", t), "guarded"),
-    "no thread": (lambda t: t.replace("  insertion = run insert()\n", ""), "guarded"),
-    "a joint changed": (lambda t: t.replace("  movej([0.3000", "  movej([0.3001"), "approach"),
+    "no guard": (
+        lambda t: t.replace("if tool_contact(direction=get_target_tcp_speed()) > 0:", "if False:"),
+        "insertion_unguarded",
+    ),
+    "a faster way back": (
+        lambda t: re.sub(r"    movel\(standoff_m, a=0.", "    movel(standoff_m, a=1.", t),
+        "insertion_unguarded",
+    ),
+    "no thread": (lambda t: t.replace("  insertion = run insert()\n", ""), "insertion_unguarded"),
+    "a joint changed": (lambda t: t.replace("  movej([0.3000", "  movej([0.3001"), "not_read_back"),
     "a blend at the end": (
         lambda t: re.sub(r"r=0\.0+\)(?!(?:.*\n)+  movej)", "r=0.010000000000)", t),
-        "radius",
+        "not_read_back",
     ),
-    "another target": (lambda t: re.sub(r"target_m = p\[.", "target_m = p[-1", t), "target|reach"),
-    "another move": (lambda t: t.replace("  stopl", "  movel(start_q)\n  stopl"), "read back"),
+    "another target": (lambda t: re.sub(r"target_m = p\[.", "target_m = p[-1", t), "not_read_back"),
+    "another move": (lambda t: t.replace("  stopl", "  movel(start_q)\n  stopl"), "not_read_back"),
     "a fast insertion": (
         lambda t: re.sub(r"(movel\(target_m, a=)[\d.]+(, v=)[\d.]+", r"\g<1>90.0\g<2>9.0", t),
-        "speed",
+        "insertion_unguarded",
     ),
-    "a fast approach": (lambda t: re.sub(r"v=\d\.\d+(, r=)", r"v=9.0\1", t), "speed"),
-    "a blend that nobody looked at": (lambda t: t.replace("r=0.0000", "r=0.0020", 1), "radius"),
-    "no speed at all": (lambda t: re.sub(r"v=\d\.\d+(, r=)", r"v=0.0\1", t), "speed"),
-    "another tool": (lambda t: t.replace("0.250000000000, 0.0", "0.200000000000, 0.0"), "read back"),
+    "a fast approach": (lambda t: re.sub(r"v=\d\.\d+(, r=)", r"v=9.0\1", t), "not_read_back"),
+    "a blend that nobody looked at": (lambda t: t.replace("r=0.0000", "r=0.0020", 1), "not_read_back"),
+    "no speed at all": (lambda t: re.sub(r"v=\d\.\d+(, r=)", r"v=0.0\1", t), "not_read_back"),
+    "another tool": (lambda t: t.replace("0.250000000000, 0.0", "0.200000000000, 0.0"), "not_read_back"),
 }
 
 
@@ -700,7 +706,7 @@ def test_a_program_that_is_not_the_plan_does_not_read_back(plan, what):
     change, message = TAMPERED[what]
     text = script(plan)
     assert change(text) != text
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         check_program(read_urscript(change(text), where=SOURCE), plan, where=SOURCE)
 
 
@@ -773,8 +779,9 @@ def test_absurd_times_are_refused_in_bounded_work(plan, smooth, name, tmp_path):
     """An insertion of a thousand years, a stream of a century: one line, not all of the memory."""
     part = smooth.approach
     century = Trajectory(np.append(part.times_s, 3e9), np.concatenate([part.q, part.q[-1:]]))
-    for one in (hurried(plan, "insertion", 3e9), replace(smooth, approach=century)):
-        with pytest.raises(InputError):
+    approach = replace(smooth, approach=century)
+    for one in (hurried(plan, "insertion", 3e9), approach):
+        with refused("not_read_back" if name == "urscript" and one is not approach else "too_long"):
             export_plan(one, name, tmp_path / "out", source=SOURCE)
     assert not (tmp_path / "out").exists()
 

@@ -243,7 +243,7 @@ def test_a_folder_without_a_series_says_what_it_holds(tmp_path, what):
         (tmp_path / "series 1").mkdir()
     elif what == "capture alone":
         world.write_series(tmp_path, [capture()])
-    told = {"folders": r"series 1 \(is a folder\)", "capture alone": "1 Secondary Capture"}.get(what, "no DICOM file")
+    told = {"folders": "series 1 (is a folder)", "capture alone": "1 Secondary Capture"}.get(what, "no DICOM file")
     with refused("no_ct", told):
         read_series(tmp_path)
 

@@ -83,7 +83,7 @@ def test_a_recording_is_read_in_every_heading():
         b"# x\n" + written(["time_s", *JOINTS_RAD], np.column_stack([times, q])), FILE, timed=True
     )
     deg = parse_joint_recording(written([f"q{k}_deg" for k in range(1, 7)], POSES), FILE, timed=False)
-    assert code_of(parse_joint_recording, b"name,x_mm\na,1\n", FILE, timed=False) == "column_missing"
+    assert code_of(parse_joint_recording, b"name,x_mm\na,1\n", FILE, timed=False) == "missing_column"
     header, rows = rtde("ur3", q)
     for comma in (",", " "):
         own = parse_joint_recording(written(header, rows, comma), FILE, timed=True)
@@ -103,7 +103,7 @@ def test_times_that_run_backwards_are_refused():
     parse_joint_recording(written(["time_s", *JOINTS_RAD], np.column_stack([times, q])), FILE, timed=True)
     times[4] = 0.25
     table = written(["time_s", *JOINTS_RAD], np.column_stack([times, q]))
-    assert code_of(parse_joint_recording, table, FILE, timed=True) == "times_backwards"
+    assert code_of(parse_joint_recording, table, FILE, timed=True) == "times_not_rising"
 
 
 def test_a_list_of_touches_has_the_same_gate():

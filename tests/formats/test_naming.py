@@ -12,7 +12,6 @@ import pytest
 from places import REAL_CT
 from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.labels.naming import V1, V2, LabelRule, RuleKind, names_for, select
 
@@ -68,21 +67,21 @@ def test_namings_by_name_by_file_and_by_the_map_itself(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "match"),
     [
-        (b"", "header"),
-        (b"id,name\n", "no label"),
-        (b"id,name\n0,a\n", "line 2"),
-        (b"id,name\n-1,a\n", "line 2"),
-        (b"id,name\n1.5,a\n", "line 2"),
-        (b"id,name\n1,a\n2,a\n", "both named 'a'"),
-        (b"id,name\n1,\n", "empty name"),
-        (b"id,name\n1,\xff\n", "no CSV text"),
-        (b'id,name\n1,"a\n', "no CSV text"),
+        (b"", "wrong_columns"),
+        (b"id,name\n", "empty"),
+        (b"id,name\n0,a\n", "bad_label"),
+        (b"id,name\n-1,a\n", "bad_label"),
+        (b"id,name\n1.5,a\n", "bad_label"),
+        (b"id,name\n1,a\n2,a\n", "duplicate_name"),
+        (b"id,name\n1,\n", "bad_name"),
+        (b"id,name\n1,\xff\n", "not_text"),
+        (b'id,name\n1,"a\n', "not_csv"),
     ],
 )
 def test_broken_name_tables_are_refused(tmp_path: Path, content: bytes, match: str) -> None:
     """By line where there is one."""
     (tmp_path / "names.csv").write_bytes(content)
-    with pytest.raises(InputError, match=match):
+    with refused(*match.split()):
         names_for("names.csv", tmp_path, read_from(tmp_path), map_with(None))
 
 

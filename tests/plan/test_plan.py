@@ -173,53 +173,56 @@ def nearest_branch(branches, q):
 
 
 BROKEN = {
-    "another version": (lambda d: {"version": 7}, "version 7"),
-    "no T_base_ct": (lambda d: {"T_base_ct": None}, "T_base_ct"),
-    "a mirrored T_base_ct": (lambda d: {"T_base_ct": (np.diag([1, 1, -1, 1]) @ d["T_base_ct"]).tolist()}, "T_base_ct"),
-    "a target elsewhere": (lambda d: {"target_ct_mm": [0, 0, 0]}, "straight path|off the stored pose"),
-    "two coordinates": (lambda d: {"target_ct_mm": [0, 0]}, "does not fit"),
-    "text for a number": (lambda d: {"standoff_mm": "150"}, "is no number"),
-    "another standoff": (lambda d: {"standoff_mm": d["standoff_mm"] + 1}, "tip at standoff is 1 mm off"),
-    "a gap between the phases": (lambda d: {"approach": _moved(d["approach"], -1, 0, 0.01)}, "does not start where"),
+    "another version": (lambda d: {"version": 7}, "unknown_version"),
+    "no T_base_ct": (lambda d: {"T_base_ct": None}, "wrong_type T_base_ct"),
+    "a mirrored T_base_ct": (
+        lambda d: {"T_base_ct": (np.diag([1, 1, -1, 1]) @ d["T_base_ct"]).tolist()},
+        "mirrored T_base_ct",
+    ),
+    "a target elsewhere": (lambda d: {"target_ct_mm": [0, 0, 0]}, "not_straight"),
+    "two coordinates": (lambda d: {"target_ct_mm": [0, 0]}, "bad_value"),
+    "text for a number": (lambda d: {"standoff_mm": "150"}, "bad_value"),
+    "another standoff": (lambda d: {"standoff_mm": d["standoff_mm"] + 1}, "plan_contradicted"),
+    "a gap between the phases": (lambda d: {"approach": _moved(d["approach"], -1, 0, 0.01)}, "phases_not_joined"),
     "a joint off at the target": (
         lambda d: {"insertion": _moved(d["insertion"], -1, 1, 0.01)},
-        "leaves the straight path",
+        "not_straight",
     ),
     "a detour on the way in": (
         lambda d: {"insertion": _moved(d["insertion"], 40, 1, 0.01)},
-        "leaves the straight path",
+        "not_straight",
     ),
     "a dive past the target": (
         lambda d: _with_rows(d, lambda rows: [*rows, *_shifted(d, rows[-1], -30.0)]),
-        "goes beyond standoff and target by 30|turns back by 30",
+        "not_straight 30",
     ),
-    "only the two ends of the insertion": (lambda d: _two_rows(d), "leaves the straight path by|swings out"),
+    "only the two ends of the insertion": (lambda d: _two_rows(d), "not_straight"),
     "a thousand times as fast": (
         lambda d: {"approach": {**d["approach"], "times_s": [t / 1000 for t in d["approach"]["times_s"]]}},
-        "the approach drives the tip at .* mm/s",
+        "tip_too_fast",
     ),
     "a jolt on the way": (
         lambda d: {"approach": _moved(d["approach"], len(d["approach"]["q_rad"]) // 2, 2, 0.01)},
-        "the approach (has .* times the acceleration that a joint may have|drives the tip)",
+        "tip_too_fast",
     ),
     "an insertion at ten times the speed": (
         lambda d: {"insertion": {**d["insertion"], "times_s": [t / 10 for t in d["insertion"]["times_s"]]}},
-        "drives the tip at .* mm/s",
+        "tip_too_fast",
     ),
     "times that fall": (
         lambda d: {"insertion": {**d["insertion"], "times_s": d["insertion"]["times_s"][::-1]}},
-        "times do not rise",
+        "times_not_rising",
     ),
     "five joints": (
         lambda d: {"insertion": {**d["insertion"], "q_rad": [row[:5] for row in d["insertion"]["q_rad"]]}},
-        "does not fit",
+        "bad_value",
     ),
     "a jerk that is not its own": (
         lambda d: {"approach": {**d["approach"], "peaks": {**d["approach"]["peaks"], "jerk_rad_s3": [0.0] * 6}}},
-        "peaks of the approach",
+        "plan_contradicted",
     ),
-    "other limits": (lambda d: {"limits": {**d["limits"], "speed_rad_s": [9.0] * 6}}, "the limits are not"),
-    "an unknown arm": (lambda d: {"robot": "ur99"}, "ur99"),
+    "other limits": (lambda d: {"limits": {**d["limits"], "speed_rad_s": [9.0] * 6}}, "plan_contradicted"),
+    "an unknown arm": (lambda d: {"robot": "ur99"}, "unknown_robot ur99"),
 }
 
 
@@ -228,7 +231,7 @@ def test_a_plan_that_contradicts_itself_is_refused(name, document):
     """Whatever was changed is named."""
     change, message = BROKEN[name]
     content, write = document
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         read_plan(write(**change(content)))
 
 

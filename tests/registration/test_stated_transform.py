@@ -7,7 +7,6 @@ from case_world import CASE, MARKERS, changed, registration_section, write_case
 from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import load_skin
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, left_jacobian, pose
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
@@ -76,7 +75,7 @@ def test_it_is_an_input_and_says_that_nothing_is_known_of_its_error(tmp_path):
     assert line.startswith(f"registration: {said} (markers_ct and markers_base beside it measure it)")
     placement = load_placement(case)
     assert placement.registration is None and np.isnan(placement.target_error_mm)
-    with pytest.raises(InputError, match=said):
+    with refused("no_markers", said):
         registration_report(tmp_path)
 
 
