@@ -133,11 +133,7 @@ def test_where_the_scanner_did_not_look_there_is_no_skin() -> None:
 
 @pytest.mark.parametrize(
     ("hu", "match"),
-    [
-        (np.full(SHAPE, -1000), "no_body"),
-        (np.full(SHAPE, 40), "no_air"),
-        (cylinder_ct(radius=10.0), "no_body"),
-    ],
+    [(np.full(SHAPE, -1000), "no_body"), (np.full(SHAPE, 40), "no_air"), (cylinder_ct(radius=10.0), "no_body")],
 )
 def test_a_ct_without_a_plausible_body_is_refused(hu: np.ndarray, match: str) -> None:
     """Air alone, tissue alone, and something far smaller than a patient."""

@@ -58,10 +58,7 @@ def test_a_mount_takes_the_place_of_a_registration(tmp_path):
 @pytest.mark.parametrize(
     ("sections", "message"),
     [
-        (
-            {"colour": {"red": 1}},
-            "unknown_key colour",
-        ),
+        ({"colour": {"red": 1}}, "unknown_key colour"),
         ({"needle": 3}, "not_a_table"),
         ({"needle": {"length_mm": float("nan")}}, "bad_value"),
         ({"needle": {"length": 3.0}}, "unknown_key length"),

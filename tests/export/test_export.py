@@ -506,10 +506,7 @@ TOO_MUCH = {
     "a hurried approach": (lambda p: hurried(p, "approach", 0.6), "tip_too_fast"),
     "a hurried insertion": (lambda p: hurried(p, "insertion", 0.05), "tip_too_fast"),
     "an elbow beyond half a turn": (lambda p: bent_elbow(p), "joint_beyond_limits"),
-    "an elbow whose limit was rounded away": (
-        lambda p: bent_elbow(p, math.pi + 1e-8),
-        "joint_beyond_limits",
-    ),
+    "an elbow whose limit was rounded away": (lambda p: bent_elbow(p, math.pi + 1e-8), "joint_beyond_limits"),
 }
 
 
@@ -683,10 +680,7 @@ TAMPERED = {
     ),
     "no thread": (lambda t: t.replace("  insertion = run insert()\n", ""), "insertion_unguarded"),
     "a joint changed": (lambda t: t.replace("  movej([0.3000", "  movej([0.3001"), "not_read_back"),
-    "a blend at the end": (
-        lambda t: re.sub(r"r=0\.0+\)(?!(?:.*\n)+  movej)", "r=0.010000000000)", t),
-        "not_read_back",
-    ),
+    "a blend at the end": (lambda t: re.sub(r"r=0\.0+\)(?!(?:.*\n)+  movej)", "r=0.010000000000)", t), "not_read_back"),
     "another target": (lambda t: re.sub(r"target_m = p\[.", "target_m = p[-1", t), "not_read_back"),
     "another move": (lambda t: t.replace("  stopl", "  movel(start_q)\n  stopl"), "not_read_back"),
     "a fast insertion": (

@@ -169,15 +169,9 @@ WRONG_SEG = {
     ),
     "two frames at one place": (again, "duplicate_place"),
     "a frame beside the others": (frame(2, push), "off_grid"),
-    "two of one name": (
-        lambda data: setattr(data.SegmentSequence[1], "SegmentLabel", "Liver"),
-        "duplicate_name",
-    ),
-    "no name": (lambda data: setattr(data.SegmentSequence[1], "SegmentLabel", ""), "duplicate_name"),
-    "one number twice": (
-        lambda data: setattr(data.SegmentSequence[1], "SegmentNumber", 1),
-        "duplicate_number",
-    ),
+    "two of one name": (lambda data: setattr(data.SegmentSequence[1], "SegmentLabel", "Liver"), "duplicate_name"),
+    "no name": (lambda data: setattr(data.SegmentSequence[1], "SegmentLabel", ""), "bad_name"),
+    "one number twice": (lambda data: setattr(data.SegmentSequence[1], "SegmentNumber", 1), "duplicate_number"),
     "compressed": (lambda data: setattr(data.file_meta, "TransferSyntaxUID", RLELossless), "transfer_syntax RLE"),
 }
 
@@ -353,18 +347,9 @@ WRONG_RT = {
         lambda T: world.structure_set({"a": [outline(T, 1, CORNERS)]}, "1.2.3"),
         "other_frame_of_reference 1.2.3",
     ),
-    "between slices": (
-        lambda T: world.structure_set({"a": [outline(T, 1.4, CORNERS)]}),
-        "contour_outside_ct",
-    ),
-    "beyond the slices": (
-        lambda T: world.structure_set({"a": [outline(T, 9, CORNERS)]}),
-        "contour_outside_ct",
-    ),
-    "not planar": (
-        lambda T: world.structure_set({"a": [outline(T, np.arange(4), CORNERS)]}),
-        "contour_outside_ct",
-    ),
+    "between slices": (lambda T: world.structure_set({"a": [outline(T, 1.4, CORNERS)]}), "contour_outside_ct"),
+    "beyond the slices": (lambda T: world.structure_set({"a": [outline(T, 9, CORNERS)]}), "contour_outside_ct"),
+    "not planar": (lambda T: world.structure_set({"a": [outline(T, np.arange(4), CORNERS)]}), "contour_outside_ct"),
     "two points": (lambda T: world.structure_set({"a": [outline(T, 1, CORNERS[:2])]}), "wrong_count"),
     "no structure": (lambda T: world.structure_set({}), "no_structure"),
     "a SEG": (lambda T: world.segmentation(masks(), T), "wrong_format"),

@@ -102,7 +102,6 @@ def test_a_bad_mesh_is_refused_by_name(vertices: ArrayLike, faces: ArrayLike, sa
     with refused(*says.split()) as caught:
         guard_mesh(vertices, faces, where="liver.stl")
     assert str(caught.value).startswith("liver.stl: ") and "allowed:" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_limits_of_size_are_the_stated_ones() -> None:

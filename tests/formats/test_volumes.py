@@ -354,11 +354,7 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
         nifti_bytes(datatype=(16, 32), slope=1e30, data=np.full(120, 1e30, dtype="<f4").tobytes()),
         "not_finite",
     ),
-    "NaN voxel": (
-        "a.nii",
-        nifti_bytes(datatype=(16, 32), data=np.full(120, NAN, dtype="<f4").tobytes()),
-        "not_finite",
-    ),
+    "NaN voxel": ("a.nii", nifti_bytes(datatype=(16, 32), data=np.full(120, NAN, dtype="<f4").tobytes()), "not_finite"),
 }
 SIZED = ("sizes", "sizes: 30000 30000 30000")
 

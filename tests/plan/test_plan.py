@@ -184,14 +184,8 @@ BROKEN = {
     "text for a number": (lambda d: {"standoff_mm": "150"}, "bad_value"),
     "another standoff": (lambda d: {"standoff_mm": d["standoff_mm"] + 1}, "plan_contradicted"),
     "a gap between the phases": (lambda d: {"approach": _moved(d["approach"], -1, 0, 0.01)}, "phases_not_joined"),
-    "a joint off at the target": (
-        lambda d: {"insertion": _moved(d["insertion"], -1, 1, 0.01)},
-        "not_straight",
-    ),
-    "a detour on the way in": (
-        lambda d: {"insertion": _moved(d["insertion"], 40, 1, 0.01)},
-        "not_straight",
-    ),
+    "a joint off at the target": (lambda d: {"insertion": _moved(d["insertion"], -1, 1, 0.01)}, "not_straight"),
+    "a detour on the way in": (lambda d: {"insertion": _moved(d["insertion"], 40, 1, 0.01)}, "not_straight"),
     "a dive past the target": (
         lambda d: _with_rows(d, lambda rows: [*rows, *_shifted(d, rows[-1], -30.0)]),
         "not_straight 30",

@@ -192,11 +192,7 @@ BAD = [
     ("affine", lambda parent, _: parent["0"].pop("TransformType"), "missing_key /TransformGroup/0"),
     ("affine", lambda parent, file: file.pop("TransformGroup"), "wrong_format"),
     ("affine", lambda parent, _: parent.pop("0"), "wrong_count"),
-    (
-        "affine",
-        set_to("TransformType", "BSplineTransform_double_3_3"),
-        "unknown_type BSplineTransform_double_3_3",
-    ),
+    ("affine", set_to("TransformType", "BSplineTransform_double_3_3"), "unknown_type BSplineTransform_double_3_3"),
     ("affine", set_to("TransformType", "AffineTransform_double_2_2"), "unknown_type AffineTransform_double_2_2"),
     ("affine", set_to("TransformType", [1.0]), "wrong_type"),
     ("affine", set_to("TransformParameters", np.arange(12)), "wrong_type int64"),

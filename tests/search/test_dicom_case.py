@@ -186,10 +186,7 @@ WRONG = {
     "an organ that no rule names": (('avoid = { "spi*" = 2.0 }', ""), "no_rule"),
     "a naming": (('rtstruct = "rt.dcm"', 'rtstruct = "rt.dcm"\nnaming = "x.csv"'), "key_not_of_it"),
     "two sources": (('rtstruct = "rt.dcm"', 'rtstruct = "rt.dcm"\nseg = "seg.dcm"'), "not_one_source"),
-    "ct beside a label map": (
-        ('rtstruct = "rt.dcm"', 'labelmap = "labels.nii.gz"\nct = "series"'),
-        "key_not_of_it",
-    ),
+    "ct beside a label map": (('rtstruct = "rt.dcm"', 'labelmap = "labels.nii.gz"\nct = "series"'), "key_not_of_it"),
     "a file that is not there": (('rtstruct = "rt.dcm"', 'rtstruct = "none.dcm"'), "no_such_file none.dcm"),
     "the other kind": (('rtstruct = "rt.dcm"', 'seg = "rt.dcm"'), "wrong_format"),
 }

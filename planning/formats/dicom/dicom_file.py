@@ -146,7 +146,12 @@ def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[flo
         plain = tuple(float(one) for one in listed)
     if len(plain) != count or not all(map(math.isfinite, plain)):
         what = f"{name(keyword)} is missing" if found is None else f"{name(keyword)} is {str(found)[:100]}"
-        refuse(what, where, f"{count} finite number{'s' if count > 1 else ''}", "bad_tag")
+        refuse(
+            what,
+            where,
+            f"{count} finite number{'s' if count > 1 else ''}",
+            "missing_tag" if found is None else "bad_tag",
+        )
     return plain
 
 

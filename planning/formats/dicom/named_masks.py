@@ -68,7 +68,7 @@ def unique_names(names: Sequence[str], where: Path) -> None:
     for name in names:
         if not name or names.count(name) > 1:
             what = f"{names.count(name)} structures are called {name!r}" if name else "a structure has no name"
-            refuse(what, where, "a name of its own for each structure", "duplicate_name")
+            refuse(what, where, "a name of its own for each structure", "duplicate_name" if name else "bad_name")
 
 
 def check_frame_of_reference(stated: str, ct: CtSeries, where: Path) -> None:
