@@ -1,5 +1,6 @@
 """What must be refused: by its code, and the one line of a command."""
 
+import json
 from contextlib import contextmanager
 
 import pytest
@@ -17,6 +18,15 @@ def refused(code, *values, by=InputError):
     assert caught.value.code == code, caught.value
     line = str(caught.value)
     assert "\n" not in line and all(str(value) in line for value in values), line
+
+
+def refused_command(arguments, capfd, code, *values):
+    """Run a command that must be refused with this code, in one line that names these values."""
+    assert main([*map(str, arguments), "--json"]) == BAD_INPUT
+    captured = capfd.readouterr()
+    error, line = json.loads(captured.out)["error"], captured.err.strip()
+    assert error["code"] == code and error["sentence"] in line and "allowed: " in line, (error, line)
+    assert "\n" not in line and all(value in line for value in values), line
 
 
 def refused_line(arguments, capfd):

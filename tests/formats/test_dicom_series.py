@@ -158,7 +158,10 @@ REFUSED = {
     ),
     "another pixel size": (lambda: changed(1, PixelSpacing=["0.9", "0.8"]), "mixed_geometry"),
     "no position": (lambda: changed(1, ImagePositionPatient=None), "missing_tag _1 ImagePositionPatient 0020 0032"),
-    "no orientation": (lambda: changed(1, ImageOrientationPatient=None), "missing_tag ImageOrientationPatient 0020 0037"),
+    "no orientation": (
+        lambda: changed(1, ImageOrientationPatient=None),
+        "missing_tag ImageOrientationPatient 0020 0037",
+    ),
     "no spacing": (lambda: changed(1, PixelSpacing=None), "missing_tag PixelSpacing 0028 0030"),
     "no slope": (lambda: changed(1, RescaleSlope=None), "no_rescale _1 0028 1053"),
     "slope 0": (lambda: changed(1, RescaleSlope="0"), "out_of_range"),
