@@ -21,12 +21,13 @@ def refused(code, *values, by=InputError):
 
 
 def refused_command(arguments, capfd, code, *values):
-    """Run a command that must be refused with this code, in one line that names these values."""
+    """Run a command that must be refused with this code, in one line that names these values; returns the line."""
     assert main([*map(str, arguments), "--json"]) == BAD_INPUT
     captured = capfd.readouterr()
-    error, line = json.loads(captured.out)["error"], captured.err.strip()
+    error, (*_, line) = json.loads(captured.out)["error"], captured.err.strip().splitlines()
     assert error["code"] == code and error["sentence"] in line and "allowed: " in line, (error, line)
-    assert "\n" not in line and all(value in line for value in values), line
+    assert all(value in line for value in values), line
+    return line
 
 
 def refused_line(arguments, capfd):

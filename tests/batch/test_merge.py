@@ -7,7 +7,7 @@ import polars
 import pyarrow.parquet as pq
 import pytest
 from cohort_world import merged, plan_of, run_here, tiny_text, write_cohort, write_patient
-from refusals import refused
+from refusals import refused, refused_command
 
 from puncture_twin.planning.batch.merge import compare, read_cases, union_schema
 from puncture_twin.planning.batch.run import cohort_state
@@ -125,7 +125,8 @@ def test_what_is_expected_is_held(cohort, tmp_path, capfd):
     pq.write_table(table.slice(1), expected)
     assert main(command) == 1 and "p0/case.toml: new" in capfd.readouterr().out
     expected.write_text("no table")
-    assert main(command) == 2 and "is no table" in capfd.readouterr().err
+    capfd.readouterr()
+    refused_command(command, capfd, "not_parquet")
 
 
 def row(case, safe, clearance=None, entry=None, reason=None, code=0):

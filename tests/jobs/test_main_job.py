@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from case_world import coarse_carton
 from PIL import Image
+from refusals import refused_command
 
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems, read_manifest
@@ -153,11 +154,8 @@ def test_a_plan_whose_marker_file_changed_is_refused(carton, rehearsed, tmp_path
     text = (other / "touch.csv").read_text()
     (other / "touch.csv").write_text(text.replace("417.67", "417.68"))
     out = tmp_path / "out"
-    assert (
-        main(["rehearse", str(rehearsed / "plan.json"), "--case", str(other / "case_m.toml"), "--out", str(out)])
-        == BAD_INPUT
-    )
-    assert "(touch.csv)' is not the one" in capfd.readouterr().err
+    command = ["rehearse", rehearsed / "plan.json", "--case", other / "case_m.toml", "--out", out]
+    refused_command(command, capfd, "input_changed", "touch.csv")
     assert not out.exists()
 
 
