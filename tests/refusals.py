@@ -28,14 +28,3 @@ def refused_command(arguments, capfd, code, *values):
     assert error["code"] == code and error["sentence"] in line and "allowed: " in line, (error, line)
     assert all(value in line for value in values), line
     return line
-
-
-def refused_line(arguments, capfd):
-    """Run a command that must be refused; returns its one line."""
-    assert main([str(argument) for argument in arguments]) == BAD_INPUT
-    captured = capfd.readouterr()
-    assert captured.out == ""
-    lines = [line for line in captured.err.splitlines() if line.strip()]
-    assert len(lines) == 1, captured.err
-    assert "allowed: " in lines[0]
-    return lines[0]
