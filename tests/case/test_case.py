@@ -131,10 +131,8 @@ def test_a_broken_case_is_refused_in_one_line(name, write):
     """Each defect is named with its place and what is allowed."""
     change, message = BAD[name]
     text = GOOD.replace("theta_deg = [0, 60]", 'theta_deg = [0, 60]\nframe = "bed"') if "local" in name else GOOD
-    with refused(*message.split()) as caught:
+    with refused(*message.split(), "case.toml"):
         load_case(write(change, text=text))
-    assert "case.toml" in str(caught.value)
-    assert "allowed: " in str(caught.value)
 
 
 @pytest.mark.parametrize(

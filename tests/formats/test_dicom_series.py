@@ -222,10 +222,8 @@ def test_two_series_are_refused_with_names_and_a_file_chooses_one(tmp_path):
     """Their descriptions, counts and a file of each; then one file of a series stands for it."""
     other = world.series(world.phantom() + 5, series=world.ROOT + "70", description="arterial")
     folder = world.write_series(tmp_path / "s", [*world.series(), *other], [f"{n}.dcm" for n in range(8)])
-    listed = "2.5 0.dcm"
-    with refused("several_series", *listed.split()) as caught:
+    with refused("several_series", "2.5", "0.dcm"):
         read_series(folder)
-    assert "name one of its files" in str(caught.value)
     assert by_place(read_series(folder / "2.dcm")) == expected(world.affine())
     assert by_place(read_series(folder / "6.dcm")) == expected(world.affine(), HU + 5)
 

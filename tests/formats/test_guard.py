@@ -99,9 +99,8 @@ def test_indices_may_come_as_whole_floats() -> None:
 )
 def test_a_bad_mesh_is_refused_by_name(vertices: ArrayLike, faces: ArrayLike, says: str) -> None:
     """Each fault gives one line that names the place, the fault and what is allowed."""
-    with refused(*says.split()) as caught:
+    with refused(*says.split(), "liver.stl"):
         guard_mesh(vertices, faces, where="liver.stl")
-    assert str(caught.value).startswith("liver.stl: ") and "allowed:" in str(caught.value)
 
 
 def test_the_limits_of_size_are_the_stated_ones() -> None:

@@ -616,9 +616,8 @@ BROKEN = [
 @pytest.mark.parametrize(("suffix", "data", "says"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
 def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, suffix: str, data: bytes, says: str) -> None:
     """One line that names the file, the place and what is allowed."""
-    with refused(*says.split()) as caught:
+    with refused(*says.split(), tmp_path / f"mesh{suffix}"):
         read(tmp_path, suffix, data)
-    assert str(caught.value).startswith(str(tmp_path / f"mesh{suffix}")) and "; allowed: " in str(caught.value)
 
 
 def test_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:

@@ -228,9 +228,8 @@ BROKEN: list[tuple[str, str, str | bytes, str]] = [
 @pytest.mark.parametrize(("ending", "data", "says"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
 def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, ending: str, data: str | bytes, says: str) -> None:
     """One line that names the file, the line or point, and what is allowed."""
-    with refused(*says.split()) as caught:
+    with refused(*says.split(), tmp_path / f"markers{ending}") as caught:
         read(tmp_path, ending, data, default_space=Space.LPS)
-    assert str(caught.value).startswith(str(tmp_path / f"markers{ending}")) and "; allowed: " in str(caught.value)
     str(caught.value).encode("utf-8")  # can be printed
 
 

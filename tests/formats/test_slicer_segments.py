@@ -155,6 +155,5 @@ def test_voxels_of_a_segment_that_is_not_listed_are_not_lost(tmp_path, layers):
     head, _, voxels = data.partition(b"\n\n")
     lines = [line for line in head.split(b"\n") if not line.startswith(b"Segment2_")]
     found = read(tmp_path, b"\n".join(lines) + b"\n\n" + voxels)
-    with refused("label_without_segment") as caught:
+    with refused("label_without_segment", "[2]"):
         found.masks["right lung"].volume()
-    assert caught.value.code == "label_without_segment" and "[2]" in caught.value.what

@@ -468,9 +468,8 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
 def test_damaged_and_hostile_files_are_refused_by_name(tmp_path: Path, case: tuple[str, bytes, str]) -> None:
     """Each is an ``InputError`` that names the file and what is wrong."""
     name, content, match = case
-    with refused(*match.split()) as caught:
+    with refused(*match.split(), name):
         read_volume(write(tmp_path, name, content))
-    assert name in str(caught.value)
 
 
 def test_paths_that_are_no_volume_files(tmp_path: Path) -> None:

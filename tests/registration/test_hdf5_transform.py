@@ -214,9 +214,8 @@ BAD = [
 @pytest.mark.parametrize(("kind", "change", "says"), BAD)
 def test_what_is_not_one_rigid_transform_is_refused(tmp_path, kind, change, says):
     """Stretched, sheared, of another kind, incomplete, pointing elsewhere: named, in one line."""
-    with refused(*says.split()) as caught:
+    with refused(*says.split(), tmp_path / "b.h5"):
         read(rewritten(tmp_path, kind, change))
-    assert "\n" not in str(caught.value) and str(tmp_path / "b.h5") in str(caught.value)
 
 
 def test_every_truncation_is_refused(tmp_path):
