@@ -28,7 +28,7 @@ def test_a_patient_that_cannot_be_looked_up_is_not_left_out(tmp_path, monkeypatc
     """Behind a link to an archive that is not mounted, or in a folder that may not be read."""
     write_patient(tmp_path / "c" / "a")
     (tmp_path / "c" / "b").symlink_to(tmp_path / "archive" / "b")
-    with refused("cohort_not_whole") as caught:
+    with refused("cohort_not_whole"):
         read_cohort(tmp_path / "c")
     (tmp_path / "c" / "b").unlink()
     write_patient(tmp_path / "c" / "b")
@@ -40,9 +40,8 @@ def test_a_patient_that_cannot_be_looked_up_is_not_left_out(tmp_path, monkeypatc
         return listed(folder)
 
     monkeypatch.setattr(os, "scandir", scandir)
-    with refused("cohort_not_whole", "Permission") as caught:
+    with refused("cohort_not_whole", "/b: "):
         read_cohort(tmp_path / "c")
-    assert caught.value.where.endswith("/b")
 
 
 def test_a_csv_lists_cases_relative_to_itself_or_absolute(tmp_path):

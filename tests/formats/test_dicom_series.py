@@ -400,9 +400,8 @@ def test_big_endian_is_refused_by_its_name_where_it_may_be_read(tmp_path):
     big_endian(folder / "4")
     assert by_place(read_series(folder)) == expected(world.affine())
     big_endian(folder / "2")
-    with refused("transfer_syntax", "Big") as caught:
+    with refused("transfer_syntax", folder / "2"):
         read_series(folder)
-    assert caught.value.code == "transfer_syntax" and caught.value.where.endswith("2")
 
 
 def test_pixels_that_no_decoder_takes_are_named_by_their_syntax(tmp_path):
@@ -421,6 +420,5 @@ def test_pixels_that_no_decoder_takes_are_named_by_their_syntax(tmp_path):
 
 def test_a_missing_rescaling_says_what_to_do(tmp_path):
     """Nothing tells whether air is 0 or -1000."""
-    with refused("no_rescale") as caught:
+    with refused("no_rescale", "-1024"):
         read_series(world.write_series(tmp_path, changed(1, RescaleIntercept=None)))
-    assert caught.value.code == "no_rescale" and "-1024" in caught.value.allowed
