@@ -69,7 +69,7 @@ def test_a_case_that_cannot_be_read_is_planned_with_its_reason(tmp_path):
     assert str(tmp_path) not in row.refusal
     (path.parent / "away").rename(path.parent / "rib.stl")
     assert identified(row).id == whole != row.id
-    assert "cannot be read" in plan_of(tmp_path / "gone" / "case.toml")[0].refusal
+    assert "no such file" in plan_of(tmp_path / "gone" / "case.toml")[0].refusal
 
 
 def test_a_plan_is_read_as_it_was_written(tmp_path):

@@ -340,11 +340,7 @@ def test_an_arm_that_was_switched_off_is_named(carton, capfd):
 @pytest.mark.parametrize("command", [["search"], ["check", "--theta", "0", "--beta", "0"]])
 def test_an_arm_that_is_asked_for_must_have_a_base(without_base, command, capfd):
     """--arm typed for a case without a base: bad input, one line."""
-    assert main([*command, str(without_base), "--arm"]) == BAD_INPUT
-    said = capfd.readouterr()
-    assert said.out == ""
-    assert len(said.err.strip().splitlines()) == 1
-    assert "the arm is to be checked, but the case does not say where the robot's base is" in said.err
+    refused_command([*command, without_base, "--arm"], capfd, "no_base")
 
 
 def test_reproduce_holds(capfd):
