@@ -132,7 +132,7 @@ def card(title: str, facts: Facts, picture: str = "") -> str:
     Args:
         title: Plain text.
         facts: Names and values, plain text.
-        picture: HTML, such as an SVG; "" for none.
+        picture: HTML, such as an image; "" for none.
     """
     rows = "".join(
         f'<tr style="{ROW}"><th style="{NAME}">{escape(name)}</th><td style="{CELL}">{escape(value)}</td></tr>'

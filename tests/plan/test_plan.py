@@ -55,7 +55,7 @@ def test_plan_case_and_candidates_show_themselves(carton, found, planned):
     assert f"θ {np.degrees(planned.plan.theta):g}°" in shown["plan"]
     assert "bolt_m" in shown["case"]
     assert f"{len(found):,} candidates" in shown["all"]
-    assert "<svg" in shown["all"]
+    assert "data:image/png" in shown["all"]
     hostile = replace(planned.plan, case_name="<script>")._repr_html_()
     assert "<script>" not in hostile
     assert "&lt;script&gt;" in hostile
