@@ -110,20 +110,11 @@ def _lined(raster: MapRaster, candidates: Candidates, codes: NDArray[np.int64]) 
 
 
 def _edges(values: NDArray[np.int64], *, named: bool = False) -> Bools:
-    """Pixels within one of where two values lie beside each other; where ``named``, of two that are not 0."""
-    marked = np.zeros(values.shape, dtype=bool)
-    for here, there, at in (
-        (values[:-1], values[1:], marked[:-1]),
-        (values[:, :-1], values[:, 1:], marked[:, :-1]),
-    ):
-        at |= (here != there) & ((here * there != 0) | (not named))
-    wide = marked.copy()
-    wide[1:] |= marked[:-1]
-    wide[:-1] |= marked[1:]
-    wider = wide.copy()
-    wider[:, 1:] |= wide[:, :-1]
-    wider[:, :-1] |= wide[:, 1:]
-    return wider
+    """Pixels beside which another value lies; where ``named``, of two that are not 0."""
+    shown = np.where(values == 0, np.iinfo(np.int64).max, values) if named else values
+    least = ndimage.minimum_filter(shown, 3)
+    most = ndimage.maximum_filter(values, 3)
+    return np.asarray((least < most) & (values != 0) if named else least < most)
 
 
 def _frame(axes: Axes, view: MapView) -> None:

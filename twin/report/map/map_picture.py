@@ -51,12 +51,11 @@ from puncture_twin.twin.report.numbers import (
     arm_text,
     nearest_text,
     needle_text,
-    number,
-    percent,
     reason_counts,
     target_text,
 )
 from puncture_twin.twin.report.palette import safe_shades
+from puncture_twin.twin.report.present import number, percent
 
 WIDTH, HEIGHT = 1690, 1222
 
