@@ -12,7 +12,7 @@ from puncture_twin.planning.formats.points import read_points
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.experiment.scan_job import Control, _needle_lines, control_summary
+from puncture_twin.twin.jobs.experiment.scan_job import Control, _needle_rows, control_summary
 from puncture_twin.twin.plant.scanner.case_scene import TrueRod
 
 CARTON = folder() / "carton" / "case_m.toml"
@@ -139,4 +139,4 @@ def test_a_needle_that_cannot_be_read_is_no_reason_for_no_scan():
     summary = control_summary(Control(true, None, np.zeros(3), why))
     assert summary["found"] is None and summary["why_not"] == why
     assert summary["true"]["depth_mm"] == pytest.approx(-2.0)
-    assert _needle_lines(summary) == [f"  needle         not read: {why}"]
+    assert _needle_rows(summary) == [("needle", f"not read: {why}")]

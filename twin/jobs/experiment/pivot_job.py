@@ -34,6 +34,7 @@ from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, c
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.plant.true_needle import TouchTruth, draw_pivot_truth
 from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
+from puncture_twin.twin.report.present import Section, footer, text, vector
 
 STANDS_OUT = 2.0
 """A touch that misses by so many times the others' root mean square is named."""
@@ -119,19 +120,21 @@ def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> 
 
 def pivot_text(run: PivotRun) -> str:
     """For the terminal."""
-    pivot = run.pivot
+    return text(_pivot_said(run))
+
+
+def _pivot_said(run: PivotRun) -> list[Section]:
+    pivot, stated = run.pivot, run.case.needle.length_mm
     x, y, z = pivot.tip_flange
-    sd = np.sqrt(np.diag(pivot.cov_tip))
-    lines = [
-        f"tip in the flange frame: ({x:.3f}, {y:.3f}, {z:.3f}) mm, sd ({sd[0]:.3f}, {sd[1]:.3f}, {sd[2]:.3f}), "
-        f"from {len(run.names)} poses",
-        f"the case states {run.case.needle.length_mm:g} mm along z: {z - run.case.needle.length_mm:+.3f} mm, "
-        f"and {np.hypot(x, y):.3f} mm beside it",
+    tip, sd = vector(pivot.tip_flange, 3, "mm"), vector(np.sqrt(np.diag(pivot.cov_tip)), 3)
+    said = [
+        f"tip in the flange frame: {tip}, sd {sd}, from {len(run.names)} poses",
+        f"the case states {stated:g} mm along z: {z - stated:+.3f} mm, and {np.hypot(x, y):.3f} mm beside it",
         f"residual {pivot.residual_mm:.3f} mm rms; the declared touch noise leaves {pivot.expected_mm:.3f}, "
         f"with the declared arm {pivot.expected_whole_mm:.3f}",
         *_doubt(run),
     ]
-    return "\n".join(lines)
+    return [Section(one, []) for one in said]
 
 
 def _doubt(run: PivotRun) -> list[str]:
@@ -267,16 +270,9 @@ def _executed(context: CaseContext, tour: TouchTour, truth: TouchTruth) -> Touch
 
 def pivot_tour_text(run: PivotTourRun) -> str:
     """For the terminal."""
-    at = ", ".join(f"{mm:.0f}" for mm in run.place_base)
-    count, seconds = len(run.touched.readings), run.touched.seconds
-    x, y, z = run.true_tip_flange
-    return "\n".join(
-        [
-            f"{count} poses touched about ({at}) mm (base) in {seconds:.0f} s",
-            *(f"  {name:<12} not touched: {why}" for name, why in run.touched.failed.items()),
-            pivot_text(run.found),
-            f"the true tip (seed {run.seed}) is ({x:.3f}, {y:.3f}, {z:.3f}) mm: {run.error_mm:.3f} mm off, "
-            f"{run.expected_error_mm:.3f} expected (rms)",
-            *(f"wrote {path}" for path in run.files),
-        ]
-    )
+    at, count, seconds = vector(run.place_base, 0, "mm"), len(run.touched.readings), run.touched.seconds
+    failed = [f"{name} not touched: {why}" for name, why in run.touched.failed.items()]
+    off = f"{run.error_mm:.3f} mm off, {run.expected_error_mm:.3f} expected (rms)"
+    true = f"the true tip (seed {run.seed}) is {vector(run.true_tip_flange, 3, 'mm')}: {off}"
+    head = Section(f"{count} poses touched about {at} (base) in {seconds:.0f} s", failed)
+    return text([head, *_pivot_said(run.found), Section(true, []), *footer(run.files)])

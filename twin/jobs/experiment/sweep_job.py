@@ -20,6 +20,7 @@ from puncture_twin.planning.sweep.sweep_planner import SweepPlan, plan_sweep
 from puncture_twin.twin.jobs.patient.main_job import is_plan
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.rehearsal.rehearsal import Swept, execute_sweep
+from puncture_twin.twin.report.present import Section, footer, text
 
 SWEEP = "sweep.json"
 
@@ -154,14 +155,11 @@ def _ends(context: CaseContext, choice: Choice, to: Angles | None) -> tuple[Angl
 def sweep_text(run: SweepRun) -> str:
     """For the terminal."""
     plan, off = run.plan, run.swept.off_mm
-    angles = ["theta {:.1f}, beta {:.1f}".format(*np.degrees(one)) for one in (plan.angles[0], plan.angles[-1])]
-    lines = [
-        f"swept from {angles[0]} to {angles[1]} deg in {plan.sweep.duration_s:.1f} s, "
-        f"the tip {plan.standoff_mm:.0f} mm from the target",
-        f"virtual TCP off its point: {off.mean():.4f} mm on average, {off.max():.4f} mm at most ({run.control})",
-    ]
-    if plan.stopped:
-        headed = "theta {:.1f}, beta {:.1f}".format(*np.degrees(plan.wanted))
-        lines.append(f"stopped there, on the way to {headed} deg: {plan.stopped}")
-    lines += [f"{link} touches {body}" for link, body in run.swept.contacts]
-    return "\n".join([*lines, *(f"wrote {path}" for path in run.files)])
+    start, end, wanted = (
+        "theta {:.1f}, beta {:.1f}".format(*np.degrees(one)) for one in (plan.angles[0], plan.angles[-1], plan.wanted)
+    )
+    seconds = f"in {plan.sweep.duration_s:.1f} s, the tip {plan.standoff_mm:.0f} mm from the target"
+    tcp = f"virtual TCP off its point: {off.mean():.4f} mm on average, {off.max():.4f} mm at most ({run.control})"
+    stopped = [f"stopped there, on the way to {wanted} deg: {plan.stopped}"] if plan.stopped else []
+    touched = (f"{link} touches {body}" for link, body in run.swept.contacts)
+    return text([Section(f"swept from {start} to {end} deg {seconds}", [tcp, *stopped, *touched]), *footer(run.files)])

@@ -40,6 +40,8 @@ from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.twin.jobs.patient.budget import budget_facts, correction_facts
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
+from puncture_twin.twin.report import patient
+from puncture_twin.twin.report.present import Section, text, vector
 
 
 def check_candidate(context: CaseContext, choice: Choice) -> Explanation:
@@ -266,3 +268,20 @@ def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:
     done = verify(certificate, context.case, context.anatomy, cells, error=error)
     inputs = inputs_document((stated, *context.case.inputs))
     return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}
+
+
+def certificate_text(report: dict[str, Any]) -> str:
+    """What the plain checker proved."""
+    done = report["verified"]
+    proven = f"{done['safe']} safe and {done['rejected']} rejected cells proven again, {done['undecided']} undecided"
+    return text([Section(f"{report['certificate']}: every cell holds", [proven, *patient.certificate(report)])])
+
+
+def registration_text(report: dict[str, Any]) -> str:
+    """Residuals, expected error, weak points and error budget of a registration."""
+    target = f", target {vector(report['target_mm'], 1, 'mm')} {report['space']}" if "target_mm" in report else ""
+    return text([
+        Section(f"case {report['case']}: registration{target}", patient.registration(report)),
+        Section("error budget", patient.budget(report.get("budget"))),
+        *(Section(f"{kind}: {one}", []) for kind in ("warning", "note") for one in report[f"{kind}s"]),
+    ])  # fmt: skip

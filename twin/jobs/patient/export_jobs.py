@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
@@ -26,7 +28,7 @@ from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.twin.jobs.patient.candidates_export import CANDIDATE_FORMATS, TABLE, export_candidates, table_of
 from puncture_twin.twin.jobs.patient.main_job import case_of, export, export_case, is_plan, plan_case, search_case
 from puncture_twin.twin.jobs.patient.summaries import export_summary
-from puncture_twin.twin.jobs.patient.text import export_text
+from puncture_twin.twin.report.present import Section, Warn, text
 
 NOTES = (
     "scene, goals, arm with needle and a sender: read the sender before it is run; it asks before each phase",
@@ -132,6 +134,15 @@ def export_source(
     return Export(done, export_summary(done, context is not None), export_text(done, context is not None))
 
 
+def export_text(done: Exported, case_checked: bool) -> str:
+    """What was written, and what whoever runs it should know."""
+    unchecked = [] if case_checked else ["the plan was not held against its case again: name it with --case"]
+    direction = f"direction: theta {np.degrees(done.plan.theta):g} deg, beta {np.degrees(done.plan.beta):g} deg"
+    warned = (Section(f"warning: {one}", []) for one in done.plan.warnings)
+    said = Section(f"{done.format_name}: {done.path}", [direction, *done.notes, *unchecked])
+    return text([said, *warned])
+
+
 NO_APPROACH = "the directions were checked; no approach of the arm was planned"
 
 
@@ -166,10 +177,8 @@ class SlicerExport:
 
     def text(self) -> str:
         """As lines."""
-        lines = [*self.notes, *(f"warning: {one}" for one in self.warnings)]
-        return "\n".join(
-            [f"{SLICER}: {self.path}", *(f"  {file}" for file in self.files), *(f"  {one}" for one in lines)]
-        )
+        warned = (f"warning: {one}" for one in self.warnings)
+        return text([Section(f"{SLICER}: {self.path}", [Warn(tuple(map(str, self.files))), *self.notes, *warned])])
 
 
 def export_to_slicer(context: CaseContext, out: Path, choice: Choice) -> SlicerExport:

@@ -1,8 +1,8 @@
-"""The main job, stage by stage: search, plan, rehearse, and the files that show each.
+"""The main job, stage by stage over one growing `Run`: search, certify, plan, table, pictures, rehearsal, page.
 
-A stage loads what it needs itself: a search without pictures waits for no planner, simulator or plotter.
-
-What a command works on that takes a case, or a plan beside its case.
+`search_case`, `plan_case`, `rehearse_case` and `rehearse_plan` are the lists of stages; each stage, below, takes a run
+and returns it with what it found and wrote. A stage loads what it needs itself: a search without pictures waits for no
+planner, simulator or plotter.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, Roo
 
 if TYPE_CHECKING:
     from puncture_twin.planning.export.exporter import Exported
-    from puncture_twin.twin.jobs.patient.rehearsed import PendingRehearsal
 
 
 CERTIFICATE = "certificate.json"
@@ -85,8 +84,7 @@ def search_case(
     names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify is None else (CERTIFICATE,)))
     with _writing(out, "search", context, names) as draft:
         run = Run(context, context.search(), (), checked=checked)
-        if certify is not None:
-            run = _certified(run, certify, draft.folder)
+        run = run if certify is None else _certified(run, certify, draft.folder)
         run = _with_table(run, draft.folder)
         run = _with_pictures(run, draft.folder) if pictures else run
     return _final(run, draft)
@@ -102,7 +100,10 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
     _refuse_without_arm(context)
     choice = _stated(context, out, choice)
     with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES), read=choice.read) as draft:
-        run = _with_pictures(_searched_and_planned(context, draft.folder, choice), draft.folder)
+        run = Run(context, context.search(), (), read=choice.read)
+        run = _planned(run, draft.folder, choice)
+        run = _with_table(run, draft.folder)
+        run = _with_pictures(run, draft.folder)
     return _answered(_final(run, draft), out)
 
 
@@ -119,29 +120,24 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
+    from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
 
     _refuse_without_arm(context)
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names, read=choice.read) as draft, two_stages() as begin:
-        run = _searched_and_planned(context, draft.folder, choice)
+        run = Run(context, context.search(), (), read=choice.read)
+        run = _planned(run, draft.folder, choice)
+        run = _with_table(run, draft.folder)
         planned = run.files
-        pending = None if run.plan is None else begin_rehearsal(run, rooms, begin)
-        run = _pictured_and_rehearsed(run, draft.folder, pending)
+        pending = None if run.plan is None else begin_rehearsal(run, rooms, begin)  # while the pictures are drawn
+        paged = partial(with_page, out=draft.folder, drawn=draw_pictures(run, draft.folder))
+        run = paged(run) if pending is None else pending.ended(draft.folder, paged)
         if run.rehearsal is not None:  # the page shows it: it goes with it
             shown = {draft.folder / name for name in PICTURES if name != PAGE}
             draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
     return _answered(_final(run, draft), out)
-
-
-def _pictured_and_rehearsed(run: Run, out: Path, pending: PendingRehearsal | None) -> Run:
-    """The run with the pictures of its plan, drawn while that is rehearsed, and then with the page of all."""
-    from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
-
-    drawn = draw_pictures(run, out)
-    paged = partial(with_page, out=out, drawn=drawn)
-    return paged(run) if pending is None else pending.ended(out, paged)
 
 
 def rehearsed_case(source: Path, case: Path | None, choice: Choice) -> Path:
@@ -223,10 +219,6 @@ def _answered(run: Run, out: Path) -> Run:
     if run.plan is None:
         raise NoAnswerError(f"{NO_PLAN}{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
     return run
-
-
-def _searched_and_planned(context: CaseContext, out: Path, choice: Choice) -> Run:
-    return _with_table(_planned(Run(context, context.search(), (), read=choice.read), out, choice), out)
 
 
 def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomCount | None = None) -> Run:

@@ -25,7 +25,7 @@ from puncture_twin.twin.report.error_pictures import draw_budget
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map_view import map_view
-from puncture_twin.twin.report.page.page import Uncertainty, write_page
+from puncture_twin.twin.report.page.page import Shown, Uncertainty, write_page
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
 from puncture_twin.twin.report.slices.sheet import Slices, draw_slices, write_sheet
 from puncture_twin.twin.report.slices.subject import Subject
@@ -68,23 +68,24 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
     shown = _registration(context)
     film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
     with stages.time("page"):
-        page, uncertainty = out / PAGE, _uncertainty(run)
-        write_page(
+        page = Shown(
             case,
             anatomy,
             found,
             run.plan,
             run.rehearsal,
             shown,
-            page,
             film=film,
-            uncertainty=uncertainty,
+            uncertainty=_uncertainty(run),
             pick=run.pick,
             slices=drawn.slices,
             facts=run.facts,
             refusal=run.refusal,
             raster=drawn.raster,
+            notes=run.plan_notes,
+            failures=run.failures,
         )
+        write_page(page, out / PAGE)
     return run.with_files(*drawn.files, out / PAGE)
 
 

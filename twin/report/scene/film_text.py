@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report import annotate
-from puncture_twin.twin.report.numbers import number
+from puncture_twin.twin.report.present import number
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.scene.film_file import Pixels
 

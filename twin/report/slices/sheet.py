@@ -13,8 +13,9 @@ from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.planning.search.bending import BEYOND_SKIN_MM, Stretch, stretches
 from puncture_twin.twin.report.annotate import FAINT, legend, write, write_image
 from puncture_twin.twin.report.figures import figure_of, pixels
-from puncture_twin.twin.report.numbers import number, target_text
+from puncture_twin.twin.report.numbers import target_text
 from puncture_twin.twin.report.palette import TARGET_POINT
+from puncture_twin.twin.report.present import number
 from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, TONES, Panel, Tone, draw_panel
 from puncture_twin.twin.report.slices.planes import body_planes, needle_planes
 from puncture_twin.twin.report.slices.subject import Subject

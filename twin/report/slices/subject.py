@@ -14,8 +14,9 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.search.bending import insertion_along
 from puncture_twin.planning.search.choice import Pick
-from puncture_twin.twin.report.numbers import clearance_text, number
+from puncture_twin.twin.report.numbers import clearance_text
 from puncture_twin.twin.report.palette import OUTSIDE, organ_colours
+from puncture_twin.twin.report.present import number
 
 NEAR_MM = 30.0
 """A structure with a margin that lies nearer to the needle is drawn strongly and named."""
