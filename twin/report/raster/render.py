@@ -345,12 +345,6 @@ class MovingPicture:
         """The picture without what moves, shape (h, w, 3)."""
         return self._picture
 
-    @property
-    def changed_pixels(self) -> PixelBox:
-        """Where the last picture may differ from `still`."""
-        left, top, right, bottom = self.changed
-        return PixelBox(left // SAMPLES, top // SAMPLES, -(-right // SAMPLES), -(-bottom // SAMPLES))
-
     def another(self) -> MovingPicture:
         """The same picture for another thread: what stands still is shared."""
         made = copy(self)
