@@ -38,9 +38,9 @@ from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, 
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.method import Method
-from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import aimed, load_placement
 from puncture_twin.planning.registration.registration import aim_at, register
+from puncture_twin.planning.registration.residuals import NoiseTest
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding, refined_chances

@@ -30,7 +30,7 @@ def main() -> None:
     expected = found.expected_tre_mm(np.array([target_ct]))[0]
     print(f"FRE {found.fre_mm:.2f} mm, which is not the error at the target: {expected:.2f} mm (rms) is expected there")
     for flag in found.flags:
-        print(f"weak: {flag}")
+        print(f"weak: {flag.sentence}")
     T_base_slipped = found.T_base_ct @ SLIP
     missed = np.linalg.norm(apply(T_base_slipped, np.array(target_ct)) - apply(found.T_base_ct, np.array(target_ct)))
     print(f"a slip of 3 mm and 1 degree after the touch would move the target by {missed:.2f} mm")

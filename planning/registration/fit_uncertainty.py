@@ -35,7 +35,7 @@ from puncture_twin.planning.registration.fits import (
     least_squares_map,
 )
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, check_pairs
-from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
+from puncture_twin.planning.registration.residuals import NoiseTest, noise_test
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.geometry.gauss_newton import lacking
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_of_points, log_rotation, pose, skew
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
@@ -231,6 +232,11 @@ class Distortion:
     def doubted(self) -> bool:
         """Whether true lists would seldom look so deformed, by so much that it matters: then it is reported."""
         return self.probability < DOUBTED and self.moved_mm >= LEAST_MM
+
+    def finding(self) -> Finding:
+        """The finding, a warning."""
+        numbers = {"axes": self.axes, "amount": self.amount, "probability": self.probability}
+        return Finding("lists_deformed", Severity.WARNING, self.text(), numbers)
 
     def text(self) -> str:
         """The finding, in one sentence."""

@@ -30,7 +30,7 @@ from puncture_twin.planning.registration.fits import (
     fit_weighted,
 )
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import MAX_FRE_MM
+from puncture_twin.planning.registration.residuals import MAX_FRE_MM
 
 Method = Literal["triad", "rigid", "weighted", "joint", "affine"]
 

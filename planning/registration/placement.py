@@ -40,8 +40,8 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, marker_noise
 from puncture_twin.planning.registration.fits import ReadingNoise, carried, design, fit_joint
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, check_pairs, match
-from puncture_twin.planning.registration.noise_test import noise_test
 from puncture_twin.planning.registration.registration import Aim, Registration, aim_at, reached_insertion, register
+from puncture_twin.planning.registration.residuals import noise_test
 
 MAX_AIM_OFF_MM = 20.0
 """A plan's joints are at the target as it was corrected then: no nominal arm errs by so much."""

@@ -16,7 +16,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import away_from_singularities, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import Finding, InputError, Severity
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import outward
@@ -34,29 +34,29 @@ from puncture_twin.planning.registration.fits import (
 )
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
 from puncture_twin.planning.registration.method import Method, better_names, check_residuals, checked_fit
-from puncture_twin.planning.registration.noise_test import (
+from puncture_twin.planning.registration.residuals import (
     Conditioning,
     Interval,
-    OddMarker,
+    OutlierMarker,
     ResidualTest,
     conditioning,
-    odd_marker,
+    outlier_marker,
 )
 
 
-def fit_doubts(test: ResidualTest, uncertainty: FitUncertainty | None) -> tuple[str, ...]:
+def unexplained_residuals(test: ResidualTest, uncertainty: FitUncertainty | None) -> Finding | None:
     """Residuals that the noise does not explain and the case accepts: of the rigid fit, or of the declared errors."""
-    if uncertainty is None:
-        return () if test.explained else (f"{test.text()}; accepted by the case",)
-    declared = uncertainty.test
-    if declared.agrees:
-        return ()
-    return (declared.text() + ("; all errors are scaled to them" if declared.explained else "; accepted by the case"),)
+    declared = test if uncertainty is None else uncertainty.test
+    if test.explained if uncertainty is None else uncertainty.test.agrees:
+        return None
+    scaled = uncertainty is not None and declared.explained
+    said = declared.text() + ("; all errors are scaled to them" if scaled else "; accepted by the case")
+    return Finding("residuals_unexplained", Severity.WARNING, said, {"chi_squared": declared.chi_squared})
 
 
-def odd_marker_of(markers: MarkerPairs, fle_mm: float | None) -> OddMarker | None:
+def outlier_marker_of(markers: MarkerPairs, fle_mm: float | None) -> OutlierMarker | None:
     """The marker that does not fit the others, if there is one; ``fle_mm`` is the declared noise or None."""
-    return odd_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
+    return outlier_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
 
 
 ALLOWED_RESIDUALS = "names and readings checked, the true errors declared, or registration.accept_residuals = true"
@@ -119,12 +119,15 @@ class Registration:
         return Interval(*(fle / test.scale * end for end in test.interval))
 
     @property
-    def flags(self) -> tuple[str, ...]:
-        """What weakens it, in words: the conditioning, accepted residuals, an odd marker, lists of two sizes."""
-        doubts = fit_doubts(self.residual_test, self.uncertainty)
-        odd, deformed = odd_marker_of(self.markers, self.residual_test.declared_fle_mm), self.distortion
-        found = (odd, deformed if deformed is not None and deformed.doubted else None)
-        return (*self.conditioning.flags, *doubts, *(one.text() for one in found if one is not None))
+    def flags(self) -> tuple[Finding, ...]:
+        """What weakens it, warnings: the conditioning, accepted residuals, an outlier marker, lists of two sizes."""
+        outlier, deformed = outlier_marker_of(self.markers, self.residual_test.declared_fle_mm), self.distortion
+        found = (
+            unexplained_residuals(self.residual_test, self.uncertainty),
+            None if outlier is None else outlier.finding(),
+            deformed.finding() if deformed is not None and deformed.doubted else None,
+        )
+        return (*self.conditioning.flags, *(one for one in found if one is not None))
 
     @cached_property
     def distortion(self) -> Distortion | None:
@@ -223,7 +226,7 @@ def register(
     test = ResidualTest(len(markers), fre_mm, fle_mm)
     noise_test = test if uncertainty is None else uncertainty.test
     if not (noise_test.explained or accept_residuals):
-        odd = odd_marker_of(markers, fle_mm)
+        odd = outlier_marker_of(markers, fle_mm)
         what = noise_test.text() if odd is None else f"{noise_test.text()}; {odd.text()}"
         what += better_names(markers, target_ct, fre_mm)
         deformed = distortion(T_base_ct, markers, noise, target_ct)

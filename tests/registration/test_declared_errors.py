@@ -15,8 +15,8 @@ from puncture_twin.planning.registration.fits import (
     least_squares_map,
 )
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import NoiseTest, noise_test
 
 T_TRUE = pose(exp_rotation(np.array([0.4, -0.2, 1.1])), np.array([300.0, -200.0, 100.0]))
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147], [0, 80, 60]])
@@ -124,7 +124,7 @@ def test_residuals_far_beyond_the_declaration_are_refused_and_can_be_accepted():
     found = register(pairs, **settings, accept_residuals=True)
     assert found.uncertainty.test.scaled
     assert found.uncertainty.test.scale > 2
-    assert any("declared errors" in flag for flag in found.flags)
+    assert any(flag.code == "residuals_unexplained" for flag in found.flags)
     assert found.fle_interval_mm.low < found.fle_mm < found.fle_interval_mm.high
 
 

@@ -67,7 +67,7 @@ def test_a_deformation_is_named_by_its_kind(axes):
     found = registered(MARKERS, touched).distortion
     assert found.axes == axes
     assert found.doubted
-    assert found.text() in registered(MARKERS, touched).flags
+    assert found.text() in [flag.sentence for flag in registered(MARKERS, touched).flags]
     assert found.amount == pytest.approx(0.03, abs=0.004)
     assert found.moved_mm == pytest.approx(np.sqrt(_sse(deformed(MARKERS, axes, 0.03), MARKERS) / 5), rel=0.1)
     assert 0.02 < found.reading_mm < 0.1

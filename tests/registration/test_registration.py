@@ -11,8 +11,8 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
-from puncture_twin.planning.registration.noise_test import conditioning, leverage
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import conditioning, leverage
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2, TABLE_4
 
 TARGET = np.array([50.0, 130.0, 63.0])

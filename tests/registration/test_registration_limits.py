@@ -13,8 +13,8 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
-from puncture_twin.planning.registration.noise_test import leverage
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import leverage
 
 TARGET = np.array([10.0, 20.0, 30.0])
 NAMES = ("a", "b", "c", "d")

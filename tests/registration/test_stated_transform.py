@@ -71,7 +71,8 @@ def test_it_is_an_input_and_says_that_nothing_is_known_of_its_error(tmp_path):
     case = load_case(stating(tmp_path))
     assert ("transform", "ct_to_robot.tfm") in [(one.role, one.path) for one in case.inputs]
     said = "stated transform ct_to_robot.tfm: no residuals, expected error unknown"
-    (line,) = placement_findings(case, Surroundings(load_skin(case), None), load_placement(case)).warnings
+    (found,) = placement_findings(case, Surroundings(load_skin(case), None), load_placement(case))
+    line = found.sentence
     assert line.startswith(f"registration: {said} (markers_ct and markers_base beside it measure it)")
     placement = load_placement(case)
     assert placement.registration is None and np.isnan(placement.target_error_mm)

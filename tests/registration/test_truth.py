@@ -19,8 +19,8 @@ from puncture_twin.planning.case.tables import MarkerSection, RankingSection, Re
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
-from puncture_twin.planning.registration.noise_test import leverage
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.residuals import leverage
 from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
 
 MESHES = ROOT / "meshes"

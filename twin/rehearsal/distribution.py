@@ -18,7 +18,7 @@ from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.standoff import own_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touches
-from puncture_twin.planning.registration.noise_test import INTERVAL, NoiseTest
+from puncture_twin.planning.registration.residuals import INTERVAL, NoiseTest
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances

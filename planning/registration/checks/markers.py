@@ -11,7 +11,7 @@ so only after a half turn is refused; one that does so before and after it is na
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from scipy.special import fdtri
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import Finding, InputError, Severity
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -159,8 +159,11 @@ ALLOWED_NAMES = (
 )
 
 
-def check_names(case: Case, skin: Skin, registration: Registration) -> tuple[str, ...]:
-    """Compare the names with their permutations; returns warnings, one sentence each.
+def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[Finding]:
+    """Compare the names with their permutations.
+
+    Yields:
+        Warnings.
 
     Raises:
         InputError: Permuted names fit much better; or they fit as well, nothing excludes them, and the case does not
@@ -178,12 +181,15 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> tuple[str
     if possible and not _accepted(case):
         what = f"a slip in the marker names would pass unnoticed: {_worst(possible)}; {given}"
         raise InputError(what, where=where, allowed=ALLOWED_NAMES)
-    warnings = () if complete else (f"of {len(registration.markers)} markers only swaps of two names were tested",)
+    if not complete:
+        said = f"of {len(registration.markers)} markers only swaps of two names were tested"
+        yield Finding("names_not_all_tested", Severity.WARNING, said)
     if possible:
-        return (*warnings, f"marker names: {_worst(possible)}; accepted by accept_symmetry, {given}")
-    if found:
-        return (*warnings, f"marker names: {_worst(found)}; told apart by this alone: then {excluded[0]}")
-    return warnings
+        said = f"marker names: {_worst(possible)}; accepted by accept_symmetry, {given}"
+        yield Finding("marker_names_alike", Severity.WARNING, said)
+    elif found:
+        said = f"marker names: {_worst(found)}; told apart by this alone: then {excluded[0]}"
+        yield Finding("marker_names_alike", Severity.WARNING, said)
 
 
 def _accepted(case: Case) -> bool:
@@ -221,8 +227,11 @@ EXCLUDING_DOUBT = 0.001
 
 def check_axes(
     case: Case, around: Surroundings, registration: Registration, given: MarkerList, cache: Cache = NO_CACHE
-) -> tuple[str, ...]:
-    """Compare the given list with its half turns; returns warnings, one sentence each.
+) -> Iterator[Finding]:
+    """Compare the given list with its half turns.
+
+    Yields:
+        Warnings.
 
     Raises:
         InputError: The list lies on the skin, or where it can be touched, only after a half turn.
@@ -240,13 +249,14 @@ def check_axes(
             where=f"{case.path}: registration",
             allowed="markers_ct in the axes (LPS, RAS) that the case or their file states",
         )
-    return tuple(
-        f"markers_ct with {name} would lie on the skin to {slip.fit.scatter_mm:.1f} mm rms, as given to "
-        f"{given.fit.scatter_mm:.1f} mm: too alike to tell, and the target would be {slip.target_mm:.0f} mm away; "
-        "check the axes of their file"
-        for name, slip in slips.items()
-        if not _excluded(slip, given)
-    )
+    for name, slip in slips.items():
+        if not _excluded(slip, given):
+            said = (
+                f"markers_ct with {name} would lie on the skin to {slip.fit.scatter_mm:.1f} mm rms, as given to "
+                f"{given.fit.scatter_mm:.1f} mm: too alike to tell, and the target would be {slip.target_mm:.0f} mm "
+                "away; check the axes of their file"
+            )
+            yield Finding("marker_axes_alike", Severity.WARNING, said, {"target_mm": slip.target_mm})
 
 
 def _explains(slip: MarkerList, given: MarkerList) -> bool:
@@ -283,51 +293,50 @@ def _as_given(registration: Registration, given: MarkerList, slip: MarkerList) -
     return f"{registration.markers.names[row]} lies behind {before}, where no needle touches it"
 
 
-def off_the_skin(registration: Registration, given: MarkerList) -> tuple[str, ...]:
-    """Markers far from the skin, or behind an obstacle: warnings, one sentence each."""
+def off_the_skin(registration: Registration, given: MarkerList) -> Iterator[Finding]:
+    """Markers far from the skin, or behind an obstacle: warnings."""
     names = registration.markers.names
     gaps = zip(names, np.abs(given.fit.gaps_mm), strict=True)
     far = [f"{name} ({gap:.0f} mm)" for name, gap in gaps if gap > MARKER_ON_SKIN_MM]
-    behind = tuple(
-        f"marker {names[row]} lies behind {before}: no needle can touch it there" for row, before in given.behind
-    )
-    if not far:
-        return behind
-    said = f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?"
-    return (said, *behind)
+    if far:
+        said = f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?"
+        yield Finding("markers_off_skin", Severity.WARNING, said)
+    for row, before in given.behind:
+        said = f"marker {names[row]} lies behind {before}: no needle can touch it there"
+        yield Finding("marker_behind", Severity.WARNING, said, {"marker": names[row]})
 
 
-LOCAL_AXES = 'space "local": nothing tells whether the axes of markers_ct have slipped by a half turn'
-
-BASE_AXES = (
-    "not checked: a half turn of markers_base (such as ROS base_link for the controller's base); residuals, skin and "
-    "couch are blind to it"
+LOCAL_AXES = Finding(
+    "axes_not_checked",
+    Severity.NOTE,
+    'space "local": nothing tells whether the axes of markers_ct have slipped by a half turn',
 )
-
-
-class MarkerFindings(NamedTuple):
-    """What is to be known about a case's markers or transform."""
-
-    warnings: tuple[str, ...]
-    """What these markers leave open, one sentence each."""
-    notes: tuple[str, ...]
-    """What no markers can show."""
+BASE_AXES = Finding(
+    "axes_not_checked",
+    Severity.NOTE,
+    "not checked: a half turn of markers_base (such as ROS base_link for the controller's base); residuals, skin and "
+    "couch are blind to it",
+)
 
 
 def check_markers(
     case: Case, around: Surroundings, registration: Registration, cache: Cache = NO_CACHE
-) -> MarkerFindings:
+) -> Iterator[Finding]:
     """Check a registration's markers against permuted names, half turns, skin and couch.
 
     How the markers lie on the skin depends on no target: ``cache`` keeps it.
+
+    Yields:
+        What these markers leave open, warnings; and what no markers can show, notes.
 
     Raises:
         InputError: Names that fit much better permuted, or as well where nothing tells them apart; a list that lies on
             the skin only after a half turn.
     """
-    names = check_names(case, around.skin, registration)
+    yield from check_names(case, around.skin, registration)
     given = marker_list(case, around, registration, cache=cache)
     local = case.space is Space.LOCAL
-    axes = () if local else check_axes(case, around, registration, given, cache)
-    warnings = (*names, *axes, *off_the_skin(registration, given))
-    return MarkerFindings(warnings, (LOCAL_AXES, BASE_AXES) if local else (BASE_AXES,))
+    if not local:
+        yield from check_axes(case, around, registration, given, cache)
+    yield from off_the_skin(registration, given)
+    yield from (LOCAL_AXES, BASE_AXES) if local else (BASE_AXES,)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.case.case import Case, up_axis
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.collision.bodies import surface, touch
@@ -296,8 +297,8 @@ def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> BasePlace:
     return BasePlace(impossible, " and ".join(filter(None, (far, shoulder, bed.off))), bed.on)
 
 
-def place_warnings(case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str) -> Iterator[str]:
-    """One sentence where something speaks against the place of a mount or of markers.
+def place_warnings(case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str) -> Iterator[Finding]:
+    """One warning where something speaks against the place of a mount or of markers.
 
     They say in words where the base is, and have no other reading that could be meant, so they are not refused: without
     an arm the verdicts are about the organs alone, and with one nothing is reached from there.
@@ -310,4 +311,4 @@ def place_warnings(case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str)
     """
     place = base_place(case, skin, T_base_ct)
     if what := place.impossible or place.unlikely:
-        yield text.format(what=what)
+        yield Finding("base_place", Severity.WARNING, text.format(what=what))

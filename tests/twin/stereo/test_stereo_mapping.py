@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
-from puncture_twin.planning.registration.noise_test import leverage
+from puncture_twin.planning.registration.residuals import leverage
 from puncture_twin.twin.guidance.stereo.servo_law import SeenMarkers, map_head
 
 NAMES = ("M1", "M2", "M3", "M4", "M5")

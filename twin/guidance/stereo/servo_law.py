@@ -42,8 +42,8 @@ from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply, frame_yz, log_rotation, pose, rotated_about
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import Conditioning
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import Conditioning
 
 CHARACTERISTIC_MM = 300.0
 """Length by which millimetres are made comparable with radians: about half of a UR3's reach."""

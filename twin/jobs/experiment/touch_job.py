@@ -59,7 +59,7 @@ class Use(NamedTuple):
             "expected_tip_error_mm": self.expected_mm,
             "tip_error_mm": self.tip_error_mm,
             "fre_mm": self.registration.fre_mm,
-            "flags": list(self.registration.flags),
+            "flags": [flag.sentence for flag in self.registration.flags],
         }
 
 
@@ -293,7 +293,7 @@ def _use_lines(run: TouchRun) -> list[str]:
     return [
         f"expected tip error: {use.expected_mm:.2f} mm rms{without}; {worst}",
         f"error of this truth (seed {run.seed}): {use.tip_error_mm:.2f} mm; FRE {use.registration.fre_mm:.2f} mm",
-        *(f"  {flag}" for flag in use.registration.flags),
+        *(f"  {flag.sentence}" for flag in use.registration.flags),
     ]
 
 

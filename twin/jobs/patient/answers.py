@@ -14,7 +14,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import load_anatomy, load_skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError, InputListError
+from puncture_twin.planning.base.errors import InputError, InputListError, Severity
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import Input, inputs_document
@@ -30,9 +30,9 @@ from puncture_twin.planning.registration.checks.places import touchable_points
 from puncture_twin.planning.registration.fits import ReadingNoise, rigid_fre_mm
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.method import LEAST_FOUND_MM
-from puncture_twin.planning.registration.noise_test import INTERVAL
 from puncture_twin.planning.registration.placement import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.registration import Registration, register
+from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, choose, chosen_angles, refuse_other_entry, with_file_read
 from puncture_twin.planning.search.context import CaseContext
@@ -95,7 +95,7 @@ def registration_report(path: Path) -> dict[str, Any]:
     if checked is None or checked.placement.registration is None:
         file = case.robot.transform
         what = "no [registration] with markers" if file is None else f"the base is placed by the transform {file}"
-        compared = () if checked is None else (*checked.findings.warnings, *checked.findings.notes)
+        compared = () if checked is None else (one.sentence for one in checked.findings)
         raise InputListError("; ".join((what, *compared)), where=case.path, allowed="markers_ct and markers_base alone")
     placement, registration = checked.placement, checked.placement.registration
     report = registration_summary(registration)
@@ -108,9 +108,11 @@ def registration_report(path: Path) -> dict[str, Any]:
     read = None if case.errors is None else case.errors.target_cov_ct
     report |= one_insertion(registration, case.target_ct, read)
     report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
-    report["warnings"] = [*case.warnings, *checked.findings.warnings, *_branch_warning(case, registration)]
+    found = {kind: [one.sentence for one in checked.findings if one.severity is kind] for kind in Severity}
+    report["warnings"] = [*case.warnings, *found[Severity.WARNING], *_branch_warning(case, registration)]
     report |= _advice(case, registration)
-    report["notes"] = list(checked.findings.notes)
+    report["notes"] = found[Severity.NOTE]
+    report["findings"] += [one.document() for one in checked.findings]
     return report
 
 

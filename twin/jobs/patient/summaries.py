@@ -46,7 +46,8 @@ def registration_summary(registration: Registration) -> dict[str, Any]:
         "altitude_mm": registration.conditioning.altitude_mm,
         "leverage": registration.conditioning.leverage,
         "distortion": _distortion(registration.distortion),
-        "flags": list(registration.flags),
+        "flags": [flag.sentence for flag in registration.flags],
+        "findings": [flag.document() for flag in registration.flags],
     }
 
 

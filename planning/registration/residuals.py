@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import chdtrc, chdtri, fdtrc, fdtri
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import least_squares_map
 
@@ -178,7 +179,7 @@ class ResidualTest:
         return float(np.sqrt(fdtri(self.freedom, self.freedom, 1 - DOUBT)))
 
 
-class OddMarker(NamedTuple):
+class OutlierMarker(NamedTuple):
     """A marker that the others contradict.
 
     Attributes:
@@ -200,14 +201,19 @@ class OddMarker(NamedTuple):
             f"reading, and fit each other to {self.others_fre_mm:.1f} mm; check its name, touch and place in the CT"
         )
 
+    def finding(self) -> Finding:
+        """The same, as a warning."""
+        numbers = {"marker": self.name, "miss_mm": self.miss_mm, "others_fre_mm": self.others_fre_mm}
+        return Finding("outlier_marker", Severity.WARNING, self.text(), numbers)
 
-def odd_marker(
+
+def outlier_marker(
     fit: Callable[[Floats, Floats], Floats],
     names: tuple[str, ...],
     points_ct: Floats,
     points_base: Floats,
     fle_mm: float | None,
-) -> OddMarker | None:
+) -> OutlierMarker | None:
     """The marker that least fits the others, if chance does not explain it.
 
     A residual of the common fit hides it, since the odd marker pulls the fit. Marker i left out, the others fit with
@@ -238,7 +244,7 @@ def _left_out(
     points_ct: Floats,
     points_base: Floats,
     least_fle_mm: float,
-) -> tuple[float, OddMarker] | None:
+) -> tuple[float, OutlierMarker] | None:
     """How likely one marker's miss is by chance, and the marker; None where the others lie on a line."""
     ct, base = np.delete(points_ct, row, axis=0), np.delete(points_base, row, axis=0)
     spread = np.linalg.svd(ct - ct.mean(axis=0), compute_uv=False)
@@ -251,7 +257,7 @@ def _left_out(
     miss = float(np.linalg.norm(apply(T, points_ct[row : row + 1]) - points_base[row]))
     lever = float(leverage(ct, points_ct[row : row + 1])[0])
     chance = float(fdtrc(3, freedom, miss**2 / 3 / ((1 + lever**2) * variance)))
-    return chance, OddMarker(names[row], miss, len(ct), float(np.sqrt(squares / len(ct))))
+    return chance, OutlierMarker(names[row], miss, len(ct), float(np.sqrt(squares / len(ct))))
 
 
 WARNED = 0.01
@@ -362,13 +368,13 @@ class Conditioning:
         spread_ratio: s2/s1, singular values of the centred markers.
         altitude_mm: Least altitude of the widest triangle of markers.
         leverage: Expected TRE at the target over FLE.
-        flags: The weak points in words; empty for a good set.
+        flags: The weak points, warnings; empty for a good set.
     """
 
     spread_ratio: float
     altitude_mm: float
     leverage: float
-    flags: tuple[str, ...]
+    flags: tuple[Finding, ...]
 
 
 def leverage(markers: Floats, points: Floats) -> Floats:
@@ -398,11 +404,14 @@ def conditioning(markers: Floats, target: Floats) -> Conditioning:
     lever = float(leverage(markers, target)[0])
     flags = []
     if ratio < WEAK_SPREAD:
-        flags.append(f"markers lie almost on a line (s2/s1 {ratio:.2f} < {WEAK_SPREAD})")
+        said = f"markers lie almost on a line (s2/s1 {ratio:.2f} < {WEAK_SPREAD})"
+        flags.append(Finding("markers_on_a_line", Severity.WARNING, said, {"spread_ratio": ratio}))
     if altitude < WEAK_ALTITUDE_MM:
-        flags.append(f"the widest marker triangle is flat (altitude {altitude:.0f} < {WEAK_ALTITUDE_MM:.0f} mm)")
+        said = f"the widest marker triangle is flat (altitude {altitude:.0f} < {WEAK_ALTITUDE_MM:.0f} mm)"
+        flags.append(Finding("flat_marker_triangle", Severity.WARNING, said, {"altitude_mm": altitude}))
     if lever > WEAK_LEVERAGE:
-        flags.append(f"the target is far from the markers (TRE/FLE {lever:.1f} > {WEAK_LEVERAGE:.0f})")
+        said = f"the target is far from the markers (TRE/FLE {lever:.1f} > {WEAK_LEVERAGE:.0f})"
+        flags.append(Finding("target_far_from_markers", Severity.WARNING, said, {"leverage": lever}))
     return Conditioning(ratio, altitude, lever, tuple(flags))
 
 
