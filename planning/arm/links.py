@@ -81,9 +81,6 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
     What is clear of them is clear of the link; the price is a few mm where a link is hollow. Most of the UR3's own
     meshes are open, where "inside" means nothing; a hull is always closed.
 
-    Args:
-        model: The arm.
-
     Raises:
         InputError: If no meshes ship for this model, or one cannot be used.
     """
@@ -101,7 +98,6 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
 
 
 def _convex_links(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
-    """The pieces of each link."""
     pieces = [
         tuple(piece for mesh in meshes for piece in _pieces(mesh, name, model))
         for name, meshes in zip(LINK_NAMES, _link_shapes(model), strict=True)

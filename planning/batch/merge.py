@@ -33,12 +33,7 @@ NOT_RUN = "not run"
 
 
 def merged_rows(cases: Sequence[PlannedCase], out: Path) -> list[dict[str, Any]]:
-    """A row for each case of the plan, in its order; one that has none yet says so.
-
-    Args:
-        cases: The plan's.
-        out: The cohort's folder.
-    """
+    """A row for each case of the plan, in its order; one that has none yet says so."""
     return [_row(one, out) for one in cases]
 
 

@@ -290,11 +290,7 @@ class Estimate:
 
 
 def estimate(cases: Sequence[PlannedCase]) -> Estimate:
-    """Estimate a cohort from its first case that can be read, run twice, the second time warm.
-
-    Args:
-        cases: The plan's.
-    """
+    """Estimate a cohort from its first case that can be read, run twice, the second time warm."""
     readable = [one for one in cases if not one.refusal]
     refused = len(cases) - len(readable)
     if not readable:

@@ -53,12 +53,6 @@ class NamedFile(NamedTuple):
 def read_named_files(content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes) -> tuple[str, ...]:
     """Read and hash whatever the case names, each file once; what costs little first.
 
-    Args:
-        content: The case file.
-        path: Where it is.
-        files: Takes what is read.
-        case_volumes: Takes the volumes.
-
     Returns:
         What is left open about being whole, one sentence each.
 

@@ -264,10 +264,6 @@ def read_certificate(path: Path) -> Certificate:
 def parse_certificate(data: bytes, path: Path) -> Certificate:
     """Check that a certificate's bytes are whole and agree with themselves; `checker.verify` proves it.
 
-    Args:
-        data: The file's bytes.
-        path: The file, for errors.
-
     Raises:
         InputError: Not a certificate, another version, missing or contradicting parts.
     """
@@ -371,13 +367,7 @@ def _map(certificate: Any) -> str:
 
 
 def with_safe_cone(case: Case, candidates: Candidates, certificate: Certificate) -> Candidates:
-    """The candidates with their safe cones, ranked again.
-
-    Args:
-        case: The case of both.
-        candidates: A search's result.
-        certificate: The case's certified map.
-    """
+    """The candidates with their safe cones, ranked again."""
     cone, rows = np.full(len(candidates), np.nan), np.flatnonzero(candidates.safe)
     cone[rows] = certificate.safe_cone(candidates.outward_ct[rows])
     return ranked(case, replace(candidates, safe_cone=cone, cone_source=CONE_CERTIFIED))

@@ -18,7 +18,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.collision.bodies import finer_prism
 from puncture_twin.planning.collision.kernels import proofs as proof_kernels, settled as settled_kernels
-from puncture_twin.planning.collision.kernels.proofs import ProofScene, scratch
+from puncture_twin.planning.collision.kernels.proofs import ProofScene, proof_scratch
 from puncture_twin.planning.collision.kernels.surfaces import STACK
 from puncture_twin.planning.collision.packed import (
     ROUND,
@@ -104,10 +104,10 @@ class Proofs:
         packed = hulls.packed(cache)
         skin = packed_skin(patient, skin_triangles, cache)
         self.scene = ProofScene(np.array(rows, dtype=np.int64), skin, spheres, *packed)
-        self._beside = settled_kernels.triangle_scratch(self.scene.hulls, STACK)
+        self._on_triangle = settled_kernels.triangle_scratch(self.scene.hulls, STACK)
         self._levers = np.array([joint_levers(model, check) for check in checks])
         self.movers = packed_movers(checks)
-        self._work = scratch(len(rows), len(self.scene.hulls.radii))
+        self._work = proof_scratch(len(rows), len(self.scene.hulls.radii))
         self.joint_spans = np.array([(row[0] == proof_kernels.PAIR, row[3], row[4]) for row in rows], dtype=np.int64)
 
     def __len__(self) -> int:
@@ -119,7 +119,7 @@ class Proofs:
         self.scene = self.scene._replace(checks=self.scene.checks[kept])
         self.movers = self.movers._replace(of_check=self.movers.of_check[kept])
         self._levers, self.joint_spans = self._levers[kept], self.joint_spans[kept]
-        self._work = scratch(int(kept.sum()), len(self.scene.hulls.radii))
+        self._work = proof_scratch(int(kept.sum()), len(self.scene.hulls.radii))
 
     def unproven(
         self, motion: Motion, tested: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
@@ -146,12 +146,14 @@ class Proofs:
             of_state: Shape (m,): which of the choices.
         """
         found = NotClear(np.empty(len(frames), np.int64), np.empty(len(frames), np.int64))
-        settled_kernels.first_not_clear(self.scene, frames, self._work, self._beside, tested, of_state, begins, *found)
+        settled_kernels.first_not_clear(
+            self.scene, frames, self._work, self._on_triangle, tested, of_state, begins, *found
+        )
         return found
 
     def settled_at(self, check: int, frames: Floats) -> int:
         """Result of a check at frames (7, 4, 4), see :mod:`puncture_twin.planning.collision.kernels.settled`."""
-        return int(settled_kernels.settled_at(self.scene, self._work, self._beside, check, frames))
+        return int(settled_kernels.settled_at(self.scene, self._work, self._on_triangle, check, frames))
 
     def clear_about(self, frames: Floats, turns: Floats, tested: Bools) -> Around:
         """Prove checks clear all about some states.

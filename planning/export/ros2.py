@@ -73,10 +73,6 @@ def velocities(model: UrModel, trajectory: Trajectory) -> Floats:
     the motion's own slope when its acceleration changes at samples only, and not at two in a row: the middle one of the
     three slopes is taken. It is kept within what keeps a cubic through the samples between its neighbours.
 
-    Args:
-        model: The arm.
-        trajectory: The samples.
-
     Returns:
         Shape (m, 6), rad/s.
     """

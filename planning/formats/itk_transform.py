@@ -46,10 +46,6 @@ def most_bytes(name: str) -> int:
 def parse_transform(data: bytes, path: Path) -> Floats:
     """The rigid motion of points that a file states, shape (4, 4), mm.
 
-    Args:
-        data: The whole file.
-        path: Its name.
-
     Raises:
         InputError: Another format or kind of transform, several of them, or one that is not rigid.
     """
@@ -243,10 +239,6 @@ def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
     group 0 without parameters, its parts the groups after it. What is read are the bytes that were hashed: nothing
     that points elsewhere is followed. The texts are found by `heap_text`: HDF5's own library never ends on some damaged
     heaps. Needs the extra ``hdf5`` (h5py), which is imported only here.
-
-    Args:
-        data: The whole file.
-        where: Its name, for errors.
 
     Raises:
         InputError: Without h5py; or no whole HDF5 file of ITK's transforms.

@@ -111,10 +111,6 @@ def read_plan(path: Path) -> Plan:
 def parse_plan(data: bytes, path: Path) -> Plan:
     """Check that a plan's bytes are whole and agree with themselves.
 
-    Args:
-        data: The file's bytes.
-        path: The file, for errors.
-
     Raises:
         InputError: Not a plan, another version, missing keys, numbers that do not fit, or a pose that the stored
             joint angles do not reach.

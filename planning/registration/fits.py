@@ -192,7 +192,7 @@ def _transposed(R: Floats) -> Floats:
     return np.swapaxes(R, -1, -2)
 
 
-DOUBTED, SURE = 0.05, 0.01
+SIGNIFICANT, SURE = 0.05, 0.01
 """True lists look so deformed once in 20 registrations, and once in 100: it is said, and nothing is refused for it.
 Where one axis is read five times as badly as the others and nobody declares it, the second is up to one in ten (1,000
 draws each, 3 to 12 markers)."""
@@ -228,9 +228,9 @@ class Distortion:
     rms_without_mm: float
 
     @property
-    def doubted(self) -> bool:
+    def significant(self) -> bool:
         """Whether true lists would seldom look so deformed, by so much that it matters: then it is reported."""
-        return self.probability < DOUBTED and self.moved_mm >= LEAST_MM
+        return self.probability < SIGNIFICANT and self.moved_mm >= LEAST_MM
 
     def text(self) -> str:
         """The finding, in one sentence."""

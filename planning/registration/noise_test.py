@@ -178,7 +178,7 @@ class ResidualTest:
         return float(np.sqrt(fdtri(self.freedom, self.freedom, 1 - DOUBT)))
 
 
-class OddMarker(NamedTuple):
+class OutlierMarker(NamedTuple):
     """A marker that the others contradict.
 
     Attributes:
@@ -201,16 +201,16 @@ class OddMarker(NamedTuple):
         )
 
 
-def odd_marker(
+def outlier_marker(
     fit: Callable[[Floats, Floats], Floats],
     names: tuple[str, ...],
     points_ct: Floats,
     points_base: Floats,
     fle_mm: float | None,
-) -> OddMarker | None:
+) -> OutlierMarker | None:
     """The marker that least fits the others, if chance does not explain it.
 
-    A residual of the common fit hides it, since the odd marker pulls the fit. Marker i left out, the others fit with
+    A residual of the common fit hides it, since the outlier pulls the fit. Marker i left out, the others fit with
     residuals r_j and nu = 3 (n-1) - 6 degrees of freedom; they place it d_i off its reading, whose expected square is
     FLE^2 (1 + l_i^2) with l_i the leverage at its place (Fitzpatrick 1998). Where all markers err alike,
     F_i = (d_i^2 / 3) / ((1 + l_i^2) s^2) with s^2 = sum |r_j|^2 / nu follows F(3, nu).
@@ -226,9 +226,9 @@ def odd_marker(
     if count < LEAST_MARKERS:
         return None
     least = MIN_FLE_MM if fle_mm is None else fle_mm
-    found = [_left_out(fit, row, names, points_ct, points_base, least) for row in range(count)]
-    chance, odd = min((one for one in found if one is not None), key=lambda one: one[0], default=(1.0, None))
-    return odd if chance < FALSE_ALARM / count else None
+    tests = [_left_out(fit, row, names, points_ct, points_base, least) for row in range(count)]
+    chance, outlier = min((one for one in tests if one is not None), key=lambda one: one[0], default=(1.0, None))
+    return outlier if chance < FALSE_ALARM / count else None  # Bonferroni: each of the markers is tested
 
 
 def _left_out(
@@ -238,8 +238,8 @@ def _left_out(
     points_ct: Floats,
     points_base: Floats,
     least_fle_mm: float,
-) -> tuple[float, OddMarker] | None:
-    """How likely one marker's miss is by chance, and the marker; None where the others lie on a line."""
+) -> tuple[float, OutlierMarker] | None:
+    """Chance of a miss as large as one marker's, and the marker; None where the others lie on a line."""
     ct, base = np.delete(points_ct, row, axis=0), np.delete(points_base, row, axis=0)
     spread = np.linalg.svd(ct - ct.mean(axis=0), compute_uv=False)
     if spread[1] < LEAST_SPREAD * spread[0]:
@@ -251,7 +251,7 @@ def _left_out(
     miss = float(np.linalg.norm(apply(T, points_ct[row : row + 1]) - points_base[row]))
     lever = float(leverage(ct, points_ct[row : row + 1])[0])
     chance = float(fdtrc(3, freedom, miss**2 / 3 / ((1 + lever**2) * variance)))
-    return chance, OddMarker(names[row], miss, len(ct), float(np.sqrt(squares / len(ct))))
+    return chance, OutlierMarker(names[row], miss, len(ct), float(np.sqrt(squares / len(ct))))
 
 
 WARNED = 0.01
@@ -279,7 +279,7 @@ class NoiseTest:
 
     @property
     def probability(self) -> float:
-        """Of residuals as large as these, if the declaration holds."""
+        """Chance of residuals as large as these, if the declaration holds."""
         return float(chdtrc(self.freedom, self.chi_squared))
 
     @property
@@ -306,7 +306,7 @@ class NoiseTest:
 
     @property
     def scale(self) -> float:
-        """By which the declared deviations are multiplied: 1 where the declaration holds."""
+        """Factor of the declared deviations: 1 where the declaration holds."""
         return self.estimate if self.found or not self.agrees else 1.0
 
     @property

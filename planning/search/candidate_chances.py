@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances
-from puncture_twin.planning.reach.standoff import own_lengths
+from puncture_twin.planning.reach.standoff import case_axis_lengths
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.windows import find_windows
@@ -119,7 +119,7 @@ def _touch_bounds(candidates: Candidates, model: ChanceModel) -> Floats:
     surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])  # in the worst direction
     bounds, rows = np.full((len(candidates), len(columns)), np.nan), np.flatnonzero(candidates.safe)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
-        length = float(own_lengths(model.case, model.anatomy, candidates.outward_ct[part])[:, columns].max())
+        length = float(case_axis_lengths(model.case, model.anatomy, candidates.outward_ct[part])[:, columns].max())
         slack, cov_ct = (
             candidates.clearance.distance[part][:, columns],
             error.covariance_ct(candidates.arm.q_insertion[part]),

@@ -29,7 +29,7 @@ from puncture_twin.planning.collision.workcell import GANTRY, OF_CASE_FILE, case
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.needle.deflection import DeflectionBound
-from puncture_twin.planning.reach.standoff import axis_lengths, own_paths
+from puncture_twin.planning.reach.standoff import axis_lengths, case_paths
 from puncture_twin.planning.search.bending import bent_verdict
 from puncture_twin.planning.search.candidates import ArmColumns, BreathingColumns, Candidates, Verdict
 from puncture_twin.planning.search.constraints import ArmReach, first_broken, with_reach
@@ -104,7 +104,7 @@ def _at_phase(
     displaced = _displaced(anatomy, weights, breathing, s)
     solids = _with_moved_solids(case, anatomy, weights, breathing, s, reach.T_base_ct)
     there = ArmReach(case_checker(solids, displaced, reach.T_base_ct), reach.T_base_ct)
-    paths = own_paths(case, anatomy.skin, candidates.outward_ct, (1 - weights.skin) * moved)
+    paths = case_paths(case, anatomy.skin, candidates.outward_ct, (1 - weights.skin) * moved)
     path = replace(candidates.path, length=paths.path_length, skin_angle=paths.skin_angle)
     shifted = replace(candidates, path=path, arm=ArmColumns.unknown(len(candidates)))
     answered = with_reach(replace(case, target_ct=case.target_ct + moved), shifted, there)
@@ -187,7 +187,7 @@ class BreathingBody:
     def paths(self, outward_ct: Floats, s: float) -> SkinPaths:
         """Skin paths (n, 3) at a position; entries in the moved skin's own coordinates."""
         moved = (1 - self.weights.skin) * self.breathing.moved_ct(s)
-        return own_paths(self.case, self.anatomy.skin, outward_ct, moved)
+        return case_paths(self.case, self.anatomy.skin, outward_ct, moved)
 
     @property
     def demanding(self) -> Ints:

@@ -18,7 +18,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, normals_of
-from puncture_twin.planning.reach.standoff import own_lengths
+from puncture_twin.planning.reach.standoff import case_axis_lengths
 from puncture_twin.planning.uncertainty.hit import (
     HitModel,
     hit_model,
@@ -96,7 +96,7 @@ class ChanceModel:
         """Needles with their covariances and proximity to the structures; arguments as of `chances`."""
         target, columns = self.case.target_ct, self.columns
         if axes is None:
-            lengths = own_lengths(self.case, self.anatomy, outward_ct)
+            lengths = case_axis_lengths(self.case, self.anatomy, outward_ct)
             axes = self.engine.measure(target, outward_ct, lengths, shown=False)
         normal = normals_of(self.engine.triangles, target, outward_ct, axes)[:, columns]
         distance, depth = axes.distance[:, columns], axes.depth[:, columns]
@@ -170,7 +170,7 @@ def refined_chances(
         wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
     """
     every = np.ones(first.touch.shape, bool)
-    blocks, lengths = model.engine.blocks, own_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
+    blocks, lengths = model.engine.blocks, case_axis_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
     around = Surroundings(tuple(blocks[column] for column in model.columns), lengths, model.case.target_ct)
     needles = model.needles(outward_ct, q)
     touch = refined(around, needles, model.touching, first.touch, every if wanted is None else wanted)

@@ -7,7 +7,7 @@ from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import FALSE_ALARM, odd_marker
+from puncture_twin.planning.registration.noise_test import FALSE_ALARM, outlier_marker
 from puncture_twin.planning.registration.registration import register
 
 TURN = np.array([0.3, -0.2, 1.0])
@@ -28,7 +28,7 @@ def markers(seed, noise_mm=0.4, moved=None, by_mm=0.0):
 
 def odd(pairs, fle_mm=None):
     """The odd marker of a set."""
-    return odd_marker(fit_rigid, pairs.names, pairs.points_ct, pairs.points_base, fle_mm)
+    return outlier_marker(fit_rigid, pairs.names, pairs.points_ct, pairs.points_base, fle_mm)
 
 
 @pytest.mark.parametrize("moved", range(6))
@@ -64,7 +64,7 @@ def test_tiny_residuals_and_few_markers_name_nobody():
     pairs = markers(1, moved=1, by_mm=8.0)
     assert odd(MarkerPairs(NAMES[:3], pairs.points_ct[:3], pairs.points_base[:3])) is None
     row = np.array([[0.0, 0, 0], [50, 0, 0], [100, 0, 0], [40, 80, 0]])
-    assert odd_marker(fit_rigid, NAMES[:4], row, row + [0, 0, 1.0], None) is None
+    assert outlier_marker(fit_rigid, NAMES[:4], row, row + [0, 0, 1.0], None) is None
 
 
 def test_a_refusal_names_it_too():

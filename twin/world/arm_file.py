@@ -40,11 +40,6 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
 
     The collision bodies are the planner's own: convex pieces that contain each link.
 
-    Args:
-        model: The arm.
-        tool: What the flange carries.
-        folder: Where to write.
-
     Returns:
         The URDF's path.
 

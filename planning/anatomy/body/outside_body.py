@@ -250,7 +250,6 @@ def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
 
 
 def _bulky(mask: Bools, spacing_mm: Floats) -> Bools:
-    """The bulky pieces of a mask."""
     found = parts_of(mask, corners=True)
     return found.painted(found.sizes * np.prod(spacing_mm) >= 1000.0 * BULKY_ML)
 

@@ -413,7 +413,6 @@ def _views(
 
 
 def _sides(views: Sequence[_Ends]) -> tuple[TableSide, ...]:
-    """The drawn sides of one bed."""
     if views[0].length_mm < LEAST_LENGTH_MM:
         return ()
     slopes = _direction([view.sampled() for view in views])

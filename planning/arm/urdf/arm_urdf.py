@@ -40,11 +40,6 @@ class BodyShape(NamedTuple):
 def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tuple[BodyShape, ...], ...]:
     """The collision shapes of each of the arm's seven bodies.
 
-    Args:
-        chain: The arm.
-        document: Its URDF.
-        read: Reads a mesh file.
-
     Raises:
         InputError: A link is drawn without a shape for contacts, a body has none at all, something is fixed beyond the
             flange, or a mesh cannot be used.

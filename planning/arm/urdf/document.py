@@ -135,10 +135,6 @@ class UrdfDocument:
 def parse_urdf(data: bytes, where: Path) -> UrdfDocument:
     """The links and joints of a URDF.
 
-    Args:
-        data: The whole file.
-        where: Its name, for errors.
-
     Raises:
         InputError: It is no well-formed XML, no URDF, or says something that is not understood.
     """

@@ -207,11 +207,6 @@ NOTHING_STATED = StatedLimits()
 def urdf_limits(joints: tuple[UrdfJoint, ...], stated: StatedLimits, where: Path) -> JointLimits:
     """The limits of a URDF's six joints; what the case states of them takes the place of what the URDF lacks.
 
-    Args:
-        joints: The six.
-        stated: By the case.
-        where: The URDF, for errors.
-
     Raises:
         InputError: A limit is missing, is in degrees, or makes no sense.
     """

@@ -24,8 +24,8 @@ FAR_MM = 1e15
 class Blocks:
     """One surface, packed. Made once per patient; nothing here depends on the target.
 
-    A node is a disc: every point p of its triangles has |(p - c) . n| <= h and lies within rho of the axis through c
-    along n. Level 0 holds the blocks; node j of a level has the nodes 16 j ... 16 j + 15 of the level below.
+    A node is a thick disc: for every point p of its triangles |(p - c) . n| <= h, and p is within rho of the axis
+    through c along n. Level 0 holds the blocks; node j of a level holds nodes 16 j to 16 j + 15 of the level below.
 
     Attributes:
         triangles: Shape (16 b, 9), corners in block order, mm; the last block is filled up with its last triangle.
@@ -254,11 +254,9 @@ def _reach_across(center, disc, j, n, c):  # type: ignore[no-untyped-def]  # num
 
 @allocation_free(nogil=True)
 def _axis(disc, j):  # type: ignore[no-untyped-def]  # numba infers
-    """Normal of a disc."""
     return disc[0, j], disc[1, j], disc[2, j]
 
 
 @allocation_free(nogil=True)
 def _dot(p, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Inner product of two vectors of three."""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]

@@ -28,7 +28,7 @@ from puncture_twin.planning.collision.kernels.proofs import (
     paths_about,
     place_sphere,
     place_spheres,
-    scratch,
+    proof_scratch,
     sphere_gap,
 )
 
@@ -38,10 +38,10 @@ tenth."""
 
 
 @allocation_free()
-def _keep(scene, segment, clear_mm, room):
+def _keep(scene, segment, clear_mm, scratch):
     """Fills ``kept`` (k,), mm: what a check is to keep, ``clear_mm`` or as much as the nearer end does (``KEPT``)."""
     checks, hulls, T_box_base, halves = scene.checks, scene.hulls, scene.T_box_base, scene.halves
-    kept, work, frames, enough = room.kept, room.work, segment.frames[0], clear_mm / KEPT
+    kept, work, frames, enough = scratch.kept, scratch.work, segment.frames[0], clear_mm / KEPT
     for at in range(len(checks)):
         kept[at] = 0.0 if checks[at, 0] == PAIR else clear_mm
     for end in (0.0, 1.0):
@@ -78,14 +78,14 @@ def _bound(scene, work, at, frames, needed):
 
 
 @allocation_free()
-def _prove(scene, movers, segment, at, within, fine_mm, room, answer):
+def _prove(scene, movers, segment, at, within, fine_mm, scratch, answer):
     """Whether a check surely finds something, or keeps less than it is to; else what is left to query joins the answer.
 
     Looked at is the part ``within`` (low, high) of the segment. Its middle clears what lies nearer to it than its gap
     allows to move; the rest is checked in the same way, by the middles of what is left on either side.
     """
-    mover, frame_a, frames, paths = movers.of_check[at], scene.checks[at, 3], segment.frames[0], room.paths[0]
-    work, parts, kept_mm = room.work, room.parts, room.kept[at]
+    mover, frame_a, frames, paths = movers.of_check[at], scene.checks[at, 3], segment.frames[0], scratch.paths[0]
+    work, parts, kept_mm = scratch.work, scratch.parts, scratch.kept[at]
     kept = kept_mm + MIN_GAP_MM
     parts[0, 0], parts[0, 1], top = within[0], within[1], 1
     while top > 0:
@@ -119,7 +119,7 @@ def _prove(scene, movers, segment, at, within, fine_mm, room, answer):
 
 
 @nb.njit(cache=True)
-def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_mm, clear_mm, order, room, answer):
+def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_mm, clear_mm, order, scratch, answer):
     """Check a straight joint segment: fills ``answer``.
 
     Args:
@@ -133,7 +133,7 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
         fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.
         clear_mm: What the arm is to keep from skin and boxes where both ends do, see :func:`_keep`; 0 for none.
         order: Shape (k,): the checks in the order in which they are tested.
-        room: See :class:`SegmentScratch`.
+        scratch: See :class:`SegmentScratch`.
         answer: See :class:`Answer`.
     """
     step, frames = end - start, np.empty((1, 7, 4, 4))
@@ -143,19 +143,19 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
     if not np.isfinite(frames).all():
         answer.status[STATUS] = NOT_FINITE
         return
-    room.work.axes[:], room.kept[:] = 0.0, 0.0
+    scratch.work.axes[:], scratch.kept[:] = 0.0, 0.0
     if clear_mm > 0.0:
-        _keep(scene, segment, clear_mm, room)
+        _keep(scene, segment, clear_mm, scratch)
     for row in range(len(order)):
-        room.lists[0, row] = order[row]
+        scratch.lists[0, row] = order[row]
     none = np.int64(0)
-    if left_of(scene, movers, segment, (1.0, 0.0), (none, none, len(order)), none, room, answered, answer) < 0:
+    if left_of(scene, movers, segment, (1.0, 0.0), (none, none, len(order)), none, scratch, answered, answer) < 0:
         return
-    parts, here = divide(scene, movers, segment, halvings, order, room, answered, answer)
+    parts, here = divide(scene, movers, segment, halvings, order, scratch, answered, answer)
     for part in range(parts):
-        for row in range(room.spans[here, part, 0], room.spans[here, part, 1]):
+        for row in range(scratch.spans[here, part, 0], scratch.spans[here, part, 1]):
             within = part / parts, (part + 1) / parts
-            if _prove(scene, movers, segment, room.lists[here, row], within, fine_mm, room, answer):
+            if _prove(scene, movers, segment, scratch.lists[here, row], within, fine_mm, scratch, answer):
                 return
 
 
@@ -184,7 +184,7 @@ def _found(at, gap, kept_mm, fraction, answered, answer):
 
 
 @allocation_free()
-def left_of(scene, movers, segment, part, span, into, room, answered, answer):
+def left_of(scene, movers, segment, part, span, into, scratch, answered, answer):
     """Which checks the middle of a part of the segment does not clear all over the part.
 
     Each is looked at in the middle as it is. How far spheres and bodies are from one another clears the part where the
@@ -196,9 +196,9 @@ def left_of(scene, movers, segment, part, span, into, room, answered, answer):
         movers: See :class:`Movers`.
         segment: See :class:`Segment`.
         part: Its middle and half its width, fractions of the segment.
-        span: Which list of ``room.lists``, and from where to where, holds the checks that are to be cleared.
+        span: Which list of ``scratch.lists``, and from where to where, holds the checks that are to be cleared.
         into: Where in the other list the rest goes.
-        room: See :class:`SegmentScratch`.
+        scratch: See :class:`SegmentScratch`.
         answered: See :func:`check_segment`.
         answer: Likewise.
 
@@ -206,9 +206,15 @@ def left_of(scene, movers, segment, part, span, into, room, answered, answer):
         Where in the other list the rest ends; -1 where the search has ended.
     """
     checks, radii, T_box_base, halves = scene.checks, scene.hulls.radii, scene.T_box_base, scene.halves
-    work, paths, known, spheres, frames = room.work, room.paths, room.known, room.work.spheres, segment.frames[0]
+    work, paths, known, spheres, frames = (
+        scratch.work,
+        scratch.paths,
+        scratch.known,
+        scratch.work.spheres,
+        segment.frames[0],
+    )
     of_check, centres, reaches, mover_frames = movers.of_check, movers.centres, movers.radii, movers.frames
-    source, target, kept_mm = room.lists[span[0]], room.lists[1 - span[0]], room.kept
+    source, target, kept_mm = scratch.lists[span[0]], scratch.lists[1 - span[0]], scratch.kept
     place_arm(segment, part[0])
     place_spheres(scene.hulls, frames, spheres)
     known[:] = False
@@ -242,16 +248,16 @@ def left_of(scene, movers, segment, part, span, into, room, answered, answer):
 
 
 @allocation_free()
-def divide(scene, movers, segment, halvings, order, room, answered, answer):
+def divide(scene, movers, segment, halvings, order, scratch, answered, answer):
     """Halve the segment, and leave of each part the checks that neither its middle nor that of a larger part clears.
 
     All parts of one size come before the next, so that what touches is found soon.
 
     Returns:
-        How many parts there are, and which list of ``room`` holds the checks left in each; (0, 0) for none, and
+        How many parts there are, and which list of ``scratch`` holds the checks left in each; (0, 0) for none, and
         (-1, 0) where the search has ended.
     """
-    lists, spans, parts, here = room.lists, room.spans, 1, np.int64(0)
+    lists, spans, parts, here = scratch.lists, scratch.spans, 1, np.int64(0)
     for row in range(len(order)):
         lists[0, row] = order[row]
     spans[0, 0, 0], spans[0, 0, 1] = 0, len(order)
@@ -261,7 +267,7 @@ def divide(scene, movers, segment, halvings, order, room, answered, answer):
             begin = top
             if spans[here, part, 0] < spans[here, part, 1]:
                 middle, span = half * (2 * part + 1), (here, spans[here, part, 0], spans[here, part, 1])
-                top = left_of(scene, movers, segment, (middle, half), span, top, room, answered, answer)
+                top = left_of(scene, movers, segment, (middle, half), span, top, scratch, answered, answer)
             if top < 0:
                 return -1, 0
             for side in range(2):
@@ -333,7 +339,7 @@ def segment_scratch(scene: ProofScene, movers: Movers) -> SegmentScratch:
     """Scratch for segments of a workcell's checks."""
     checks, count = len(scene.checks), len(movers.frames)
     lists, spans = np.empty((2, checks << HALVINGS), np.int64), np.empty((2, 2 << HALVINGS, 2), np.int64)
-    work, paths = scratch(checks, len(scene.hulls.radii)), np.empty((count, 7))
+    work, paths = proof_scratch(checks, len(scene.hulls.radii)), np.empty((count, 7))
     return SegmentScratch(work, np.zeros(checks), lists, spans, paths, np.zeros(count, np.bool_), np.empty((PARTS, 2)))
 
 

@@ -54,10 +54,6 @@ def refused_if_damaged(where: str | Path) -> Iterator[None]:
 def parse_dicom(content: bytes, path: Path) -> Dataset:
     """The data set of a file that has been read, with its ``file_meta``.
 
-    Args:
-        content: The whole file.
-        path: Its name, for messages.
-
     Raises:
         InputError: No DICOM, damaged, cut short, inflating to too much, or big endian.
     """

@@ -239,7 +239,6 @@ def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
 
 
 def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: Path) -> Mask:
-    """The voxels of one segment."""
     made = np.zeros(placed.grid.shape, np.uint8, order="F")
     i, j, k = placed.offset
     for frame in np.flatnonzero(frames.segments == segment).tolist():

@@ -171,7 +171,6 @@ def _points(item: Dataset, label: str) -> Floats:
 
 
 def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> Mask:
-    """The voxels of one region."""
     made = np.zeros(shape, np.uint8, order="F")
     for number in {one.slice for one in contours}:
         made[:, :, number] = _slice_mask([one for one in contours if one.slice == number], shape[:2])

@@ -161,11 +161,6 @@ class Segment(NamedTuple):
 def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
     """The segments of a Slicer segmentation, each by its name.
 
-    Args:
-        path: Its name.
-        file: Its key in ``content``.
-        content: Gives its bytes.
-
     Raises:
         InputError: No such file, no segment, or segments that share a name or a label.
     """

@@ -84,10 +84,6 @@ def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
 def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer], float]:
     """Voxels as whole numbers, and how far they were off, at most.
 
-    Args:
-        values: Of any type.
-        path: The file, for errors.
-
     Raises:
         InputError: Values that are negative, too large, or farther from whole numbers than `ROUNDED_BY`; those of a
             map that was blended by an interpolation have a code of their own.

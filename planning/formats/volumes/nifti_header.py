@@ -78,10 +78,6 @@ def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
     Where sform and qform are both given they must agree, so that it does not matter which one a program takes
     (SimpleITK takes the sform if its code is 1, else the qform).
 
-    Args:
-        content: The whole file.
-        path: Its name.
-
     Raises:
         InputError: Whatever is wrong with the header.
     """

@@ -66,10 +66,6 @@ def wide_metal(volume: Volume, diameter_mm: float) -> Bools:
     """Voxels of metal that is wider than a rod, and those into which it blurs; shape of the image.
 
     Wide is what a ball fits into that is wider than the rod's own image.
-
-    Args:
-        volume: The CT.
-        diameter_mm: Of the rod.
     """
     metal, spacing = volume.values > METAL_HU, spacing_mm(volume)
     radius = diameter_mm / 2 + BLUR_MM

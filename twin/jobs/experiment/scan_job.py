@@ -384,11 +384,6 @@ LIST = "manifest.json"
 def parse_beside(arms: str, bed: str, lines: int) -> OutsideObjects | None:
     """What shall lie beside the patient; None for nothing.
 
-    Args:
-        arms: One of `Arms`.
-        bed: One of `Bed`.
-        lines: How many.
-
     Raises:
         InputError: A word that is not known.
     """

@@ -247,7 +247,6 @@ class _Rms(NamedTuple):
 
 
 def _rms(one: Callable[[np.random.Generator], list[float]], runs: int, key: int) -> _Rms:
-    """Over the runs."""
     squared = np.array([one(np.random.default_rng([SEED, key, k])) for k in range(runs)])
     return _Rms(np.sqrt(np.mean(squared, axis=0)).tolist(), [widened(column) for column in squared.T])
 

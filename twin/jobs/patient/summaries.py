@@ -51,7 +51,7 @@ def registration_summary(registration: Registration) -> dict[str, Any]:
 
 
 def _distortion(found: Distortion | None) -> dict[str, Any] | None:
-    return None if found is None else {**vars(found), "doubted": found.doubted, "text": found.text()}
+    return None if found is None else {**vars(found), "doubted": found.significant, "text": found.text()}
 
 
 def _declared(registration: Registration) -> dict[str, Any]:

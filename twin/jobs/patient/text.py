@@ -281,7 +281,6 @@ def _interval(bounds: Sequence[float], of: str = "") -> str:
 
 
 def _best(run: Run) -> list[str]:
-    """The best candidate of each window."""
     summary = run.summary()
     head = "the best of each window"
     if summary["windows"] > len(summary["best"]):

@@ -173,7 +173,6 @@ def _words(axes: Axes, one: ReasonCount) -> Text:
 
 
 def _width(text: Text) -> float:
-    """Of the column's width."""
     return float(text.get_window_extent().width) / SIDE_WIDE
 
 

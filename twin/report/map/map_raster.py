@@ -97,13 +97,7 @@ def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
 
 
 def map_raster(candidates: Candidates, view: MapView, size: int = PIXELS) -> MapRaster:
-    """Draw the cap.
-
-    Args:
-        candidates: The grid's rows.
-        view: The map's geometry.
-        size: Pixels per side.
-    """
+    """Draw the cap."""
     cells = MapCells.of(candidates)
     rows = cells.picture(view, size)
     table = np.zeros((len(candidates) + 1, 4), dtype=np.uint8)

@@ -224,7 +224,6 @@ def over_background(image: Pixels, imager: Imager) -> Floats:
 
 
 def _segment(relative: Floats, imager: Imager, settings: DetectorSettings) -> Segment:
-    """The brightest segment, mm."""
     clipped = np.minimum(relative, BRIGHTEST) - 1.0 - EXPECTED
     small = np.asarray(cv2.GaussianBlur(clipped, (0, 0), COARSE / 1.5)[::COARSE, ::COARSE], dtype=np.float64)
     low, high = np.radians(settings.inclination_deg)
