@@ -140,7 +140,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
 
 
 def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Finding:
-    """What a rule guesses of an image: how much, where, which picture shows it, and the line that overrules it.
+    """Sentence on what a rule guessed of an image: how much, where, which picture shows it, what overrules it.
 
     Args:
         code: Of the finding; the structure that paths would pass through, where there is one.
@@ -170,7 +170,7 @@ def body_side(mesh: TriangleMesh, skin: Skin) -> str:
 def _outside(
     case: Case, scan: Scan, outside: Outside, structures: Sequence[Structure], warnings: list[str]
 ) -> tuple[Structure, ...]:
-    """What the CT shows outside of the body that is not air, and limbs that are pressed against it."""
+    """Surfaces of what the CT shows outside of the body that is not air, and of limbs pressed against it."""
     if case.ct.table != "none":
         warnings.extend(support_warnings(outside.supported, outside.open_faces))
     voxel_ct = scan.source.surfaces.voxel_ct
@@ -184,7 +184,7 @@ def _outside(
 
 
 def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterator[Structure]:
-    """What the CT shows inside the body that no structure names, unless the case takes that for free."""
+    """Surfaces of what the CT shows inside the body that no structure names, unless the case declares it free."""
     if case.ct.unnamed == "free":
         return
     written = [Named(one.name, one.mesh) for one in structures if one.source != OWN_TARGET]
@@ -208,7 +208,7 @@ def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
 
 
 def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh | None:
-    """What lies beyond what the body lies on in the case's CT, as `Anatomy.couch`.
+    """Load the surfaces beyond what the body lies on in the case's CT, as `Anatomy.couch`.
 
     Raises:
         InputError: A CT that cannot be trusted, or does not show the target.
@@ -218,7 +218,7 @@ def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh 
 
 
 def _check_count(case: Case, count: int) -> None:
-    """Of a case that states how many structures it has, before a surface is made; the CT adds others later."""
+    """Compare the number of structures with what the case states, before surfaces are made and the CT adds others."""
     if wrong := count_difference(case.stated_structures, count):
         raise InputError(wrong, where=case.path, allowed="the number of structures that are read")
 
@@ -238,7 +238,7 @@ def _check_names(case: Case, structures: list[Structure]) -> None:
 
 
 def _check_demands(case: Case, structures: list[Structure]) -> None:
-    """Where nothing demands a margin every path is "safe", which says nothing about a patient."""
+    """Refuse a case without margins: every path would be "safe", which says nothing about a patient."""
     if not any(structure.demands_margin for structure in structures):
         raise InputError(
             "no structure is to be avoided, so that no verdict would say anything about safety",

@@ -79,7 +79,7 @@ class Scan:
     skin: Skin | None
 
     def outside(self, air_hu: float) -> Outside:
-        """What is denser than air outside of the body, and beyond which faces of the image nothing is known."""
+        """Surfaces outside of the body denser than air, and the image's faces beyond which nothing is known."""
 
         def make() -> list[TriangleMesh | None]:
             ct = self._ct
@@ -95,7 +95,7 @@ class Scan:
         return Outside(_joined([solids, supports, *faces]), supports, open_faces)
 
     def _outside_meshes(self, image: OutsideImage, mask: Bools) -> list[TriangleMesh | None]:
-        """What is outside of the body, what lies beyond tables, and what beyond each open face."""
+        """Meshes of the outside: what is seen, what lies beyond tables, and what lies beyond each open face."""
         measured = mask & ~image.unscanned.voxels
         support = find_support(measured, image.body, image.spacing_mm, self._tables, self._ct.shown)
         supports = [beyond_table(image, side) for side in (*self._tables, *support.drawn)]
@@ -104,7 +104,7 @@ class Scan:
         return [outside_surface(image, mask, where=self._ct.where), _joined(supports), *faces]
 
     def end(self) -> tuple[FieldOfView, Floats] | None:
-        """Where this image cuts a body whose skin is not its own, and points (n, 3) of its outlines there, LPS mm.
+        """Where this image cuts a body whose skin comes from elsewhere, and points (n, 3) of its outlines, LPS mm.
 
         None where it does nowhere, or the skin is its own and tells.
         """
@@ -149,7 +149,7 @@ class Scan:
         return self._kept(made_from, lambda: [make()])[0]
 
     def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
-        """What is dense, or gas, inside the body and in no structure.
+        """Surfaces of what is dense, or gas, inside the body and in no structure.
 
         Args:
             structures: Every structure of the case but the skin.
@@ -225,7 +225,7 @@ class Scan:
 
 
 def _joined(meshes: Sequence[TriangleMesh | None]) -> TriangleMesh | None:
-    """Those that are there as one, or None."""
+    """The meshes that are present, joined to one; None where none is."""
     found = [mesh for mesh in meshes if mesh is not None]
     return joined(found) if found else None
 

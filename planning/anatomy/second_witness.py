@@ -49,7 +49,7 @@ class Named(NamedTuple):
 
 
 class Unnamed(NamedTuple):
-    """What no structure names: closed surfaces in LPS mm, or None where there is nothing."""
+    """Closed surfaces of what no structure names, LPS mm; None where there is nothing."""
 
     dense: TriangleMesh | None
     gas: TriangleMesh | None

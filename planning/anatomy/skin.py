@@ -61,7 +61,7 @@ class Skin:
 
     @property
     def nbytes(self) -> int:
-        """What mesh and flags hold."""
+        """Bytes of mesh and flags."""
         return self.mesh.nbytes + self.cut_faces.nbytes
 
 
@@ -112,7 +112,7 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
 
 
 def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
-    """A mesh that is the whole skin, or the skin of a body that was cut at some sides.
+    """The skin of a mesh: of a whole body, or of one that was cut at some sides.
 
     Args:
         mesh: In LPS mm (or the local frame, without cuts).
@@ -179,7 +179,7 @@ def _skin(
 
 
 def field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
-    """Up to the outer faces of the border voxels that the body reaches."""
+    """The box that was imaged, up to the outer faces of the border voxels that the body reaches."""
     spacing = spacing_of(T_ct_index)
     axes, origin = T_ct_index[:3, :3], T_ct_index[:3, 3]
     T_ct_image = pose(axes / spacing, origin - 0.5 * axes.sum(axis=1))

@@ -53,7 +53,7 @@ class StructureSources:
         return Structure(section.name, role, margin_mm, mesh, source, voxel_ct=voxel_ct)
 
     def many(self, section: StructuresSection) -> list[partial[Structure]]:
-        """All labels of one map, or masks of one folder, that the rules do not ignore; their surfaces when called."""
+        """All labels of a map, or masks of a folder, that the rules do not ignore; their surfaces are made on call."""
         if section.mask_set is not None:
             return self._masks(section, section.mask_set)
         name = section.source
@@ -148,7 +148,7 @@ class StructureSources:
     def _seen(
         self, name: str, label: int | None, structures: Sequence[Structure], stated: Sequence[str] | None
     ) -> Imaged:
-        """What a CT, or the label of a body, shows of it."""
+        """Voxels of a CT, or of a body's label, that show the body's outside."""
         if (name, label) not in self._imaged:
             volume = self._volume(name) if label is None else self._labels(name)
             organs, ct = [(one.mesh, one.voxel_mm) for one in structures], self._case.ct
@@ -226,7 +226,7 @@ class StructureSources:
         return self._volumes[name]
 
     def _open(self, name: str) -> VolumeSurfaces:
-        """A volume that nobody else holds, so that its voxels go when it does."""
+        """A volume held by its caller alone, so that its voxels are freed with it."""
         source = self._case.volumes.source(name)
         hashes = (self._case.files.sha256(file) for file in source.files)
         return VolumeSurfaces(source, (*hashes, *source.part), self._cache)

@@ -47,7 +47,7 @@ MASK_BYTES = 3
 
 
 class Present(NamedTuple):
-    """What a label map or mask holds.
+    """The labels that a map or mask holds.
 
     Attributes:
         labels: Those that have a voxel, rising.
@@ -58,7 +58,7 @@ class Present(NamedTuple):
     rounded_by: float
 
     def notes(self, path: Path) -> tuple[str, ...]:
-        """What a person should be told of how a file was read."""
+        """Notes for a person on how a file was read."""
         said = f"{path.name}: its labels are up to {self.rounded_by:.2g} off whole numbers, and were rounded"
         return (said,) if self.rounded_by else ()
 
@@ -111,7 +111,7 @@ class VolumeSurfaces:
         return self._kept("labels present", lambda: _of_present(self.labelmap), _to_labels)
 
     def mask(self) -> Present:
-        """Of a file that is one structure's mask its voxels' value; none where it is empty."""
+        """The voxels' value in a file that is one structure's mask; none where it is empty."""
 
         def make() -> Arrays:
             labels = labelmap_of(self.volume, may_be_empty=True)
@@ -128,7 +128,7 @@ class VolumeSurfaces:
 
     @cached_property
     def ct_image(self) -> CtImage:
-        """All voxels of a CT."""
+        """All voxels of the CT."""
 
         def make() -> CtImage:
             return ct_image(vars(self).pop("volume", None) or self.source.volume())  # nobody asks for it again
@@ -143,7 +143,7 @@ class VolumeSurfaces:
         shown: Shown = PATIENT,
         stated: Collection[str] | None = None,
     ) -> Imaged:
-        """What a scanner saw of a body, without what was laid around it.
+        """A scanner's image of a body, without padding around it.
 
         Args:
             label: Of the body, in a label map; None where this is a CT.
@@ -163,7 +163,7 @@ class VolumeSurfaces:
         return _of_content(content_of(labels.values == label, labels.T_ct_index))
 
     def held(self, what: str, make: Callable[[], Value], size: Callable[[Value], int]) -> Value:
-        """What is made from this file, and is held in memory alone, where that does not push out all else."""
+        """Value made from this file, cached in memory alone, where that does not displace everything else."""
         memory = self.cache.memory
 
         def held_bytes(value: Value) -> int:
@@ -174,7 +174,7 @@ class VolumeSurfaces:
     def kept(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
     ) -> Value:
-        """What is made from this file and from what ``made_from`` says; see `Cache.value`."""
+        """Value made from this file and from what ``made_from`` states, cached; see `Cache.value`."""
         return self.cache.value({"files": self.sha256, "readers": _readers(), **made_from}, make, read, by=by)
 
     def _kept(self, what: str, make: Callable[[], Arrays], read: Callable[[Arrays], Value]) -> Value:
@@ -183,7 +183,7 @@ class VolumeSurfaces:
 
 @dataclass(frozen=True)
 class Imaged:
-    """What a scanner saw: a CT, or a label that is the body, without what was laid around it.
+    """A scanner's image of a body: a CT, or a body's label, without padding around it.
 
     Attributes:
         surfaces: Of the whole file.

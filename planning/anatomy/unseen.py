@@ -63,7 +63,7 @@ class Beyond(NamedTuple):
 
 
 def beyond_images(case: Case, skin: Skin, scan: Scan | None) -> Beyond:
-    """What lies beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere."""
+    """Solids assumed beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere."""
     ends = [] if skin.field_of_view is None else [(skin.field_of_view, skin.mesh.vertices)]
     of_scan = None if scan is None else scan.end()
     ends = [end for end in [*ends, *([] if of_scan is None else [of_scan])] if end[0].cut.any()]
@@ -78,7 +78,7 @@ def beyond_images(case: Case, skin: Skin, scan: Scan | None) -> Beyond:
 
 
 def assumed(case: Case, view: FieldOfView) -> Assumed:
-    """What holds of a case: a person's word, or the usual where no arm can lie beyond.
+    """Width assumed beyond a case's image: as a person states it, or the usual where no arm can be beyond.
 
     An arm that is stretched out lies farther from the trunk than anything usual: unless there is none, or the image
     shows the arms and the body's whole width, all that lies beyond a cut is unknown.
@@ -211,7 +211,7 @@ class _Extent:
 
     @property
     def gaps(self) -> Floats:
-        """By how many voxels the body goes on beyond each low and high face, shape (2, 3)."""
+        """Number of voxels by which the body goes on beyond each low and high face, shape (2, 3)."""
         low, high = self.box
         return np.stack([low - self.low, self.high - high])
 
@@ -249,7 +249,7 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure]) -> Be
 
 
 def _largest_margin(case: Case, grid: LabelGrid, structures: Sequence[Structure]) -> float:
-    """Of the labels that are there, those that patterns name and that may lie beyond, and of what nobody named; mm."""
+    """Largest margin, mm, of structures that may lie beyond an image: those that patterns name, and unnamed ones."""
     sections = [one for one in case.structures if one.source == grid.name]
     named = [margin for one in sections for margin in (*one.avoid.values(), *one.unknown.values())]
     return max([case.ct.margin_mm, *named, *(one.margin_mm for one in grid.own(structures))])

@@ -144,7 +144,7 @@ class Box:
 
     @property
     def corners(self) -> Floats:
-        """Its eight corners, base frame, shape (8, 3), mm."""
+        """The eight corners of the box, base frame, shape (8, 3), mm."""
         local = np.array(list(product((-0.5, 0.5), repeat=3))) * self.size_mm
         return np.asarray(apply(self.T_base_box, local))
 

@@ -28,7 +28,7 @@ class PlanningError(Exception):
     """Base of everything that the planner raises on purpose."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """With all its parts, which a process that sends it makes again; they do not follow from the message alone."""
+        """For pickling between processes: all parts of the error, which its message alone does not hold."""
         return _error_again, (type(self), self.args, vars(self))
 
 
@@ -133,7 +133,7 @@ class Finding:
     way_out: str = ""
 
     def document(self) -> dict[str, object]:
-        """As it stands under ``findings`` of ``--json``."""
+        """The finding as it is listed under ``findings`` of ``--json``."""
         return {
             "code": self.code,
             "severity": str(self.severity),
@@ -177,7 +177,7 @@ def require_extra(extra: str, where: str, *, else_allowed: str = "") -> None:
 
 
 def _install_line(extra: str, missing: list[str]) -> str:
-    """What installs it, from where this was installed: the project is on no index."""
+    """Command that installs an extra, from where this package was installed: it is on no index."""
     if all(name in NO_WHEEL_FROM and sys.version_info >= NO_WHEEL_FROM[name][1] for name in missing):
         names = " ".join(NO_WHEEL_FROM[name][0] for name in missing)
         version = ".".join(map(str, sys.version_info[:2]))

@@ -125,7 +125,7 @@ def _shown(path: Path) -> str:
 
 
 def read_input(path: Path, *, max_bytes: int, where: str) -> bytes:
-    """All bytes of a file.
+    """Read all bytes of a file.
 
     Args:
         path: The file.

@@ -1,4 +1,4 @@
-"""What a result was made from: every file once, with its role and the hash of the bytes that were parsed.
+"""Provenance of a result: every file that decided it, once, with its role and the hash of the bytes that were parsed.
 
 A path may name other bytes a moment later. So a file is read once, its hash is that of the bytes in memory, and
 whoever parses the file parses those bytes.

@@ -26,7 +26,7 @@ ALLOWED_NAME = f"printable characters on one line, {MAX_NAME} at most: no escape
 
 
 def check_name(name: str, what: str, *, where: str | Path) -> str:
-    """A name that may be printed as it is.
+    """Check a name that is printed as it is, and return it.
 
     Args:
         name: The name as the file states it.
@@ -144,7 +144,7 @@ def card(title: str, facts: Facts, picture: str = "") -> str:
 
 
 def never_raises(make: Callable[[Value], str]) -> Callable[[Value], str]:
-    """What a notebook calls: where a value cannot be shown, its class and the error are."""
+    """Decorator for a notebook's hooks: where a value cannot be shown, its class and the error are."""
 
     @functools.wraps(make)
     def shown(value: Value) -> str:

@@ -225,7 +225,7 @@ class CaseChange(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """All cases of two cohorts.
+    """Two cohorts compared, case by case.
 
     Attributes:
         changes: In the order of the second, then what only the first has.

@@ -62,7 +62,7 @@ class Part(NamedTuple):
         return f"{self.number}/{self.parts}"
 
     def of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """This part's items: neighbours stay together, and every item is in one part."""
+        """The items of this part: neighbours stay together, and every item is in one part."""
         size = len(items)
         return items[(self.number - 1) * size // self.parts : self.number * size // self.parts]
 
@@ -404,7 +404,7 @@ class _WorkerCache:
 
 
 def on_scheduler(address: str) -> RunTasks:
-    """A function that runs cases on a scheduler's workers.
+    """Make a function that runs cases on a scheduler's workers.
 
     Args:
         address: Such as ``tcp://10.0.0.1:8786``.

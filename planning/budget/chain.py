@@ -167,7 +167,7 @@ class Chain:
         return float(np.sqrt(np.trace(self.tip_mean_square())))
 
     def with_errors(self, errors: ErrorModel) -> Chain:
-        """With other errors; weighted again as they ask for, unless the method is a triad, or joint with the arm."""
+        """The chain with other declared errors; fitted again by them, unless the method is a triad, or joint."""
         method = self.method if self.method in {"triad", "joint"} else default_method(errors)
         return replace(self, errors=errors, method=method)
 

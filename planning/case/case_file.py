@@ -67,7 +67,7 @@ def _statements(data: Any) -> Any:
 
 
 def count_difference(stated: int, found: int) -> str:
-    """What to say of a case that has another number of structures than it states; the empty string if it has not."""
+    """Sentence on a case with another number of structures than it states; empty where they agree."""
     if stated == found:
         return ""
     return f"structures = {stated} is stated, and the case has {found}, the skin among them; was the file cut?"

@@ -195,7 +195,7 @@ class AngleGrid:
         return len(self.theta) * len(self.beta)
 
     def solid_angle(self) -> Floats:
-        """What each direction stands for, shape (m k,), sr: to the middle between neighbours, nothing beyond the grid.
+        """Solid angle of each direction, shape (m k,), sr: to the middle between neighbours, within the grid.
 
         The integral of sin θ dθ dβ over each cell: together they are the grid's whole solid angle.
         """

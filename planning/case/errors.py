@@ -146,7 +146,7 @@ class ErrorModel:
 
 
 class Cells(NamedTuple):
-    """Of what a CT is made: pixel and slice spacing in mm, and the unit normal of its slices, shape (3,), LPS."""
+    """The voxels of a CT: pixel and slice spacing, mm, and the unit normal of its slices, shape (3,), LPS."""
 
     pixel_mm: float
     spacing_mm: float

@@ -225,7 +225,7 @@ class CaseVolumes:
         return {called: _key(name, called) for called in self._masks[name].masks} if name in self._masks else {}
 
     def mask_notes(self, name: str) -> tuple[str, ...]:
-        """What to tell of the structures of such a file."""
+        """Notes on the structures of a file of masks."""
         return self._masks[name].notes if name in self._masks else ()
 
     def _read_series(self, path: Path, name: str, key: str) -> CtSeries:
@@ -267,7 +267,7 @@ LINE_FILES = (".csv", ".fcsv")
 
 
 def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tuple[str, ...]:
-    """What is left open about being whole, one sentence each.
+    """Sentences on files of which it is not known whether they are whole.
 
     Args:
         content: The case file.
@@ -296,7 +296,7 @@ def ends_with_end(text: str) -> bool:
 
 
 def robot_warnings(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
-    """That nothing is said of where a robot is: no verdict is about it."""
+    """Warning of a case that does not say where a robot is: no verdict includes one."""
     located = content.registration is not None or content.robot.mount is not None
     nowhere = not located and bool({"robot", "tool"} & content.model_fields_set)
     return (ROBOT_NOWHERE.format(robot=robot.model.name),) if nowhere else ()

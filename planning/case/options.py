@@ -1,4 +1,4 @@
-"""What is stated in place of what a case file states: another target, margins, mount, needle, arm or errors.
+"""Options in place of what a case file states: another target, margins, mount, needle, arm or errors.
 
 The case file is not changed: its tables are, before they are validated, so that an option is held to the same rules as
 a line of the file. Options are an input of their own: no result of a case with options passes for one without.

@@ -52,7 +52,7 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
 def case_of(
     content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes, warnings: tuple[str, ...]
 ) -> Case:
-    """What a case file and the files that it names state, in LPS (or local) mm and radians; warnings go in front."""
+    """Make a case of its file and the files that it names, in LPS (or local) mm and radians."""
     space = Space(content.space)
     target = _target_of(content, path, space, files)
     robot = robot_of(content, space, path, files)

@@ -114,7 +114,7 @@ class CtSettings:
 
     @property
     def declared(self) -> tuple[str, ...]:
-        """What a person states of the image, one sentence each."""
+        """Sentences on what a person states of the image."""
         said = []
         if self.arms is not None:
             said.append("declared: " + ("no arms in the image" if self.arms == "none" else "arms in the image"))

@@ -368,7 +368,7 @@ MountName = Literal["floor", "rail", "ceiling", "side"]
 
 
 class MountBounds(Section):
-    """Where a base of one kind may stand, seen from the target; what is left out follows from the arm's length."""
+    """Bounds of the base's place for one kind of mount, from the target; the rest follows from the arm's length."""
 
     along_mm: Range | None = None
     across_mm: Range | None = None
@@ -384,7 +384,7 @@ class MountBounds(Section):
 
 
 class PlaceSection(Section):
-    """Where ``place`` may stand the arm."""
+    """Bounds within which ``place`` searches for the arm's base."""
 
     mounts: tuple[MountName, ...] | None = None
     step_mm: Annotated[Number, Field(ge=20, le=500)] = 150.0
@@ -489,7 +489,7 @@ def stated_base_ct(section: RegistrationSection, T_file: Floats) -> Floats:
 
 
 def other_readings(section: RegistrationSection, T_base_ct: Floats) -> dict[str, Floats]:
-    """What T_base_ct would be with other values of ``transform_maps`` and ``base_axes``, by these keys as text.
+    """T_base_ct under other values of ``transform_maps`` and ``base_axes``, by these keys as text.
 
     Args:
         section: As the case states it.
@@ -546,7 +546,7 @@ class ErrorsSection(Section):
 
 
 class RehearsalSection(Section):
-    """What the twin's truth is drawn from; the planner never reads it."""
+    """From what the twin draws its ground truth; the planner never reads it."""
 
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
     truth_base: str | None = None

@@ -71,7 +71,7 @@ class _Cell:
         return np.asarray(self._R @ np.array([np.sin(t) * np.cos(b), np.sin(t) * np.sin(b), np.cos(t)]))
 
     def parts(self, letter: str) -> list[_Cell]:
-        """Its halves or quarters, low θ first, then low β."""
+        """The cell's halves or quarters, low θ first, then low β."""
         (t0, t1), (b0, b1) = self.theta, self.beta
         t, b = 0.5 * (t0 + t1), 0.5 * (b0 + b1)
         thetas = [(t0, t), (t, t1)] if letter in "tq" else [(t0, t1)]

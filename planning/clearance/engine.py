@@ -77,7 +77,7 @@ class ClearanceEngine(Protocol):
         ...
 
     def of(self, columns: Ints) -> ClearanceEngine:
-        """The same engine for some of its structures, in this order; nothing is prepared again."""
+        """This engine for some of its structures, in the order of ``columns``; nothing is prepared again."""
         ...
 
 

@@ -149,7 +149,7 @@ class FastEngine:
         return len(near) > 0 and capsule_touches_any(near.triangles, target_ct, outward_ct, length, radius)
 
     def of(self, columns: Ints) -> FastEngine:
-        """The same engine for some of its structures; see `ClearanceEngine`."""
+        """This engine for some of its structures; see `ClearanceEngine`."""
         part = copy(self)
         part._blocks = tuple(self._blocks[column] for column in columns)
         part._placed, part._progress = None, None

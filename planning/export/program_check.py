@@ -71,7 +71,7 @@ def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None,
 
 
 def _rates(program: Program) -> Floats:
-    """All numbers that a program prints besides angles and poses; 1 + mm for radii, which may be 0."""
+    """All numbers that a program prints except angles and poses; 1 + mm for radii, which may be 0."""
     moves = [(move.speed, move.acceleration, 1.0 + move.blend_mm) for move in program.moves]
     return np.array([program.tcp_mm, program.insertion_mm_s, program.insertion_mm_s2, *np.ravel(moves)])
 

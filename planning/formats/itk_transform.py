@@ -267,7 +267,7 @@ def _groups(h5py: Any, file: Any, where: str) -> list[Any]:
 
 
 def _own(h5py: Any, parent: Any, name: str, kind: type, where: str) -> Any:
-    """A member that is in the file itself; links could name any file of the host."""
+    """A member of the file itself; a link could name any file of the host, and is refused."""
     if not isinstance(parent.get(name, getlink=True), h5py.HardLink) or not isinstance(parent[name], kind):
         refuse(f"{parent.name}/{name} is a link or of another sort", where, ALLOWED)
     return parent[name]

@@ -31,7 +31,7 @@ _EXTENT_ALLOWED = (
 
 
 def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> TriangleMesh:
-    """A mesh that passed the guard: finite, indices in range, of a plausible size, with an area.
+    """Check a mesh: finite, indices in range, of a plausible size, with an area; and return it.
 
     Triangles of zero area are all kept: their corners still belong to the surface, and dropping them would
     change counts; ``mesh_files.mesh_warnings`` counts them. Only a mesh without any area is refused.

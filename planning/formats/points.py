@@ -103,7 +103,7 @@ def parse_points(
     default_space: Space | None = None,
     default_unit: Unit | None = None,
 ) -> NamedPoints:
-    """As `read_points`, of a file that has been read; it is not opened again.
+    """Parse a points file that has been read, like `read_points`; it is not opened again.
 
     Args:
         data: The whole file.

@@ -158,7 +158,7 @@ class Spread(NamedTuple):
 
 
 def spread_on(mesh: TriangleMesh, count: int) -> Spread:
-    """So many points spread evenly over a surface's area, the same in every run.
+    """Points spread evenly over a surface's area, ``count`` of them, the same in every run.
 
     Along the triangles by cumulative area, within a triangle by the R2 sequence (Roberts 2018), folded at its diagonal.
     """
@@ -227,7 +227,7 @@ def _first_of_equals(a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.i
 
 
 def packed_meshes(meshes: Sequence[TriangleMesh]) -> dict[str, NDArray[Any]]:
-    """All vertices and faces, one mesh after the other, and how many each has, shape (k, 2)."""
+    """All vertices and faces of some meshes, one after the other, and how many each has, shape (k, 2)."""
     return {
         "sizes": np.array([(len(mesh.vertices), len(mesh.faces)) for mesh in meshes], np.int64).reshape(-1, 2),
         "vertices": np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes)]),

@@ -1,4 +1,4 @@
-"""What of a mask holds together, by runs of voxels along its last axis: no grid of numbers is made, nor gone through.
+"""Connected parts of a mask, by runs of voxels along its last axis: no grid of numbers is made or read.
 
 A large scan has a hundred million voxels and a few hundred thousand runs. Two runs of neighbouring lines that touch
 are of one part (union-find, the older run is the root, so that one pass forward numbers them all).
@@ -43,7 +43,7 @@ class Parts:
         return np.bincount(self.part, held, len(self.sizes)).astype(np.int64)
 
     def painted(self, values: NDArray[Any]) -> NDArray[Any]:
-        """A grid that holds a value of its own in each part, and zero outside of all.
+        """A grid with a value of its own in each part, and zero outside of all.
 
         Args:
             values: Shape (parts,), whole numbers or flags.
@@ -78,7 +78,7 @@ def middle_of(mask: Bools) -> Floats:
 
 
 def ends_of(mask: Bools) -> tuple[Ints32, Ints32, Ints32, Ints32]:
-    """Where lines along axes 0 and 1 first and last meet a mask.
+    """First and last voxel of a mask along each line of axes 0 and 1.
 
     Returns:
         The first along axis 0, shape (ny, nz), the last, and both along axis 1, shape (nx, nz); -1 of a line that does
@@ -91,7 +91,7 @@ def ends_of(mask: Bools) -> tuple[Ints32, Ints32, Ints32, Ints32]:
 
 
 def _plain(mask: Bools) -> Bools:
-    """As kernels take it: in one piece, writable."""
+    """The array as kernels take it: contiguous and writable."""
     return np.require(mask, requirements=["C", "W"])
 
 

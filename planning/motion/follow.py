@@ -225,7 +225,7 @@ def _corner_speeds(round_speeds: list[float], straight: Floats, rates: list[Rate
 
 
 def _sampled(waypoints: Floats, runs: Iterable[list[_Stretch]]) -> Trajectory:
-    """All runs one after the other, each slowed down by less than one sample, so that it ends on one."""
+    """All runs sampled one after the other, each slowed by less than one sample so that it ends on one."""
     rows, count = [waypoints[:1]], 0
     for run in runs:
         ends = np.cumsum([stretch.duration_s for stretch in run])

@@ -27,7 +27,7 @@ ROUNDING_MM = 1e-9
 
 
 class Push(NamedTuple):
-    """A capsule that is pushed in, from one depth to its rupture at another, with a force there."""
+    """A capsule that is pushed in from one depth, and ruptures at another at a force."""
 
     start_mm: float
     end_mm: float

@@ -238,7 +238,7 @@ class WantedDirections:
         return WantedDirections(self.outward_ct[rows], self.standoff_mm[rows], self.weight[rows])
 
     def spread(self, count: int) -> WantedDirections:
-        """At most ``count`` of them, each as far as can be from those before, with the weight of all nearest to it."""
+        """At most ``count`` directions, each as far as can be from those before, weighted by all nearest to it."""
         if count >= len(self):
             return self
         chosen = [int(np.argmax(self.weight))]

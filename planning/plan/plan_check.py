@@ -57,7 +57,7 @@ def rate_limits(model: UrModel) -> Peaks:
 
 
 def with_case_arm(plan: Plan, case: Case) -> Plan:
-    """A plan that was read, with its case's arm: a plan's file states the arm's numbers, and not its shapes."""
+    """A plan from a file with its case's arm: the file states the arm's numbers, but not its shapes."""
     return replace(plan, model=case.robot.model) if same_arm(plan.model, case.robot.model) else plan
 
 
@@ -117,7 +117,7 @@ def check_angles(plan: Plan, path: Path) -> None:
 
 
 def roll_of(plan: Plan) -> float:
-    """About the needle, rad, 0 to 2 pi: what the joint angles at standoff give, whatever the plan states."""
+    """Rotation about the needle, rad, 0 to 2 pi, by the joints at standoff, whatever the plan states."""
     R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
     line = needle_lines((R @ plan.target_ct + t)[None], (R @ plan.outward_ct)[None])[0]
     x_axis = line.R_base_flange.T @ flange_pose(plan.model, plan.insertion.q[0])[:3, 0]

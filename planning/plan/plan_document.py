@@ -195,7 +195,7 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
 
 
 def _speed_limits(value: Any) -> SpeedLimits:
-    """What a plan says that it keeps."""
+    """Limits of speed that a plan says it keeps."""
     if set(value) != set(SpeedLimits._fields):
         raise ValueError(f"speed_limits are {', '.join(SpeedLimits._fields)}")
     speeds = SpeedLimits(*(number(value[name]) for name in SpeedLimits._fields))

@@ -1,4 +1,4 @@
-"""What a registration's method makes of the declared errors of its markers.
+"""Covariance of a registration, from its method and the declared errors of its markers.
 
 The declared noise of a case's markers, and how the arm stood, or may have stood, when it touched them.
 """

@@ -242,7 +242,7 @@ class Distortion:
         )
 
     def brief(self) -> str:
-        """What is deformed, by how much, and how sure that is."""
+        """How the lists differ, by how much, and how sure that is."""
         along = "" if self.axes == "xyz" else f" along the CT's {self.axes}"
         said = f"markers_base look {1 + self.amount:.4f} times as large as markers_ct{along}"
         if len(self.axes) == 2:
@@ -331,7 +331,7 @@ class NoiseCovariance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ReadingNoise:
-    """What the readings of N markers may be off by, all normal with mean zero.
+    """Declared errors of the readings of N markers, all normal with mean zero.
 
     Attributes:
         cov_ct: Shape (3, 3), mm^2, of each reading in the CT.
@@ -348,7 +348,7 @@ class ReadingNoise:
     touches_known: bool
 
     def covariance(self, R_base_ct: Floats) -> NoiseCovariance:
-        """Of all readings stacked, CT axes rotated by (..., 3, 3)."""
+        """Covariance of all readings stacked, CT axes rotated by (..., 3, 3)."""
         blocks = self.blocks(R_base_ct)
         count = blocks.shape[-3]
         omega = np.zeros((*blocks.shape[:-3], 3 * count, 3 * count))

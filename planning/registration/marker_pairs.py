@@ -1,4 +1,4 @@
-"""The same markers in the CT and at the robot, paired by name."""
+"""Markers paired by name: the same ones in the CT and at the robot."""
 
 from __future__ import annotations
 

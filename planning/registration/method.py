@@ -289,7 +289,7 @@ SHOWN = 3
 
 
 def better_names(markers: MarkerPairs, target_ct: Floats, fre_mm: float) -> str:
-    """All permutations of the names that fit where the given ones do not, the best first; empty for none.
+    """Sentence on permutations of the names that fit where the given ones do not, the best first; empty for none.
 
     Args:
         markers: As the user named them.

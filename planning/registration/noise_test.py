@@ -179,7 +179,7 @@ class ResidualTest:
 
 
 class OutlierMarker(NamedTuple):
-    """A marker that the others contradict.
+    """A marker that does not fit the others.
 
     Attributes:
         name: Its name.

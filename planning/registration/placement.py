@@ -1,4 +1,4 @@
-"""Where the patient lies for the robot: T_base_ct from markers or from the stated mount, and its expected error.
+"""The patient's pose for the robot, T_base_ct, from markers or from the stated mount, and its expected error.
 
 A pose corrected for what its own residuals tell of the arm: pose and arm errors estimated together.
 
@@ -225,7 +225,7 @@ class WithoutMarker:
 
 @dataclass(frozen=True, eq=False)
 class OneMore:
-    """Where a further marker would help most.
+    """The place on the skin where a further marker would help most.
 
     Attributes:
         point_ct: Shape (3,), mm.
@@ -237,7 +237,7 @@ class OneMore:
 
 
 def without_each(registration: Registration, target_ct: Floats) -> tuple[WithoutMarker, ...]:
-    """What each marker's absence would do; empty with three markers or without declared errors."""
+    """Expected error without each marker in turn; empty with three markers or without declared errors."""
     uncertainty, markers = registration.uncertainty, registration.markers
     if uncertainty is None or len(markers) <= MIN_MARKERS:
         return ()
@@ -257,7 +257,7 @@ def without_each(registration: Registration, target_ct: Floats) -> tuple[Without
 
 
 def one_more(registration: Registration, target_ct: Floats, skin_points_ct: Floats) -> OneMore | None:
-    """Where on the skin a further marker, read and touched like the others, would leave the least error.
+    """Find the place on the skin where a further marker, read and touched like the others, would leave the least error.
 
     Args:
         registration: With declared errors; None is returned without them.

@@ -101,7 +101,7 @@ class Registration:
 
     @property
     def fle_source(self) -> str:
-        """Where that number comes from."""
+        """Where `fle_mm` comes from: declared, estimated from FRE, or scaled to the residuals."""
         if self.uncertainty is None:
             return self.residual_test.source
         scaled = (

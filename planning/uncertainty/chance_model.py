@@ -239,7 +239,7 @@ class Chances:
         return cls(structures, refined=np.zeros(count, bool), **blank)
 
     def put(self, rows: Ints, known: Chances) -> Chances:
-        """These chances with some candidates' replaced."""
+        """These chances with those of some candidates replaced."""
         values = {field.name: getattr(self, field.name).copy() for field in fields(self) if field.name != "structures"}
         for name, value in values.items():
             value[rows] = getattr(known, name)

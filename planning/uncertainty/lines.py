@@ -304,7 +304,7 @@ class NeedleUncertainty:
 
     @cached_property
     def _widths(self) -> Callable[[float], tuple[float, float, float]]:
-        """By length of the axis: largest displacement of tip (mm), other end (mm) and direction (rad) per deviation."""
+        """Largest displacement of tip (mm), other end (mm) and direction (rad) per deviation, by length of the axis."""
         shift, lean = self.root[:3], self.root[3:]
         tip, turn = float(np.linalg.norm(shift, 2)), float(np.linalg.norm(lean, 2))
 

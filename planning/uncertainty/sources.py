@@ -28,7 +28,7 @@ NAMED = 3
 
 
 def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
-    """What the chances of a case leave out, in words: undeclared errors, and those counted elsewhere.
+    """Sentences on what the chances of a case leave out: undeclared errors, and those counted elsewhere.
 
     Args:
         case: The case.

@@ -86,7 +86,7 @@ SIDES = (("left", 1.0), ("right", -1.0))
 
 
 def arms(outline: Outline, kind: Arms, at_mm: float, rng: np.random.Generator) -> Iterator[Part]:
-    """Both arms of a patient: flesh with skin, and bones.
+    """Solids of a patient's both arms: flesh with skin, and bones.
 
     Args:
         outline: Of the trunk.

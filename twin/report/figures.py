@@ -41,7 +41,7 @@ def halo(width: float, colour: str = "white") -> list[Any]:
 
 
 def pixels(figure: Figure) -> NDArray[np.uint8]:
-    """What a figure shows, shape (h, w, 4), RGB and opacity."""
+    """A figure's pixels, shape (h, w, 4), RGB and opacity."""
     buffer, (width, height) = FigureCanvasAgg(figure).print_to_buffer()  # type: ignore[no-untyped-call]  # no types
     return np.frombuffer(bytes(buffer), dtype=np.uint8).reshape(height, width, 4)
 

@@ -270,7 +270,7 @@ def _find_cell(betas, starts, heights, half_theta, half_beta, theta, beta):  # t
 
 @nb.njit(cache=True)
 def _first_not_below(values, begin, end, value):  # type: ignore[no-untyped-def]  # numba infers
-    """Where in ``values[begin:end]``, which ascend, the first stands that is not below a value; ``end`` if none is."""
+    """Index of the first of ascending ``values[begin:end]`` that is not below a value; ``end`` if none is."""
     while begin < end:
         middle = (begin + end) // 2
         if values[middle] < value:

@@ -145,7 +145,7 @@ NEARLY = 0.985
 
 
 def direction_text(direction_ct: Floats, space: str) -> str:
-    """What a person calls a direction, such as "the patient's left"; "" where no name fits.
+    """Name of a direction for a person, such as "the patient's left"; "" where none fits.
 
     Args:
         direction_ct: Shape (3,), unit.

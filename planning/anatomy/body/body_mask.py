@@ -126,7 +126,7 @@ class CtImage:
 
     @property
     def content(self) -> Content:
-        """Where what is as dense as a body ends."""
+        """Box of what is as dense as a body."""
         return content_of(self.hu > BODY_HU, self.T_ct_index)
 
     def within(self, box: Box, shown: Shown = PATIENT) -> CtImage:
@@ -300,7 +300,7 @@ def _coarse_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
 
 
 def _eroded(mask: Bools, spacing_mm: Floats) -> Bools:
-    """Where the ball fits."""
+    """Voxels on which a ball may be centred that lies inside the mask: its erosion."""
     fits, size = mask.copy(), mask.shape
     reach = np.floor(OPENING_MM / spacing_mm).astype(int)
     for by in itertools.product(*(range(-r, r + 1) for r in reach)):
@@ -312,7 +312,7 @@ def _eroded(mask: Bools, spacing_mm: Floats) -> Bools:
 
 
 def detached_limbs(hu: NDArray[np.float32], parts: Iterable[Piece], spacing_mm: Floats) -> tuple[Piece, ...]:
-    """Those of some parts beside the trunk that are of the patient.
+    """Those of some parts beside the trunk that belong to the patient.
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the bed.

@@ -91,16 +91,16 @@ class LimbSearch:
 
     @property
     def block_ml(self) -> float:
-        """Of one block."""
+        """Volume of one block of voxels, ml."""
         return float(np.prod(self.spacing_mm)) / 1000.0
 
     def volume_ml(self, mask: Bools) -> float:
-        """Of a mask."""
+        """Volume of a mask, ml."""
         return float(np.count_nonzero(mask)) * self.block_ml
 
     @cached_property
     def depth_mm(self) -> Floats:
-        """From the air, shape of ``body``; beyond the border the body goes on."""
+        """Distance of each voxel from the air, mm, shape of ``body``; beyond the image's border the body goes on."""
         padded = np.pad(self.solid, 1, mode="edge")
         return np.asarray(scipy.ndimage.distance_transform_edt(padded, sampling=self.spacing_mm)[1:-1, 1:-1, 1:-1])
 
@@ -145,7 +145,7 @@ class LimbSearch:
                 yield self._along(groups == number)
 
     def _along(self, bones: Bools) -> Bools:
-        """With what continues them in a line, where the limb lies deeper."""
+        """A mask of bones with the voxels that continue them in a line, where the limb lies deeper."""
         labels, _ = scipy.ndimage.label(self.bone, FULL)
         index = np.argwhere(np.isin(labels, np.unique(labels[bones])))
         middle, axis = _axis(np.argwhere(bones) * self.spacing_mm)
@@ -201,7 +201,7 @@ class LimbSearch:
         return max(depths) <= DEEPEST_MM and float(np.mean(lateral)) >= LATERAL_FRACTION
 
     def _about(self, bones: Bools) -> Bools:
-        """What may belong to the limb about some bones, also some way beyond their ends; nothing about the target."""
+        """Voxels that may belong to the limb around some bones, and some way beyond their ends; not near the target."""
         gap, nearest = scipy.ndimage.distance_transform_edt(~bones, sampling=self.spacing_mm, return_indices=True)
         radius = self.depth_mm[tuple(nearest)]
         if gap[self.at] < radius[self.at]:

@@ -166,7 +166,7 @@ def _box(low: Floats, high: Floats, image: OutsideImage) -> TriangleMesh:
 
 
 def beyond_table(image: OutsideImage, side: TableSide) -> TriangleMesh:
-    """What lies beyond a section that is drawn along the bed: a table's far side, and on along the bed.
+    """Voxels beyond a section drawn along the bed: the table's far side, and its continuation along the bed.
 
     Where its edges count as table, what is beyond it goes on to both sides, from ``edge_mm`` before the section: what
     comes out of an edge is not free.
@@ -314,7 +314,7 @@ def _hulls_beyond(mask: Bools, image: OutsideImage) -> list[TriangleMesh]:
 
 
 def prism(T_ct_index: Floats, outline: Floats, axis: int, between: tuple[float, float]) -> TriangleMesh:
-    """What stands over a convex polygon, shape (n, 2), between two planes across an axis; in voxels or mm."""
+    """Solid over a convex polygon, shape (n, 2), between two planes across an axis; in voxels or mm."""
     n = len(outline)
     index = np.concatenate([np.insert(outline, axis, at, axis=1) for at in between])
     i, j = np.arange(n), np.roll(np.arange(n), -1)

@@ -1,4 +1,4 @@
-"""What a body lies on: tables, cradles and pads, touching it or not, and what of them the image does not show.
+"""Tables, cradles and pads that a body lies on, touching it or not, and the parts of them that the image does not show.
 
 A scanner's table has the same section in every slice; a patient has not. Seen from its far side it is one line, drawn
 along the bed, which may run at an angle to the slices' axis (a tilted gantry). Nothing comes from beyond that line.
@@ -84,7 +84,7 @@ FACES: tuple[Side, ...] = tuple(itertools.product((0, 1), (0, -1)))
 
 @dataclass(frozen=True)
 class Shown:
-    """What a person says of an image: then no rule guesses it.
+    """Statements of a person about what an image shows: then no rule guesses it.
 
     Attributes:
         phantom: It shows a phantom: no limb, and what holds together is the phantom.
@@ -153,7 +153,7 @@ class TableSide(NamedTuple):
 
 
 class Touching(NamedTuple):
-    """What touches the body.
+    """The objects that touch the body.
 
     Attributes:
         cut_off: Shape of the body, what of it is a table whose thickness is seen beside the body.
@@ -335,7 +335,7 @@ class _Ends(NamedTuple):
 
     @property
     def length_mm(self) -> float:
-        """Of the image, along the bed."""
+        """Length of the image along the bed, mm."""
         return float(self.ends_mm.shape[1] * self.spacing_mm[2])
 
     def sampled(self) -> _Ends:
@@ -402,7 +402,7 @@ def support_side(outside: Bools, body: Bools, spacing_mm: Floats) -> TableSide |
 def _views(
     surfaces: dict[Side, Floats], body: Bools, spacing_mm: Floats, own: dict[Side, Bools] | None = None
 ) -> list[_Ends]:
-    """What is seen of surfaces from each side; where ``own`` says which ends count, they are known to a voxel."""
+    """Surfaces as seen from each side; where ``own`` says which ends count, they are known to a voxel."""
     views, middle_mm = [], middle_of(body) * spacing_mm
     for (axis, end), ends in surfaces.items():
         ends_mm = _smooth(ends * spacing_mm[axis], float(spacing_mm[2]))
@@ -462,7 +462,7 @@ def _bed_at(view: _Ends, slopes: tuple[float, float]) -> _Bed:
 
 
 def _medians(ends_mm: Floats) -> Floats:
-    """Of every line of sight the median over the slices in which it ends anywhere; NaN without any."""
+    """Median of each line of sight's end over the slices in which it ends anywhere; NaN where it never does."""
     ends_mm, rows = np.sort(ends_mm, axis=1), np.arange(len(ends_mm))  # NaN comes last
     count = np.isfinite(ends_mm).sum(axis=1)
     return np.asarray((ends_mm[rows, (count - 1) // 2] + ends_mm[rows, count // 2 - (count == 0)]) / 2.0)
@@ -531,7 +531,7 @@ class Support(NamedTuple):
 def find_support(
     outside: Bools, body: Bools, spacing_mm: Floats, touching: Sequence[TableSide] = (), shown: Shown = PATIENT
 ) -> Support:
-    """What the body lies on, and the faces of the image beyond which nothing is known.
+    """Find what the body lies on, and the faces of the image beyond which nothing is known.
 
     Args:
         outside: Shape (nx, ny, nz), what was scanned, lies outside of the body and is not air; axis 2 along the bed.
@@ -580,7 +580,7 @@ def _cuts(outside: Bools, face: Side) -> bool:
 
 
 def _gap_mm(body: Bools, face: Side, spacing_mm: Floats) -> float:
-    """From the body to a face of the image; 0 where the face cuts it."""
+    """Distance from the body to a face of the image, mm; 0 where the face cuts it."""
     axis, end = face
     occupied = np.flatnonzero(body.any(axis=(1 - axis, 2)))
     voxels = occupied[0] if end == 0 else body.shape[axis] - 1 - occupied[-1]

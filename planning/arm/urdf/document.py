@@ -279,7 +279,7 @@ def _only(element: Element, tag: str, here: str) -> Element:
 
 
 def _numbers(element: Element, key: str, count: int, here: str) -> Floats:
-    """So many finite numbers of an attribute, shape (count,)."""
+    """The finite numbers of an attribute, shape (count,); refused where there are more or fewer."""
     text = element.get(key, "")
     values = _parsed(text.split(), _number)
     if values is None or len(values) != count or not all(map(math.isfinite, values)):

@@ -56,7 +56,7 @@ class Memory:
 
     @property
     def held_bytes(self) -> int:
-        """What the values hold now."""
+        """Bytes that the values hold now."""
         return self._held
 
     def get(self, key: tuple[Hashable, ...], make: Callable[[], Value], size: Callable[[Value], int]) -> Value:
@@ -76,7 +76,7 @@ class Memory:
 
     @property
     def most_bytes(self) -> int:
-        """What the values may hold."""
+        """Bytes that the values may hold."""
         return self._most
 
     def limit(self, most_bytes: int) -> None:
@@ -166,7 +166,7 @@ class Cache:
     def value(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
     ) -> Value:
-        """What ``read`` makes of `arrays`. To read them is their check too: a mesh is guarded once.
+        """The value that ``read`` makes of `arrays`; reading is their check too, so a mesh is guarded once.
 
         Args:
             made_from: See `arrays`.
@@ -248,7 +248,7 @@ def _entry(made_from: Mapping[str, Any], by: str) -> StoredFile:
 
 @cache
 def _generation(by: str) -> str:
-    """Of all code that a module's results depend on, as a hash; reading it takes milliseconds, so once a process."""
+    """Hash of all code that a module's results depend on; it takes milliseconds, so it is made once a process."""
     parts = {
         "source": source_stamp(by),
         "python": platform.python_version(),
@@ -258,7 +258,7 @@ def _generation(by: str) -> str:
 
 
 def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value] | None:
-    """What an entry holds, or None where it is not there or, which is said, not whole.
+    """The arrays of an entry; None where there is no entry, or, with a note, a damaged one.
 
     Raises:
         InputError: Another user owns it, or may write it.

@@ -30,7 +30,7 @@ ALIGNED = 64
 
 
 class DamagedError(Exception):
-    """An entry that is not what was written under its name."""
+    """Raised for an entry whose content is not what was written under its name."""
 
 
 def packed(arrays: Arrays, key: str) -> bytes:

@@ -1,4 +1,4 @@
-"""What an output folder holds, written down beside it: ``manifest.json``, an entry a command, and who may read by it.
+"""``manifest.json``: what an output folder holds, an entry for each command, and the checks of whoever reads it.
 
 A file belongs to the folder's set only if the manifest lists it with the hash of its bytes.
 """
@@ -89,7 +89,7 @@ class Manifest:
         return next((key for key, entry in self.entries.items() if name in entry.files), None)
 
     def text(self) -> str:
-        """As it is written: the same entries give the same bytes."""
+        """The manifest as it is written: the same entries give the same bytes."""
         document = {
             "format": FORMAT,
             "layout": LAYOUT,
@@ -121,7 +121,7 @@ class Output(NamedTuple):
     """A warning where the file lies outside of any set, else empty."""
 
     def input(self, role: str) -> Input:
-        """As an input of what is made from it."""
+        """This file as an input, for the provenance of what is made from it."""
         return Input(role, self.path.name, self.sha256)
 
 
@@ -155,7 +155,7 @@ def read_output(path: Path, *, max_bytes: int) -> Output:
 
 
 def problems(folder: Path) -> tuple[str, ...]:
-    """What keeps a folder from being one whole set, a sentence each; empty if nothing does.
+    """Sentences on what keeps a folder from being one whole set; empty if nothing does.
 
     Raises:
         InputError: The manifest cannot be read, or is another program's.

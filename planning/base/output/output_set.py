@@ -88,7 +88,7 @@ def _silent(_: str) -> None:
 
 @contextmanager
 def _explained(out: Path) -> Iterator[None]:
-    """A disk that takes no more is bad input, not a failure of the program."""
+    """Context in which a full disk is reported as bad input, not as a failure of the program."""
     try:
         yield
     except OSError as error:

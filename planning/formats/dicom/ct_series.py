@@ -88,7 +88,7 @@ class CtSeries:
 
     @property
     def stack(self) -> Stack:
-        """Its slices as they were scanned."""
+        """The slices as they were scanned."""
         return self._series.stack
 
     @property

@@ -92,7 +92,7 @@ def parse_mesh(
     up: Up | None = None,
     stretch: NDArray[np.float64] | None = None,
 ) -> TriangleMesh:
-    """As `read_mesh`, of a file that has been read; it is not opened again.
+    """Parse a mesh file that has been read, like `read_mesh`; it is not opened again.
 
     Args:
         data: The whole file.

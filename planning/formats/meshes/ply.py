@@ -163,7 +163,7 @@ class _Cursor:
         return even if even is not None else self._take_row_by_row(element)
 
     def check_end(self) -> None:
-        """Nothing but white space may follow."""
+        """Refuse anything but white space behind the last element."""
         rest = self.body[self.position :].strip()
         if rest:
             refuse(f"{len(rest)} bytes after the stated data", self.where, _ALLOWED)
@@ -193,7 +193,7 @@ class _Cursor:
         return length, start
 
     def _take_even(self, element: _Element, lengths: list[int]) -> dict[str, NDArray[Any] | _Lists] | None:
-        """All rows at once, if each has lists as long as the first row's; None otherwise."""
+        """Read all rows at once, if each has lists as long as the first row's; None otherwise."""
         fields: list[tuple[str, Any]] = []
         for number, (prop, length) in enumerate(zip(element.properties, lengths, strict=True)):
             if prop.count_dtype is None:

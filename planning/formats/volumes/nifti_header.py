@@ -101,7 +101,7 @@ def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
 
 
 def _scaling(fields: _Fields, path: Path) -> tuple[float, float]:
-    """What stored values are multiplied with, and what is added: 1 and 0 where the header says nothing."""
+    """Slope and intercept of stored values; 1 and 0 where the header states none."""
     slope, intercept = fields.scaling
     if not np.isfinite(fields.scaling).all():
         raise InputError("scl_slope or scl_inter is not finite", where=path, allowed="finite numbers")

@@ -180,7 +180,7 @@ UNNAMED_SPACE = "its header names no patient space; read as LPS, as ITK and Slic
 
 
 def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
-    """What the header of a volume in three dimensions says.
+    """Parse the header of a volume in three dimensions.
 
     Args:
         content: The file that holds the header.

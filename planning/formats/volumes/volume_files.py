@@ -108,7 +108,7 @@ def read_volume(path: Path) -> Volume:
 
 
 def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volume:
-    """The same of a file that has been read; it is not opened again.
+    """Parse a volume file that has been read; it is not opened again.
 
     Args:
         content: The file that was named.
@@ -249,7 +249,7 @@ def in_order(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
 
 
 def canonical(values: NDArray[Any], T_ct_index: NDArray[np.float64]) -> Oriented:
-    """The same voxels with their axes permuted and flipped so that they run along +L, +P, +S as nearly as can be.
+    """The voxels with their axes permuted and flipped so that they run along +L, +P, +S as nearly as can be.
 
     What an algorithm makes of a volume may depend on the array's order (ambiguous cells of marching cubes do);
     after this step it cannot depend on how the file stored it.

@@ -1,4 +1,4 @@
-"""What the header of a volume promises: its shape, its cells' type and size, and where its voxels lie."""
+"""The checked header of a volume: its shape, its cells' type and size, and where its voxels lie."""
 
 from __future__ import annotations
 

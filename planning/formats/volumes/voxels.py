@@ -23,7 +23,7 @@ PART_BYTES = 1 << 20
 
 
 def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.uint8]:
-    """All bytes of gzip data, which may have several members one after the other, padded with zeros.
+    """Inflate gzip data, which may have several members one after the other, padded with zeros.
 
     Stops one byte after the promised length, so what a bomb would inflate to is never made.
 

@@ -55,7 +55,7 @@ ALLOWED = "a transform between this CT and this robot's base, with transform_map
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What the file would say under some keys.
+    """The transform that the file would state under some of its keys.
 
     Attributes:
         keys: Those that differ from the case's; empty as stated.
@@ -158,7 +158,7 @@ def _named(readings: Sequence[Reading]) -> str:
 
 
 def _unmeasured(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
-    """Without markers: that nothing measures it, and what it cannot be told from, in one line; then what is doubted."""
+    """Warning of a transform without markers, which nothing measures; then the reasons to doubt it."""
     alike = "".join(f"; {one.removeprefix('registration: ')}" for one in _alike(case, given, others))
     yield f"registration: {NO_RESIDUALS.format(file=case.robot.transform)}{MARKERS_TELL}{alike}"
     yield from _doubts(case, given, others)
@@ -215,7 +215,7 @@ def _held_against_markers(case: Case, registration: Registration, given: Reading
 
 @dataclass(frozen=True)
 class Apart:
-    """Where markers and a transform differ most, measured by what is expected of the markers there.
+    """Where markers and a stated transform differ most, over the error expected of the markers there.
 
     Attributes:
         where: The target or a marker.
@@ -258,7 +258,7 @@ class CheckedPlacement(NamedTuple):
 
 
 def checked_placement(case: Case, cache: Cache) -> CheckedPlacement | None:
-    """Where the patient lies for the robot, with its markers checked; None where the case does not say it.
+    """The patient's pose for the robot, its markers checked; None where the case does not say it.
 
     Raises:
         InputError: As `load_placement` and `placement_findings`, or a skin or CT that cannot be read.

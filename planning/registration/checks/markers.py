@@ -108,7 +108,7 @@ Signs = tuple[float, float, float]
 
 
 class Surroundings(NamedTuple):
-    """What markers are held against, CT frame."""
+    """Surfaces that markers are compared with, CT frame."""
 
     skin: Skin
     couch: TriangleMesh | None

@@ -1,4 +1,4 @@
-"""Where a registration puts robot and patient: could they lie so, and could the needle's tip have touched a marker?
+"""Plausibility of a registration's poses: could robot and patient be there, and could the tip have touched a marker?
 
 Physics tells it: nothing stands in a patient, and a patient lies in no box of the robot's frame, but on one. It is
 asked however a placement is stated, and of what slipped names or axes would make of it.
@@ -266,7 +266,7 @@ OF_MARKERS = (
 
 
 class BasePlace(NamedTuple):
-    """What speaks against a place of the base."""
+    """Arguments for and against a position of the base."""
 
     impossible: str
     """Why nothing can be so, or empty."""
@@ -277,7 +277,7 @@ class BasePlace(NamedTuple):
 
 
 def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> BasePlace:
-    """What speaks against a place of the base.
+    """Check a position of the base for plausibility.
 
     Args:
         case: For arm, needle, target and obstacles.

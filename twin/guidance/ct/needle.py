@@ -63,7 +63,7 @@ class _Line(NamedTuple):
 
 
 class FoundNeedle(NamedTuple):
-    """A needle that was found, LPS mm.
+    """A needle in a CT, LPS mm.
 
     Attributes:
         tip_ct: Shape (3,).
@@ -219,7 +219,7 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
 
 
 class _Rod(NamedTuple):
-    """A rod that ends in the origin, blurred by a Gaussian.
+    """Model of a rod that ends in the origin, blurred by a Gaussian.
 
     Attributes:
         forward: Shape (3,), unit, to its end.

@@ -74,7 +74,7 @@ class Acquisition:
 
 
 class _Motion:
-    """Both true arms, with the play of their last arrivals; and whether they touch."""
+    """The true motion of both arms, with the play of their last arrivals, and whether they touch."""
 
     def __init__(self, case: SelfcalCase, truth: WorkcellTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng

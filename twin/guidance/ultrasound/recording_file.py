@@ -49,7 +49,7 @@ def read_recording(path: Path) -> Recording:
 
 
 def parse_recording(content: bytes, file: Path) -> Recording:
-    """As `read_recording`, of a file that has been read; it is not opened again.
+    """Parse a recording that has been read, like `read_recording`; it is not opened again.
 
     Raises:
         InputError: As `read_recording`, but for reading.

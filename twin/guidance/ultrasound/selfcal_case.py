@@ -1,4 +1,4 @@
-"""What a self-calibration case may hold: the TOML schema, version 1, key by key. See docs/reference/selfcal-case.md."""
+"""TOML schema of a self-calibration case, version 1, key by key. See docs/reference/selfcal-case.md."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ class ImageSection(Section):
 
 
 class PosesSection(Section):
-    """From which poses are chosen, and how."""
+    """Bounds of the poses that are chosen, and how they are chosen."""
 
     samples: Annotated[int, Strict(), Field(ge=20, le=100_000)] = 600
     count: Annotated[int, Strict(), Field(ge=16, le=2000)] = 30

@@ -52,7 +52,7 @@ FRONT: Mapping[str, Any] = MappingProxyType({"marker": "o", "ms": 3.0, "mew": 0.
 
 
 class Label(NamedTuple):
-    """What is written on the map, and where, in the disc's radii (x right, y up)."""
+    """Text on the map, and its position, in the disc's radii (x right, y up)."""
 
     x: float
     y: float
@@ -232,7 +232,7 @@ NAMES_COARSE = 4
 
 
 def region_codes(verdict: Verdict, rows: Ints) -> tuple[NDArray[np.int64], list[str]]:
-    """What is written over each pixel, as its place in a list of names, of which the first is empty.
+    """Index, for each pixel, of the name that is written over it, in a list whose first name is empty.
 
     Args:
         verdict: Of every direction.
@@ -264,7 +264,7 @@ def region_labels(codes: NDArray[np.int64], names: Sequence[str], written: Seque
 
 
 def _region_names(verdict: Verdict) -> Texts:
-    """What is written over each direction, shape (n,): the structure that forbids it, or "unknown" and why."""
+    """Name written over each direction, shape (n,): the structure that forbids it, or "unknown" and why."""
     unknown = verdict.reason == Reason.UNKNOWN_REGION.value
     named = np.where(verdict.reason == Reason.TOO_CLOSE.value, verdict.structure, "").astype(object)
     whys = np.where(verdict.not_seen, NOT_SEEN_HERE, verdict.structure)

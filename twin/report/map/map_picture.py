@@ -221,7 +221,7 @@ def _even_shade(scale: ClearanceScale) -> Rgb:
 
 
 def _even_text(scale: ClearanceScale) -> str:
-    """What one shade stands for."""
+    """Text for what one shade means."""
     if not np.isfinite(scale.low):
         return "no structure has a margin"
     return f"least clearance {number(scale.low, SCALE_DIGITS, 'mm')} everywhere"

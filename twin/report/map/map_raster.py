@@ -182,7 +182,7 @@ class ShownFront(NamedTuple):
 
     @property
     def text(self) -> str:
-        """For a legend."""
+        """Text for a legend."""
         return "Pareto front" if len(self.rows) == self.of else f"Pareto front ({len(self.rows)} of {self.of:,})"
 
 

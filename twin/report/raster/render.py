@@ -310,7 +310,7 @@ def _bands(camera: ViewCamera) -> list[slice]:
 
 
 def _in_bands(camera: ViewCamera, work: Callable[[int, slice], T]) -> list[T]:
-    """What a function makes of the number and the rows of every band; the processors share them."""
+    """Call a function with number and rows of every band, on several processors, and collect its results."""
     bands = _bands(camera)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(work, range(len(bands)), bands))
@@ -347,7 +347,7 @@ class MovingPicture:
 
     @property
     def changed_pixels(self) -> PixelBox:
-        """Where the last picture may differ from `still`."""
+        """Pixels in which the last image may differ from `still`."""
         left, top, right, bottom = self.changed
         return PixelBox(left // SAMPLES, top // SAMPLES, -(-right // SAMPLES), -(-bottom // SAMPLES))
 

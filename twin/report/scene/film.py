@@ -128,7 +128,7 @@ def _with_still(frames: Iterable[Frame], count: int) -> Iterator[Frame]:
 
 
 class _Scene(NamedTuple):
-    """What a film is drawn from: a frame without what moves (HEIGHT, WIDTH, 3), and what is drawn over it."""
+    """Ingredients of a film's frames: the image of what does not move (HEIGHT, WIDTH, 3), and what is drawn over it."""
 
     ground: Pixels
     views: _Views
@@ -244,7 +244,7 @@ def _planned_path(plan: Any) -> SceneBody:
 
 
 def _tool_layer(case: Any) -> Layer:
-    """All that the flange carries, in its frame: the needle points along +z."""
+    """All that the flange carries, flange frame: the needle points along +z."""
     tip = np.array([0.0, 0.0, case.needle.length_mm])
     bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0])).all
     own = [] if case.tool is None else [Surface(case.tool.mesh, palette.HOLDER)]

@@ -51,7 +51,7 @@ class Planes(NamedTuple):
 
 
 def planes_of(pixels: Pixels) -> Planes:
-    """What an encoder takes of RGB, its sizes even (ITU-R BT.601, 16..235 and 16..240)."""
+    """Colour planes for an encoder, from RGB of even size (ITU-R BT.601, 16..235 and 16..240)."""
     r, g, b = (pixels[..., k].astype(np.uint16) for k in range(3))
     light = (66 * r + 129 * g + 25 * b + np.uint16(128 + 16 * 256)) >> 8
     four_r, four_g, four_b = (_fours(one).astype(np.int32) for one in (r, g, b))
@@ -148,7 +148,7 @@ def _boxes(film: bytes, begin: int, end: int) -> Iterator[tuple[bytes, int, int]
 
 
 def write_gif(ground: Pixels, frames: Iterable[Frame], path: Path, fps: int) -> None:
-    """The same as `write_mp4`, as a GIF."""
+    """Write a film as a GIF; arguments as of `write_mp4`."""
     images = [Image.fromarray(put_on(ground, frame)).quantize(128) for frame in frames]
     with atomic(path) as temporary:
         images[0].save(temporary, format="GIF", save_all=True, append_images=images[1:], loop=0, duration=1000 // fps)

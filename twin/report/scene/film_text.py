@@ -1,4 +1,4 @@
-"""What is written into a frame of the film: time, phase, distances, contacts."""
+"""Text in a frame of the film: time, phase, distances, contacts."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class FrameText:
 
 
 class FrameWords:
-    """What is written into frames whose overview is upper left, with the close-up beside it and numbers below.
+    """Text of frames whose overview is upper left, with the close-up beside it and numbers below.
 
     Args:
         source: Where the words come from.

@@ -29,7 +29,7 @@ GAP, TOP, CAPTION = 16, 92, 30
 
 @dataclass(frozen=True, eq=False)
 class Slices:
-    """What was drawn of one direction.
+    """The drawn slices of one direction.
 
     Attributes:
         subject: The direction.
@@ -43,7 +43,7 @@ class Slices:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the lines mean, and what is missing."""
+        """Sentences on what the lines mean, and on what is missing."""
         subject = self.subject
         ct = NO_CT if subject.anatomy.scan is None else "The CT's nearest voxels, not smoothed."
         beads = " Beads: the edge of what is unknown." if subject.has_unknown else ""

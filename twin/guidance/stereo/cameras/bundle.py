@@ -225,7 +225,7 @@ class _Problem:
 
 
 def _project(camera: Camera, points_c: Floats) -> Floats:
-    """As ``Camera.project``, but smooth everywhere: a step of the search may pass behind a camera."""
+    """Project like ``Camera.project``, but smoothly everywhere: a step of the search may pass behind a camera."""
     points = apply(camera.T_camera_c, points_c)
     flat = points[:, :2] / points[:, 2:]
     return np.asarray(distort(flat, camera.distortion) * [camera.fx, camera.fy] + [camera.cx, camera.cy])

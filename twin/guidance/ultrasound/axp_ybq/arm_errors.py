@@ -88,7 +88,7 @@ class DeclaredArm(NamedTuple):
 
 
 class DeclaredArms(NamedTuple):
-    """Both declared arms."""
+    """Declared errors of both arms."""
 
     probe: DeclaredArm
     needle: DeclaredArm

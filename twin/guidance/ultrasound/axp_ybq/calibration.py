@@ -131,7 +131,7 @@ class Calibration:
         return self.covariance if self.small_sample is None else self.small_sample.covariance
 
     def corrected(self, poses: Recording) -> tuple[Floats, Floats]:
-        """Both flanges moved by the estimated errors of the arms: A and B, each (n, 4, 4), mm.
+        """Poses A and B of both flanges, corrected by the estimated errors of the arms, each (n, 4, 4), mm.
 
         Args:
             poses: Nominal flanges, with joints where arms are declared.

@@ -195,7 +195,7 @@ class NeedleInImage(NamedTuple):
 
 
 class Lesion(NamedTuple):
-    """A ball that scatters less than what is around it."""
+    """A ball that scatters less than its surroundings."""
 
     centre_image: Floats
     """Shape (3,), mm."""
