@@ -1,4 +1,4 @@
-"""The CT of a case as a witness: what it shows outside of the body, and what inside that no structure names.
+"""A cross-check by the CT of a case: what it shows outside of the body, and what inside that no structure names.
 
 What the voxels hold in which points lie.
 """
@@ -27,9 +27,9 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     outside_surface,
 )
 from puncture_twin.planning.anatomy.body.tables import FACES, TableSide, find_support
-from puncture_twin.planning.anatomy.second_witness import Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.anatomy.skin import Skin, field_of_view
-from puncture_twin.planning.anatomy.surfaces import Imaged, kept_mesh, mesh_arrays
+from puncture_twin.planning.anatomy.surfaces import Imaged, cached_mesh, mesh_arrays
+from puncture_twin.planning.anatomy.unnamed import Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.numba_kernels import nb
@@ -239,7 +239,7 @@ def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:
 
 
 def _to_meshes(stored: Arrays) -> list[TriangleMesh | None]:
-    return [kept_mesh(stored, n) if f"faces{n}" in stored else None for n in range(int(stored["count"]))]
+    return [cached_mesh(stored, n) if f"faces{n}" in stored else None for n in range(int(stored["count"]))]
 
 
 def nearest(values: NDArray[np.float32], T_index_ct: Floats, points_ct: Floats) -> Floats:

@@ -77,7 +77,7 @@ def skin_of_image(image: CtImage) -> Skin:
     Raises:
         InputError: If no body is found, or no air around it.
     """
-    box = box_in(image.found.body, beside=1)  # beyond it the field is negative
+    box = box_in(image.found.body, margin=1)  # beyond it the field is negative
     body, above = image.found.body[box], np.subtract(image.hu[box], BODY_HU, dtype=np.float32)
     unlike = ((above > 0) != body) | (above == 0)  # what counts as body, or as air, whatever its value
     field = np.abs(above, out=above)

@@ -11,7 +11,7 @@ from puncture_twin.planning.anatomy.body.tables import Shown
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin, flat_ends
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.anatomy.surfaces import Imaged, VolumeSurfaces, kept_skin
+from puncture_twin.planning.anatomy.surfaces import Imaged, VolumeSurfaces, cached_skin
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Names
@@ -143,7 +143,7 @@ class StructureSources:
                 allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
             )
         cut = section.cut or ()
-        return kept_skin(mesh, cut, self._cache)
+        return cached_skin(mesh, cut, self._cache)
 
     def _seen(
         self, name: str, label: int | None, structures: Sequence[Structure], stated: Sequence[str] | None

@@ -123,7 +123,7 @@ class VolumeSurfaces:
     def label(self, label: int) -> TriangleMesh:
         """The surface of one label, LPS mm."""
         return self._kept(
-            f"label {label}", lambda: mesh_arrays(label_mesh(self.labelmap, label, where=self.path)), kept_mesh
+            f"label {label}", lambda: mesh_arrays(label_mesh(self.labelmap, label, where=self.path)), cached_mesh
         )
 
     @cached_property
@@ -231,7 +231,7 @@ class Imaged:
         return self.surfaces.kept({"box": self.box, "shown": asdict(self.shown), **made_from}, make, read, by=by)
 
 
-def kept_skin(mesh: TriangleMesh, cut: Sequence[str], cache: Cache) -> Skin:
+def cached_skin(mesh: TriangleMesh, cut: Sequence[str], cache: Cache) -> Skin:
     """`skin_from_mesh` of a mesh and the sides at which the body was cut, from the cache."""
     made_from = {"what": "skin of a mesh", "mesh": mesh.digest, "cut": list(cut)}
     return cache.value(made_from, lambda: _of_skin(skin_from_mesh(mesh, cut)), _to_skin, by=__name__)
@@ -243,7 +243,7 @@ def _readers() -> str:
 
 
 def mesh_arrays(mesh: TriangleMesh, number: int | str = "") -> Arrays:
-    """A surface for the cache, and what takes longest to find of it; see `kept_mesh`."""
+    """A surface for the cache, and what takes longest to find of it; see `cached_mesh`."""
     facts = np.array([mesh.closed, mesh.wound_alike])
     return {f"vertices{number}": mesh.vertices, f"faces{number}": mesh.faces, f"facts{number}": facts}
 
@@ -257,13 +257,13 @@ def _of_skin(skin: Skin) -> Arrays:
 
 def _to_skin(stored: Arrays) -> Skin:
     view = FieldOfView(stored["T_ct_box"], stored["size_mm"], stored["cut"]) if "T_ct_box" in stored else None
-    mesh, cut_faces = kept_mesh(stored), stored["cut_faces"]
+    mesh, cut_faces = cached_mesh(stored), stored["cut_faces"]
     if cut_faces.shape != (len(mesh.faces),):
         raise ValueError("one flag for each triangle")
     return Skin(mesh, cut_faces, view, tuple(str(warning) for warning in stored["warnings"]))
 
 
-def kept_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
+def cached_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
     """A surface, which went through the guard before it was stored, and does again: kept files may be anything.
 
     Args:

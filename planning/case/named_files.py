@@ -269,11 +269,6 @@ LINE_FILES = (".csv", ".fcsv")
 def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tuple[str, ...]:
     """Sentences on files of which it is not known whether they are whole.
 
-    Args:
-        content: The case file.
-        files: All that it names, read.
-        path: The case file, for the error.
-
     Raises:
         InputError: A list whose last line does not end.
     """

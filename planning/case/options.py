@@ -74,7 +74,7 @@ class CaseOptions:
             elif kind == MARGINS:
                 _set_margins(changed, values, where)
             else:
-                _lay_over(_table(changed, TABLES[kind]), values)
+                _overlay(_table(changed, TABLES[kind]), values)
         return changed
 
 
@@ -112,7 +112,7 @@ def _table(data: dict[str, Any], name: str) -> dict[str, Any]:
     return table if isinstance(table, dict) else {}
 
 
-def _lay_over(table: dict[str, Any], values: Mapping[str, Any]) -> None:
+def _overlay(table: dict[str, Any], values: Mapping[str, Any]) -> None:
     for one, other in ALTERNATIVES:
         if one in values:
             table.pop(other, None)

@@ -71,11 +71,6 @@ def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> 
 def arm_of(section: RobotSection, files: InputFiles, path: Path) -> UrModel:
     """The arm's model; each file that decides it becomes an input of the case.
 
-    Args:
-        section: As the case states it.
-        files: The case's files.
-        path: The case file, for errors.
-
     Raises:
         InputError: An unknown name, a URDF or a mesh that cannot be used, or limits that are wider than the arm's own.
     """

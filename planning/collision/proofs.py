@@ -155,16 +155,16 @@ class Proofs:
         """Result of a check at frames (7, 4, 4), see :mod:`puncture_twin.planning.collision.kernels.settled`."""
         return int(settled_kernels.settled_at(self.scene, self._work, self._on_triangle, check, frames))
 
-    def clear_about(self, frames: Floats, turns: Floats, tested: Bools) -> Around:
+    def clear_about(self, frames: Floats, rotations: Floats, tested: Bools) -> Around:
         """Prove checks clear all about some states.
 
         Args:
             frames: Shape (m, 7, 4, 4), mm: the states.
-            turns: Shape (6,), rad: how far each joint may turn either way from each of them.
+            rotations: Shape (6,), rad: how far each joint may rotate either way from each of them.
             tested: Shape (m, k): what is to be proven.
         """
         unproven, gaps = tested.copy(), np.full(tested.shape, np.inf)
-        proof_kernels.clear_about(self.scene, self.movers, frames, turns, self._work, gaps, unproven)
+        proof_kernels.clear_about(self.scene, self.movers, frames, rotations, self._work, gaps, unproven)
         return Around(gaps <= 0.0, unproven)
 
 
@@ -230,10 +230,10 @@ def _clear_all_over(model: UrModel, proofs: Proofs, touches: Touches, joint: int
     middles, half = np.zeros((1, 2)), np.pi
     unproven, touching = tested[None], np.zeros_like(tested)
     for _ in range(HALVINGS):
-        q, turns = np.zeros((len(middles), 6)), np.zeros(6)
-        q[:, joint : joint + 2], turns[joint : joint + 2] = middles, half  # other joints do not matter to the pair
+        q, rotations = np.zeros((len(middles), 6)), np.zeros(6)
+        q[:, joint : joint + 2], rotations[joint : joint + 2] = middles, half  # other joints do not matter to the pair
         frames = link_poses(model, q)
-        left = proofs.clear_about(frames, turns, unproven)
+        left = proofs.clear_about(frames, rotations, unproven)
         for square, check in np.argwhere(left.touching).tolist():
             touching[check] = touching[check] or touches(check, frames[square])  # FCL decides at the middle
         still = left.unproven & ~touching

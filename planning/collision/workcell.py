@@ -143,10 +143,6 @@ def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
 
     The checkers' boxes leave a bore up to 0.9 % narrower: a patient who fits the round one is not refused for that.
 
-    Args:
-        gantry: The wall.
-        skin: CT frame.
-
     Returns:
         mm, along the bore's radius.
     """
@@ -178,10 +174,6 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
 
     The skin alone is tested against it. What the CT shows outside of the skin is not: a bed goes through the bore, and
     beyond the image its surface goes on by assumption.
-
-    Args:
-        case: The case.
-        skin: CT frame.
 
     Raises:
         InputError: Its wall cuts the patient.

@@ -221,10 +221,6 @@ class _Row(NamedTuple):
 def read_csv_points(data: bytes, where: str) -> RawPoints:
     """The points of a CSV file, in the order of its lines; empty lines are passed over.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If the header or a line is not understood; the error names the line.
     """
@@ -308,10 +304,6 @@ def read_markups_points(data: bytes, where: str) -> RawPoints:
 
     Which end of a line is the target no file says: the case names it by its label.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If it is no such file, states no known space, or a point has no label or defined position.
     """
@@ -343,10 +335,6 @@ def _control_points(markup: dict[str, Any], where: str) -> list[Any]:
 
 def read_fcsv_points(data: bytes, where: str) -> RawPoints:
     """The points of an older Slicer fiducial list, which is in mm by its definition.
-
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
 
     Raises:
         InputError: If it states no known space or columns, or a line is not understood.

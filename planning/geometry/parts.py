@@ -107,8 +107,8 @@ def _find_ends(mask: Any, first_i: Any, last_i: Any, first_j: Any, last_j: Any) 
 
 
 @nb.njit(cache=True)
-def _runs_and_parts(mask: Any, beside: Any) -> Any:
-    """Runs (n, 4), and the part (n,) of each; ``beside`` is 1 where edges and corners count."""
+def _runs_and_parts(mask: Any, diagonal: Any) -> Any:
+    """Runs (n, 4), and the part (n,) of each; ``diagonal`` is 1 where edges and corners count."""
     nx, ny, nz = mask.shape
     count = 0
     for i in range(nx):
@@ -135,10 +135,10 @@ def _runs_and_parts(mask: Any, beside: Any) -> Any:
                 n += 1
             line = i * ny + j
             first[line + 1] = n
-            for y in range(max(0, j - beside), min(ny, j + beside + 1) if i > 0 else 0):
-                _join(runs, root, first, line - ny + y - j, line, beside)
+            for y in range(max(0, j - diagonal), min(ny, j + diagonal + 1) if i > 0 else 0):
+                _join(runs, root, first, line - ny + y - j, line, diagonal)
             if j > 0:
-                _join(runs, root, first, line - 1, line, beside)
+                _join(runs, root, first, line - 1, line, diagonal)
     parts = 0
     for r in range(count):
         if root[r] == r:
@@ -150,11 +150,11 @@ def _runs_and_parts(mask: Any, beside: Any) -> Any:
 
 
 @nb.njit(cache=True)
-def _join(runs: Any, root: Any, first: Any, line: Any, other: Any, beside: Any) -> None:
+def _join(runs: Any, root: Any, first: Any, line: Any, other: Any, diagonal: Any) -> None:
     """Make one part of the runs of two lines that overlap, or are so many voxels apart."""
     a, b = first[line], first[other]
     while a < first[line + 1] and b < first[other + 1]:
-        if runs[a, 2] < runs[b, 3] + beside and runs[b, 2] < runs[a, 3] + beside:
+        if runs[a, 2] < runs[b, 3] + diagonal and runs[b, 2] < runs[a, 3] + diagonal:
             p, q = _root(root, a), _root(root, b)
             root[max(p, q)] = min(p, q)
         if runs[a, 3] < runs[b, 3]:

@@ -20,8 +20,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import least_squares_map
 
-DOUBT = 0.001
-"""Residuals that honest noise exceeds once in 1,000 registrations contradict the declared noise."""
+REJECT_LEVEL = 0.001
+"""Significance level of rejection: honest noise exceeds such residuals once in 1,000 registrations."""
 
 MAX_FRE_MM = 5.0
 """Without a declared noise: markers that miss by more (rms) are not the same markers, or have moved."""
@@ -87,7 +87,7 @@ class ResidualTest:
         """The greatest FRE that passes."""
         if self.declared_fle_mm is None:
             return MAX_FRE_MM
-        return self.declared_fle_mm * float(np.sqrt(chdtri(self.freedom, DOUBT) / (3 * self.count)))
+        return self.declared_fle_mm * float(np.sqrt(chdtri(self.freedom, REJECT_LEVEL) / (3 * self.count)))
 
     @property
     def explained(self) -> bool:
@@ -139,8 +139,8 @@ class ResidualTest:
         scaled = "" if self.explained else f"; noise of {self.scale:.2f} times that would"
         return (
             f"fle_mm = {self.declared_fle_mm:g} {what} FRE {self.fre_mm:.2f} mm (chi-squared {self.chi_squared:.1f}, "
-            f"{100 * (1 - DOUBT):g} % stay below {chdtri(self.freedom, DOUBT):.1f} at {self.freedom} degrees of "
-            f"freedom){scaled}"
+            f"{100 * (1 - REJECT_LEVEL):g} % stay below {chdtri(self.freedom, REJECT_LEVEL):.1f} at "
+            f"{self.freedom} degrees of freedom){scaled}"
         )
 
     @property
@@ -175,7 +175,7 @@ class ResidualTest:
     @property
     def _f_ratio(self) -> float:
         """The ratio of two FRE of the same noise that is exceeded once in 1,000."""
-        return float(np.sqrt(fdtri(self.freedom, self.freedom, 1 - DOUBT)))
+        return float(np.sqrt(fdtri(self.freedom, self.freedom, 1 - REJECT_LEVEL)))
 
 
 class OutlierMarker(NamedTuple):
@@ -290,7 +290,7 @@ class NoiseTest:
     @property
     def explained(self) -> bool:
         """Whether a registration with such residuals is taken at all without the case's consent."""
-        return self.found or self.probability >= DOUBT
+        return self.found or self.probability >= REJECT_LEVEL
 
     @property
     def estimate(self) -> float:

@@ -179,8 +179,8 @@ def aimed(registration: Registration, aim: Aim) -> Registration:
     T = _aimed(registration.T_base_ct, markers.points_ct, markers.points_base, fit.noise, aim)
     T.setflags(write=False)
     target = apply(registration.T_base_ct, aim.target_ct)
-    told = aimed_uncertainty(fit, markers.points_ct, T, target, aim)
-    return replace(registration, T_base_ct=T, uncertainty=told, aim=aim)
+    uncertainty = aimed_uncertainty(fit, markers.points_ct, T, target, aim)
+    return replace(registration, T_base_ct=T, uncertainty=uncertainty, aim=aim)
 
 
 def aimed_uncertainty(

@@ -37,10 +37,10 @@ from puncture_twin.planning.search.candidates import Candidates, Verdict
 
 
 def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBound | None) -> Candidates:
-    """Reject what lacks the clearance to bend; nothing that was rejected becomes safe.
+    """Reject candidates whose clearance is less than the margin and the largest deflection.
 
     Args:
-        anatomy: The structures of ``found``.
+        anatomy: The structures of ``candidates``.
         candidates: Checked for a straight needle.
         bound: How far the needle may bend; None bends nothing.
     """
@@ -52,7 +52,7 @@ def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBoun
 
 
 def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance: Floats, deflection: Floats) -> Verdict:
-    """A verdict with those rejected whose clearance is less than a margin and the deflection.
+    """A verdict with candidates rejected whose clearance is less than margin + deflection; others keep theirs.
 
     Args:
         verdict: Of n candidates.

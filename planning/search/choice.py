@@ -101,11 +101,6 @@ def best_pick(candidates: Candidates) -> Pick | None:
 def choose(context: CaseContext, candidates: Candidates, choice: Choice) -> Chosen:
     """The candidates that a choice leaves, in the order of preference.
 
-    Args:
-        context: Of the case.
-        candidates: The search of its grid.
-        choice: The person's choice.
-
     Raises:
         InputError: A rank or window that there is not, or a point that is no skin entry.
         NoAnswerError: Nothing is safe, or the chosen direction is rejected: says why.

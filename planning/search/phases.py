@@ -1,9 +1,9 @@
-"""The breath in the search: skin, organs and arm at every position of it, and between positions.
+"""Breathing in the search: skin, organs and arm at every checked position of the breath, and clearance between them.
 
-At the position s the target is at t + s b d, and a structure of weight w is displaced by s w b d (amplitude b, unit
-direction d). Seen from the structure, the needle starts at t + s b (1 - w) d: the surfaces stay where they are, and
-their engine measures from another target. What moves with the target (w = 1) is not measured again.
-What the gate lets through decides the verdict.
+At the position s (0 exhale, 1 inhale) the target is at t + s b d, and a structure of weight w is displaced by s w b d
+(amplitude b, unit direction d). Seen from the structure, the needle starts at t + s b (1 - w) d: so the surfaces stay
+where they are, and the engine measures from another target. What moves with the target (w = 1) is not measured again.
+Positions in the gate's window decide the verdict.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from puncture_twin.planning.search.constraints import ArmReach, first_broken, wi
 def with_breathing(
     case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates, bound: DeflectionBound | None = None
 ) -> Candidates:
-    """Check what is safe through the whole breath, and reject what is not while the gate lets the needle through.
+    """Check safe candidates at every position of the breath, and reject those that are unsafe in the gate's window.
 
     Args:
         case: The case; nothing is done where it declares no breathing.
@@ -73,7 +73,7 @@ def with_breathing(
 
 
 def with_breathing_reach(case: Case, anatomy: Anatomy, candidates: Candidates, reach: ArmReach) -> Candidates:
-    """Reject what the arm cannot reach and insert along at a phase that the gate lets through.
+    """Reject candidates that the arm cannot reach, or insert along, at a phase in the gate's window.
 
     Args:
         case: The case; nothing is done where it declares no breathing.
@@ -129,7 +129,7 @@ def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s
 def _with_moved_solids(
     case: Case, anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float, T_base_ct: Floats
 ) -> Case:
-    """The case with obstacles and gantry moved as their weights say: the arm's checker takes them from it."""
+    """The case with obstacles and gantry displaced by their weights: the arm's checker reads them from the case."""
     names = [one.name for one in anatomy.checked]
     of = dict(zip(names, weights.structures.tolist(), strict=True))
 
@@ -294,7 +294,7 @@ CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE
 
 
 def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:
-    """A verdict with what is rejected at one phase; what is rejected already keeps its reason.
+    """A verdict with candidates rejected that are unsafe at one phase; those rejected already keep their reason.
 
     Args:
         verdict: Of n candidates.
@@ -315,7 +315,10 @@ def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Brea
 
 
 def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
-    """The verdict with those candidates rejected that no measurement shows to be clear between two positions.
+    """The verdict with candidates rejected that are not proven clear between two positions.
+
+    A structure moves by m between them, so a clearance changes by m at most: its least in between is at least
+    (low + high - m) / 2. Where that does not suffice, the interval is halved and measured in the middle (`_checked`).
 
     Args:
         body: The case.

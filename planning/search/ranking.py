@@ -1,6 +1,6 @@
-"""The order of the safe candidates: a weighted cost of six terms, and the Pareto front of the same terms.
+"""The order of the safe candidates: a weighted cost of six terms, and the Pareto front of these terms.
 
-One of the terms is the safe cone: by how much a needle may be off and still be safe, as far as the grid tells.
+One of the terms is the safe cone: by how much a direction may be off and still be safe, as far as the grid shows.
 """
 
 from __future__ import annotations
@@ -105,12 +105,14 @@ def rank(
     weights: RankingSection,
     touch_chance: Floats | None = None,
 ) -> Order:
-    """Rank candidates; all arrays have shape (n,), mm and rad.
+    """Rank candidates by the weighted mean of six terms in 0..1, 0 is best; all arrays have shape (n,), mm and rad.
 
-    The terms: 1 - min(clearance, 20 mm)/20 mm to the nearest structure with a margin, or where chances are known the
-    risk min(1, log10(p/1e-6)/6), at least 0, of touching any; path length over usable shaft;
-    skin angle over the largest allowed; length through other structures over usable shaft; 1 - reach margin
-    (0 for all where reach was not checked); 1 - min(safe cone, 5 degrees)/5 degrees (0 for all without a certificate).
+    clearance    1 - min(clearance, 20 mm) / 20 mm; where chances are known log10(p / 1e-6) / 6, of touching any
+    path_length  path length / usable shaft
+    skin_angle   skin angle / largest allowed
+    tissue       length through other structures / usable shaft
+    reach        1 - reach margin (0 for all where reach was not checked)
+    safe_cone    1 - min(safe cone, 5 degrees) / 5 degrees (0 for all where no cone is known)
     """
     terms = np.stack(
         [

@@ -10,7 +10,7 @@ from places import DATA, REAL_CT
 from puncture_twin.planning.anatomy.anatomy import ball
 from puncture_twin.planning.anatomy.body.body_mask import CtImage, ct_image
 from puncture_twin.planning.anatomy.body.limbs import limb_search
-from puncture_twin.planning.anatomy.second_witness import Named
+from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
 CT = REAL_CT / "ct.nii.gz"

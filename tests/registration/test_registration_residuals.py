@@ -10,7 +10,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.method import rigid_rss
-from puncture_twin.planning.registration.noise_test import DOUBT, MIN_FLE_MM, ResidualTest
+from puncture_twin.planning.registration.noise_test import MIN_FLE_MM, REJECT_LEVEL, ResidualTest
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2
 
@@ -56,7 +56,7 @@ def test_honest_noise_is_refused_once_in_a_thousand(count):
     """Of 20,000 registrations with the declared noise 0.1 % are refused, to four standard errors of the draws."""
     limit = ResidualTest(count, 0.0, FLE_MM).limit_mm
     refused = np.mean(drawn_fre(count, FLE_MM, np.random.default_rng(count)) > limit)
-    assert refused == pytest.approx(DOUBT, abs=4 * np.sqrt(DOUBT / DRAWS))
+    assert refused == pytest.approx(REJECT_LEVEL, abs=4 * np.sqrt(REJECT_LEVEL / DRAWS))
 
 
 @pytest.mark.parametrize(("count", "power"), [(3, 0.797), (4, 0.966), (5, 0.995), (6, 0.9993)])
@@ -64,7 +64,7 @@ def test_noise_four_times_the_declared_is_refused(count, power):
     """The refusals are what chi-squared says: 80 % with three markers, 97 % with four, over 99 % from five on."""
     limit = ResidualTest(count, 0.0, FLE_MM).limit_mm
     refused = np.mean(drawn_fre(count, 4 * FLE_MM, np.random.default_rng(count)) > limit)
-    assert power == pytest.approx(chi2.sf(chi2.isf(DOUBT, 3 * count - 6) / 16, 3 * count - 6), abs=0.001)
+    assert power == pytest.approx(chi2.sf(chi2.isf(REJECT_LEVEL, 3 * count - 6) / 16, 3 * count - 6), abs=0.001)
     assert refused == pytest.approx(power, abs=0.012)
 
 

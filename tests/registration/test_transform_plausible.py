@@ -13,7 +13,7 @@ from puncture_twin.planning.case.tables import other_readings
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.planning.registration.checks.checked_placement import (
     check_transform,
-    markers_beside,
+    marker_registration,
     placement_findings,
 )
 from puncture_twin.planning.registration.checks.markers import Surroundings
@@ -287,7 +287,7 @@ def test_honest_markers_hardly_ever_doubt_an_honest_transform(tmp_path, ball):
         T = T_BASE_CT if row % 2 else fit_rigid(MARKERS, second)
         lists = f'markers_ct = "markers_ct.csv"\nmarkers_base = "touched.csv"\nfle_mm = {fle_mm}\n'
         case = load_case(stating(tmp_path, T, more=lists))
-        registration = markers_beside(case, case.robot.stated)
+        registration = marker_registration(case, case.robot.stated)
         found = check_transform(case, skin, case.robot.T_base_ct_mount, registration)
         assert row % 2 == 0 or not any("more than" in line for line in found.warnings)
         doubted += any("more than" in line for line in found.warnings)

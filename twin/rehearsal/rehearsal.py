@@ -225,14 +225,7 @@ def steps(trajectory: Trajectory) -> Floats:
 
 
 def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueTissue | None:
-    """The declared tissue along the true axis of the needle; None where none is declared or the needle passes none.
-
-    Args:
-        plan: What is executed.
-        case: The case of the plan.
-        anatomy: Its structures.
-        truth: Where the patient lies.
-    """
+    """The declared tissue along the true axis of the needle; None where none is declared or the needle passes none."""
     if case.bending is None:
         return None
     T_base_flange = flange_pose(plan.model, plan.insertion.q[-1] + truth.joint_offsets)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, CtImage
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
-from puncture_twin.planning.anatomy.second_witness import Named
+from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 

@@ -242,7 +242,7 @@ def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
     solid &= mask
     if not solid.any():
         return stiff
-    box = box_in(solid, beside=2)
+    box = box_in(solid, margin=2)
     near = parts_of(widened(solid[box], (1, 1, 1)), corners=True)
     large = near.counts(solid[box]) >= MIN_PIECE_MM3 / np.prod(spacing_mm)
     stiff[box] |= widened(near.painted(large), (1, 1, 1)) & mask[box]

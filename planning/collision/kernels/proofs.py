@@ -248,10 +248,10 @@ def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
 
 
 @allocation_free()
-def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
-    """Fill ``paths`` (7,), mm: how far a body may move while each joint rotates by a fraction of ``turns`` (6,), rad.
+def paths_about(frames, body_frame, centre, radius, rotations, fraction, paths):
+    """Fill ``paths`` (7,), mm: how far a body may move while joints rotate by a fraction of ``rotations`` (6,), rad.
 
-        paths[j] = paths[j + 1] + fraction turns[j] (distance of the centre from axis j + radius + paths[j + 1])
+        paths[j] = paths[j + 1] + fraction rotations[j] (distance of centre and axis j + radius + paths[j + 1])
 
     Entry j bounds the motion against the frame before joint j, either way from the arm at ``frames`` (7, 4, 4): a point
     is no farther from axis j than its body's bounding sphere, plus what the joints beyond j have moved it.
@@ -263,18 +263,18 @@ def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
         ax, ay, az = frames[joint, 0, 2], frames[joint, 1, 2], frames[joint, 2, 2]
         cx, cy, cz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
         lever = math.sqrt(cx * cx + cy * cy + cz * cz) + radius + paths[joint + 1]
-        paths[joint] = paths[joint + 1] + fraction * turns[joint] * lever
+        paths[joint] = paths[joint + 1] + fraction * rotations[joint] * lever
 
 
 @nb.njit(cache=True)
-def clear_about(scene, movers, frames, turns, work, gaps, unproven):
-    """Prove checks clear in boxes of joint angles: at some states, and wherever each joint is within ``turns`` of them.
+def clear_about(scene, movers, frames, rotations, work, gaps, unproven):
+    """Prove checks clear in boxes of joint angles: wherever each joint is within ``rotations`` of some states.
 
     Args:
         scene: See :class:`ProofScene`.
         movers: See :class:`Movers`.
         frames: Shape (m, 7, 4, 4), mm: the states.
-        turns: Shape (6,), rad.
+        rotations: Shape (6,), rad.
         work: See :class:`ProofScratch`.
         gaps: Shape (m, k): filled, for what is tested, with the bound at the state itself, or ``TOUCHING``.
         unproven: Shape (m, k): True where a check is to be tested; set to False where it is proven clear.
@@ -285,7 +285,7 @@ def clear_about(scene, movers, frames, turns, work, gaps, unproven):
             if unproven[row, at]:
                 mover = movers.of_check[at]
                 sphere = movers.centres[mover], movers.radii[mover]
-                paths_about(frames[row], movers.frames[mover], sphere[0], sphere[1], turns, 1.0, paths)
+                paths_about(frames[row], movers.frames[mover], sphere[0], sphere[1], rotations, 1.0, paths)
                 path = paths[scene.checks[at, 3]] + MIN_GAP_MM
                 gaps[row, at] = near_gap(scene, work, at, frames[row], path, path + MIN_GAP_MM, path)
                 unproven[row, at] = gaps[row, at] <= path

@@ -94,7 +94,7 @@ def _prove(scene, movers, segment, at, within, fine_mm, scratch, answer):
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         place_arm(segment, middle)
         sphere = movers.centres[mover], movers.radii[mover]
-        paths_about(frames, movers.frames[mover], sphere[0], sphere[1], segment.turns, half, paths)
+        paths_about(frames, movers.frames[mover], sphere[0], sphere[1], segment.rotations, half, paths)
         needed = paths[frame_a] + kept
         gap = _bound(scene, work, at, frames, needed)
         if gap > needed:
@@ -224,7 +224,7 @@ def left_of(scene, movers, segment, part, span, into, scratch, answered, answer)
         if not known[mover]:
             known[mover] = True
             paths_about(
-                frames, mover_frames[mover], centres[mover], reaches[mover], segment.turns, part[1], paths[mover]
+                frames, mover_frames[mover], centres[mover], reaches[mover], segment.rotations, part[1], paths[mover]
             )
         kept = kept_mm[at] + MIN_GAP_MM
         needed, gap, most = paths[mover, checks[at, 3]] + kept, 0.0, math.inf
@@ -309,8 +309,8 @@ class Segment(NamedTuple):
     lengths: Floats
     start: Floats
     step: Floats
-    turns: Floats
-    """Shape (6,), rad: how far each joint turns."""
+    rotations: Floats
+    """Shape (6,), rad: how far each joint rotates."""
     q: Floats
     """Shape (1, 6): scratch."""
     frames: Floats

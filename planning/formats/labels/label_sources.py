@@ -118,10 +118,6 @@ def refuse_label_map(mask: LabelMap) -> None:
 def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> None:
     """Whether all masks of a folder lie on one grid: what lies beyond a smaller one would count as free.
 
-    Args:
-        headers: File name to header.
-        where: The folder, for the error.
-
     Raises:
         InputError: Two differ in shape or place; names both.
     """

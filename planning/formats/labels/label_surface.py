@@ -70,12 +70,12 @@ def mask_surface(mask: Bools, T_ct_index: NDArray[np.float64], *, where: str | P
     )
 
 
-def box_in(mask: Bools, beside: ArrayLike = 0) -> Box:
-    """The smallest index box about what is True in a mask, somewhere, with so many voxels beside it along each axis."""
+def box_in(mask: Bools, margin: ArrayLike = 0) -> Box:
+    """The smallest index box about the True voxels of a mask, and ``margin`` voxels more along each axis."""
     i = np.flatnonzero([plane.any() for plane in mask])
     seen: Bools = np.asarray(mask[i[0] : i[-1] + 1].any(axis=0))
     j, k = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    x, y, z = np.broadcast_to(beside, 3).tolist()
+    x, y, z = np.broadcast_to(margin, 3).tolist()
     ends = ((i, x, 0), (j, y, 1), (k, z, 2))
     a, b, c = (slice(max(0, n[0] - m), min(n[-1] + 1 + m, mask.shape[axis])) for n, m, axis in ends)
     return a, b, c

@@ -31,10 +31,6 @@ class _Content:
 def read_obj(data: bytes, where: str) -> RawMesh:
     """The faces of an OBJ file, of all its objects and groups; polygons are cut into fans.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If a line is not understood, an index is out of range, or the file shows that it was cut.
     """

@@ -61,10 +61,6 @@ class _Lists(NamedTuple):
 def read_ply(data: bytes, where: str) -> RawMesh:
     """The faces of a PLY file; polygons are cut into fans, other elements are passed over.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If header and data do not fit each other, or there are no faces.
     """

@@ -28,10 +28,6 @@ _COORDINATE_TOKENS = [8, 9, 10, 12, 13, 14, 16, 17, 18]
 def read_stl(data: bytes, where: str) -> RawMesh:
     """The triangles of an STL file, three vertices of their own each.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If it is cut, has a false count, or is not STL.
     """

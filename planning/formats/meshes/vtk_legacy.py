@@ -50,10 +50,6 @@ class _Polygons(NamedTuple):
 def read_vtk(data: bytes, where: str) -> RawMesh:
     """The polygons of a legacy VTK file; polygons are cut into fans; lines and lone points carry no surface.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If it is cut, of another kind, has fewer numbers than it states, or holds triangle strips.
     """

@@ -38,10 +38,6 @@ class _Split(NamedTuple):
 def read_vtp(data: bytes, where: str) -> RawMesh:
     """The polygons of a VTP file; polygons are cut into fans; points and lines in it carry no surface.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If it is cut, an array is shorter or longer than stated, or it holds triangle strips.
     """

@@ -182,10 +182,6 @@ UNNAMED_SPACE = "its header names no patient space; read as LPS, as ITK and Slic
 def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
     """Parse the header of a volume in three dimensions.
 
-    Args:
-        content: The file that holds the header.
-        path: Its name.
-
     Raises:
         InputError: A damaged header, an unknown field, a space that is not patient space, or data elsewhere than in
             the file or beside it.
@@ -200,10 +196,6 @@ def parse_layered_header(content: bytes, path: Path) -> VolumeHeader:
     """What the header of a segmentation says whose segments may overlap: one volume, or several as layers.
 
     Layers are the first axis, which runs fastest in the file (Slicer, "Segmentations", file format).
-
-    Args:
-        content: The file that holds the header.
-        path: Its name.
 
     Raises:
         InputError: As `parse_nrrd_header`; a first axis of four that is none of layers.
@@ -283,10 +275,6 @@ def _without_layers(raw: NrrdText, path: Path) -> NrrdText:
 
 def data_file(content: bytes, path: Path) -> str | None:
     """The name of the file beside a detached header that holds its data; None where header and data are one file.
-
-    Args:
-        content: The file, or its beginning.
-        path: Its name.
 
     Raises:
         InputError: A damaged header, or data elsewhere than in the file or beside it.

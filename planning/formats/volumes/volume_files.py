@@ -69,10 +69,6 @@ class Volume:
 def data_file(content: bytes, path: Path) -> str | None:
     """The name of the file beside this one that holds its voxels; None for a volume in one file.
 
-    Args:
-        content: The file that was named.
-        path: Its name.
-
     Raises:
         InputError: A header that is damaged, or names data elsewhere.
     """

@@ -98,8 +98,8 @@ class Reading:
         return f"the patient lies {lies} and the robot's z axis {np.degrees(self.tilt):.0f} deg from up"
 
 
-def markers_beside(case: Case, stated: RegistrationSection) -> Registration | None:
-    """What the markers beside a stated transform say; None without them.
+def marker_registration(case: Case, stated: RegistrationSection) -> Registration | None:
+    """The registration by the markers that a case states besides a transform; None without them.
 
     Raises:
         InputError: As `registered`.
@@ -116,7 +116,7 @@ def check_transform(
         case: Nothing is done where it states no transform.
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm, as stated.
-        registration: Of `markers_beside`, whose own checks are `check_markers`.
+        registration: Of `marker_registration`, whose own checks are `check_markers`.
 
     Returns:
         Warnings, one sentence each; how far markers that agree are from it is a note.
@@ -133,8 +133,8 @@ def check_transform(
         _refuse(case, f"{given.impossible}: {CAUSES}{_better(others)}")
     if registration is None:
         return MarkerFindings(tuple(_unmeasured(case, given, others)), ())
-    told_apart = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
-    doubts = (*_doubts(case, given, told_apart), *_alike(case, given, told_apart))
+    distinct = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
+    doubts = (*_doubts(case, given, distinct), *_alike(case, given, distinct))
     compared = _held_against_markers(case, registration, given, others)
     if _apart(case, registration, given.T_base_ct).unexplained:
         return MarkerFindings((compared, *doubts), ())
@@ -291,7 +291,7 @@ def placement_findings(
         return MarkerFindings((*place, *found.warnings), found.notes)
     if case.robot.stated is None:
         return MarkerFindings(tuple(place_warnings(case, skin.mesh, placement.T_base_ct, OF_MOUNT)), ())
-    registration = markers_beside(case, case.robot.stated)
+    registration = marker_registration(case, case.robot.stated)
     said = check_transform(case, skin.mesh, placement.T_base_ct, registration)
     if registration is None:
         return said

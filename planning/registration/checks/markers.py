@@ -206,8 +206,8 @@ HALF_TURNS: Mapping[str, Signs] = MappingProxyType(
 )
 """The slips of axes that are proper rotations; a list with one or three axes negated is refused as mirrored."""
 
-REFUSING_DOUBT = 0.01
-"""A list is refused at 99 %. Honest lists less often: the more symmetric a body, the more alike are both lists."""
+REFUSING_LEVEL = 0.01
+"""Significance level at which a list is refused; honest lists are less often: on a symmetric body both are alike."""
 
 SCATTER_MM = 0.25
 """No skin is known better: a third of a millimetre's voxel, and the marker's own reading."""
@@ -215,8 +215,8 @@ SCATTER_MM = 0.25
 USUAL_SCATTER_MM = 3.0
 """Markers of one kind on the skin of their own CT scatter less."""
 
-EXCLUDING_DOUBT = 0.001
-"""A half turn is no more mentioned at 99.9 %."""
+EXCLUDING_LEVEL = 0.001
+"""Significance level at which a half turn is excluded, and no more mentioned."""
 
 
 def check_axes(
@@ -253,31 +253,31 @@ def _explains(slip: MarkerList, given: MarkerList) -> bool:
     """Whether the given list is likely the other one, slipped: off the skin, or on it where no needle touches it."""
     if not slip.plausible:
         return False
-    hidden = bool(given.behind) and not _worse(slip.fit, given.fit, doubt=REFUSING_DOUBT)
-    return hidden or _worse(given.fit, slip.fit, doubt=REFUSING_DOUBT)
+    hidden = bool(given.behind) and not _worse(slip.fit, given.fit, level=REFUSING_LEVEL)
+    return hidden or _worse(given.fit, slip.fit, level=REFUSING_LEVEL)
 
 
 def _excluded(slip: MarkerList, given: MarkerList) -> bool:
     """Whether a list is implausible, or so much farther off the skin than the given one that it is not meant."""
     unusual = slip.fit.scatter_mm > USUAL_SCATTER_MM >= given.fit.scatter_mm
-    return unusual or not slip.plausible or _worse(slip.fit, given.fit, doubt=EXCLUDING_DOUBT)
+    return unusual or not slip.plausible or _worse(slip.fit, given.fit, level=EXCLUDING_LEVEL)
 
 
-def _worse(fit: SkinFit, other: SkinFit, *, doubt: float) -> bool:
+def _worse(fit: SkinFit, other: SkinFit, *, level: float) -> bool:
     """Whether the same markers scatter more in one list than in another beyond chance, by an F-test.
 
     Args:
         fit: Of one list.
         other: Of the same markers, read in other axes.
-        doubt: How often two lists of one scatter would seem so different.
+        level: How often two lists of one scatter would seem so different.
     """
     freedom = len(fit.gaps_mm) - 1
-    limit = float(np.sqrt(fdtri(freedom, freedom, 1 - doubt)))
+    limit = float(np.sqrt(fdtri(freedom, freedom, 1 - level)))
     return fit.scatter_mm > limit * max(other.scatter_mm, SCATTER_MM)
 
 
 def _as_given(registration: Registration, given: MarkerList, slip: MarkerList) -> str:
-    if _worse(given.fit, slip.fit, doubt=REFUSING_DOUBT):
+    if _worse(given.fit, slip.fit, level=REFUSING_LEVEL):
         return f"to {given.fit.scatter_mm:.1f} mm"
     row, before = given.behind[0]
     return f"{registration.markers.names[row]} lies behind {before}, where no needle touches it"

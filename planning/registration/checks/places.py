@@ -135,7 +135,7 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
         T_base_ct: Shape (4, 4), mm.
     """
     column = _column_ct(case, T_base_ct)
-    if stands_in_patient(case, skin, T_base_ct):
+    if base_in_patient(case, skin, T_base_ct):
         return "the robot's base would stand in the patient"
     for box in _boxes_ct(case):
         if any(np.all(np.abs(point - box.center_mm) <= box.size_mm / 2) for point in column):
@@ -143,7 +143,7 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     return "the target would be out of the arm's reach" if out_of_reach(case, T_base_ct) else ""
 
 
-def stands_in_patient(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> bool:
+def base_in_patient(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> bool:
     """Whether base or shoulder lie in the patient; arguments as of `place_excluded`."""
     return any(side_of(skin, point) is Side.INSIDE for point in _column_ct(case, T_base_ct))
 
@@ -285,7 +285,7 @@ def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> BasePlace:
         T_base_ct: Shape (4, 4), mm.
     """
     impossible = ""
-    if stands_in_patient(case, skin, T_base_ct):
+    if base_in_patient(case, skin, T_base_ct):
         impossible = "the robot's base would stand in the patient"
     elif box := in_box(case, skin, T_base_ct):
         impossible = f"the patient would lie more than {ALLOWANCE_MM:g} mm deep in obstacle '{box}' or through it"
