@@ -33,13 +33,13 @@ from puncture_twin.planning.collision.kernels.proofs import (
 )
 
 KEPT = 0.8
-"""Fraction of the clearance at the nearer end of a segment that all of it is to keep: bounds are loose by up to a
-tenth."""
+"""Fraction of the clearance at the nearer end of a segment that the whole segment must keep: bounds are loose by up to
+a tenth."""
 
 
 @allocation_free()
 def _keep(scene, segment, clear_mm, scratch):
-    """Fills ``kept`` (k,), mm: what a check is to keep, ``clear_mm`` or as much as the nearer end does (``KEPT``)."""
+    """Fill ``kept`` (k,), mm: the clearance that each check must keep, ``clear_mm`` or ``KEPT`` of the nearer end's."""
     checks, hulls, T_box_base, halves = scene.checks, scene.hulls, scene.T_box_base, scene.halves
     kept, work, frames, enough = scratch.kept, scratch.work, segment.frames[0], clear_mm / KEPT
     for at in range(len(checks)):
@@ -60,9 +60,9 @@ def _keep(scene, segment, clear_mm, scratch):
 
 @allocation_free()
 def _bound(scene, work, at, frames, needed):
-    """Lower bound on the distance of a check, of use above ``needed``: of the spheres about two hulls where they tell.
+    """Lower bound on the distance of a check's bodies: by bounding spheres where they decide, else by `near_gap`.
 
-    Spheres whose middles are nearer than ``needed`` are about hulls that are, so no closer look proves more.
+    They decide where their gap exceeds ``needed``, and where it cannot: their centres are then nearer than that.
     """
     checks, hulls = scene.checks, scene.hulls
     kind, first, second = checks[at, 0], checks[at, 1], checks[at, 2]
@@ -79,10 +79,10 @@ def _bound(scene, work, at, frames, needed):
 
 @allocation_free()
 def _prove(scene, movers, segment, at, within, fine_mm, scratch, answer):
-    """Whether a check surely finds something, or keeps less than it is to; else what is left to query joins the answer.
+    """Prove one check clear in the part ``within`` (low, high) of the segment; True where it certainly is not.
 
-    Looked at is the part ``within`` (low, high) of the segment. Its middle clears what lies nearer to it than its gap
-    allows to move; the rest is checked in the same way, by the middles of what is left on either side.
+    The middle's gap clears the states up to which the bodies cannot move that far (adaptive bisection); what is left on
+    either side is checked likewise. States where neither is proven are added to the answer's queries.
     """
     mover, frame_a, frames, paths = movers.of_check[at], scene.checks[at, 3], segment.frames[0], scratch.paths[0]
     work, parts, kept_mm = scratch.work, scratch.parts, scratch.kept[at]
@@ -103,11 +103,12 @@ def _prove(scene, movers, segment, at, within, fine_mm, scratch, answer):
             answer.status[STATUS], answer.status[CHECK] = CONTACT, at
             return True
         if paths[frame_a] > fine_mm:
+            # The bodies move in proportion to the distance from the middle: the gap suffices for this much of it.
             clear = half * max(0.0, gap - kept) / (needed - kept_mm)
             parts[top, 0], parts[top, 1] = low, middle - clear
             parts[top + 1, 0], parts[top + 1, 1] = middle + clear, high
             top += 2
-        elif gap <= kept:
+        elif gap <= kept:  # the part is too short to divide: its middle decides
             if kept_mm > 0.0:
                 answer.status[STATUS], answer.status[CHECK] = CONTACT, at
                 return True
@@ -120,7 +121,7 @@ def _prove(scene, movers, segment, at, within, fine_mm, scratch, answer):
 
 @nb.njit(cache=True)
 def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_mm, clear_mm, order, scratch, answer):
-    """Check a straight joint segment: fills ``answer``.
+    """Check a straight joint segment, and fill ``answer``.
 
     Args:
         scene: See :class:`ProofScene`.
@@ -128,10 +129,10 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
         lengths: Of the arm, see :mod:`puncture_twin.planning.arm.kinematics`.
         start: Shape (6,), rad.
         end: Shape (6,), rad.
-        answered: 0; after a query whose answer was no, how many there were.
+        answered: How many queries FCL has answered with no contact; 0 for the first call.
         halvings: How often the segment is halved for all checks together, at most ``HALVINGS``.
         fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.
-        clear_mm: What the arm is to keep from skin and boxes where both ends do, see :func:`_keep`; 0 for none.
+        clear_mm: Clearance from skin and boxes to keep where both ends do, see :func:`_keep`; 0 for none.
         order: Shape (k,): the checks in the order in which they are tested.
         scratch: See :class:`SegmentScratch`.
         answer: See :class:`Answer`.
@@ -149,6 +150,7 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
     for row in range(len(order)):
         scratch.lists[0, row] = order[row]
     none = np.int64(0)
+    # 1. The whole segment from its middle, all checks; 2. halves of halves, all checks; 3. each check left, alone.
     if left_of(scene, movers, segment, (1.0, 0.0), (none, none, len(order)), none, scratch, answered, answer) < 0:
         return
     parts, here = divide(scene, movers, segment, halvings, order, scratch, answered, answer)
@@ -160,16 +162,16 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
 
 
 LIKELY = 0.6
-"""Two hulls are seldom farther apart than their spheres and this much of the radii: beyond it a closer look at a part
-is left for when the part is halved."""
+"""Guess of two hulls' gap: that of their spheres and this fraction of the radii. Where that is too small for a part of
+the segment, no closer bound is sought before the part is halved."""
 
 
 @allocation_free()
 def _found(at, gap, kept_mm, fraction, answered, answer):
-    """Whether a bound at a state, which is too small to tell the check clear there, ends the search.
+    """Whether a check that is not proven clear at a state ends the search.
 
-    It does where the check surely finds something or keeps less than it is to, and where it has to be queried and was
-    not yet.
+    It does where the bodies certainly touch or have less than the clearance to keep, and where FCL must be queried and
+    has not been.
     """
     answer.status[CHECK] = at
     if gap == TOUCHING or kept_mm > 0.0:
@@ -185,34 +187,30 @@ def _found(at, gap, kept_mm, fraction, answered, answer):
 
 @allocation_free()
 def left_of(scene, movers, segment, part, span, into, scratch, answered, answer):
-    """Which checks the middle of a part of the segment does not clear all over the part.
+    """List the checks that the middle of a part of the segment does not clear in all of the part.
 
-    Each is looked at in the middle as it is. How far spheres and bodies are from one another clears the part where the
-    bodies cannot come as far within it (after Schwarzer, Saha and Latombe 2005, "Adaptive dynamic collision checking
-    for single and multiple articulated robots in complex environments").
+        clear in all of the part: gap in the middle > paths of the bodies within the part + clearance to keep
+
+    After Schwarzer, Saha and Latombe 2005, "Adaptive dynamic collision checking for single and multiple articulated
+    robots in complex environments".
 
     Args:
         scene: See :class:`ProofScene`.
         movers: See :class:`Movers`.
         segment: See :class:`Segment`.
         part: Its middle and half its width, fractions of the segment.
-        span: Which list of ``scratch.lists``, and from where to where, holds the checks that are to be cleared.
-        into: Where in the other list the rest goes.
+        span: Which list of ``scratch.lists`` holds the checks to clear, and its first and last (excluded) index.
+        into: Index in the other list at which the checks that are left are written.
         scratch: See :class:`SegmentScratch`.
         answered: See :func:`check_segment`.
-        answer: Likewise.
+        answer: See :class:`Answer`.
 
     Returns:
-        Where in the other list the rest ends; -1 where the search has ended.
+        The index in the other list after the last check that is left; -1 where the search has ended.
     """
     checks, radii, T_box_base, halves = scene.checks, scene.hulls.radii, scene.T_box_base, scene.halves
-    work, paths, known, spheres, frames = (
-        scratch.work,
-        scratch.paths,
-        scratch.known,
-        scratch.work.spheres,
-        segment.frames[0],
-    )
+    work, paths, known, frames = scratch.work, scratch.paths, scratch.known, segment.frames[0]
+    spheres = work.spheres
     of_check, centres, reaches, mover_frames = movers.of_check, movers.centres, movers.radii, movers.frames
     source, target, kept_mm = scratch.lists[span[0]], scratch.lists[1 - span[0]], scratch.kept
     place_arm(segment, part[0])
@@ -228,7 +226,7 @@ def left_of(scene, movers, segment, part, span, into, scratch, answered, answer)
             )
         kept = kept_mm[at] + MIN_GAP_MM
         needed, gap, most = paths[mover, checks[at, 3]] + kept, 0.0, math.inf
-        if kind != SKIN:
+        if kind != SKIN:  # cheapest first: bounding spheres, then hulls or skin
             gap = sphere_gap(kind == BOX, first, second, spheres, radii, T_box_base, halves)
             if gap > needed:
                 continue
@@ -238,7 +236,7 @@ def left_of(scene, movers, segment, part, span, into, scratch, answered, answer)
             gap = near_gap(scene, work, at, frames, wanted, wanted + MIN_GAP_MM, wanted)
             if gap > needed:
                 continue
-            if gap <= kept < wanted and gap != TOUCHING:
+            if gap <= kept < wanted and gap != TOUCHING:  # the search for more ended early: ask for the middle alone
                 gap = near_gap(scene, work, at, frames, kept, kept + MIN_GAP_MM, kept)
             if gap <= kept and _found(at, gap, kept_mm[at], part[0], answered, answer):
                 return -1
@@ -249,9 +247,9 @@ def left_of(scene, movers, segment, part, span, into, scratch, answered, answer)
 
 @allocation_free()
 def divide(scene, movers, segment, halvings, order, scratch, answered, answer):
-    """Halve the segment, and leave of each part the checks that neither its middle nor that of a larger part clears.
+    """Halve the segment again and again; each part keeps the checks that no middle of its or a larger part clears.
 
-    All parts of one size come before the next, so that what touches is found soon.
+    Breadth first, all parts of one size before the next, so that a contact is found soon.
 
     Returns:
         How many parts there are, and which list of ``scratch`` holds the checks left in each; (0, 0) for none, and
@@ -279,7 +277,7 @@ def divide(scene, movers, segment, halvings, order, scratch, answered, answer):
 
 
 CLEAR, CONTACT, QUERY, NOT_FINITE = 0, 1, 2, 3
-"""What a segment came to: proven but for the queries, a contact, a query to be made at once, no numbers."""
+"""Results of a segment: proven but for the queries; a contact; a query to be made at once; joints not finite."""
 
 STATUS, CHECK, ANSWERED, QUERIES = 0, 1, 2, 3
 """The entries of an answer's status: one of the above; the check that touches; how many queries were, or are to be,
