@@ -192,7 +192,7 @@ class CaseChange(NamedTuple):
         case: As written.
         options: As JSON.
         before: Its row in the first; None where it is not there.
-        after: The same of the second.
+        after: The second cohort's row of the case.
     """
 
     case: str

@@ -38,7 +38,7 @@ class SourceCost:
     Attributes:
         source: As in `SOURCES`.
         alone_mm: The tip's rms error, were there no other.
-        without_mm: The same, were there all but this one; the registration's weights stay.
+        without_mm: Expected error with all sources but this one; the registration's weights stay.
     """
 
     source: str

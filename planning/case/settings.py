@@ -73,7 +73,7 @@ class SearchSettings:
     Attributes:
         min_hit: Least chance to hit the target; None sets no limit.
         max_touch: Greatest chance to touch any one structure; None sets no limit.
-        max_touch_of: The same for single structures, by name, instead.
+        max_touch_of: Limits of single structures, by name, in place of ``max_touch``.
     """
 
     theta: tuple[float, float]

@@ -52,11 +52,11 @@ class FastChecker(CellChecker):
 
     Args:
         model: See :class:`CellChecker`.
-        tool: Needle and holder, likewise.
-        boxes: Obstacles, likewise.
-        patient: The body's surface, likewise.
-        outside: A table, likewise.
-        padding_mm: Of contacts with patient and boxes, likewise.
+        tool: Needle and holder.
+        boxes: Obstacles, base frame.
+        patient: The body's surface, base frame.
+        outside: Surfaces outside of the body, such as a table, base frame.
+        padding_mm: Distance at which patient or boxes count as touched.
         cache: Where the enclosures of the arm's bodies are kept.
 
     Raises:
@@ -223,7 +223,7 @@ class SegmentChecker:
     Args:
         model: The arm.
         checks: The questions that may find a contact.
-        proofs: The same, packed.
+        proofs: These checks, packed.
         scratch: For them; several may share it, one after the other.
         clear_mm: What the padded arm is to keep from patient and boxes besides; of each body and obstacle that are
             nearer to one another at an end of the segment, most of their distance there. What is not proven to be kept

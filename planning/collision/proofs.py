@@ -124,7 +124,7 @@ class Proofs:
     def unproven(
         self, motion: Motion, tested: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
     ) -> Iterator[tuple[int, int]]:
-        """The states of a path, in order, each with a check that is not proven clear there, likewise in order.
+        """The states of a path, in order, each with the checks, in order, that are not proven clear there.
 
         Args:
             motion: The states, in order.
@@ -186,7 +186,7 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
     Args:
         model: The arm.
         checks: Of a cell.
-        proofs: The same checks, packed.
+        proofs: These checks, packed.
         cache: Where the answer is kept: it depends on arm and tool alone.
     """
     between = proofs.joint_spans[:, 0] > 0

@@ -359,7 +359,7 @@ def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: f
         length: Above 0.
         rates: The limits.
         start_speed: At most the speed limit.
-        end_speed: The same, and reachable (:func:`reachable_speed`).
+        end_speed: Speed at the end, reachable (:func:`reachable_speed`).
 
     Raises:
         InputError: If ruckig finds no such motion.

@@ -27,7 +27,7 @@ def standoffs(needle: Needle, path_length: Floats | float, skin_angle: Floats | 
     Args:
         needle: The needle.
         path_length: Target to skin, mm; NaN without a skin entry.
-        skin_angle: The same shape, rad.
+        skin_angle: Shape of ``path_length``, rad.
     """
     path_length = np.asarray(path_length, dtype=float)
     if needle.standoff_mm is None:

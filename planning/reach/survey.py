@@ -202,7 +202,7 @@ def survey(
         model: The arm.
         lines: The n directions.
         distances_mm: For each direction, shape (m,): target to flange at the samples of the path.
-        depths_mm: The same as depths, rising, shape (m,).
+        depths_mm: Shape (m,), the distances as depths of insertion, rising.
         rolls: Shape (r,), rad.
     """
     count = len(lines)

@@ -216,7 +216,7 @@ class Distortion:
         moved_mm: What it moves the markers by beside a rigid motion, rms.
         reading_mm: The standard deviation per coordinate that it leaves to the readings.
         rms_mm: Expected error at the target by the residuals of the rigid fit.
-        rms_without_mm: The same by those of the fit with the deformation.
+        rms_without_mm: The rms by the residuals of the fit with the deformation.
     """
 
     axes: str

@@ -229,7 +229,7 @@ class OneMore:
 
     Attributes:
         point_ct: Shape (3,), mm.
-        rms_mm: Expected error at the target with it, by the readings, scaled likewise.
+        rms_mm: Expected error at the target with it, by the readings, scaled to the residuals where they are.
     """
 
     point_ct: Floats

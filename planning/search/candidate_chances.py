@@ -180,7 +180,7 @@ def joint_touch_chance(
 
     Args:
         near: Of needles and structures.
-        cov_ct: Shape (n, 6, 6), Sigma6, as there.
+        cov_ct: Shape (n, 6, 6), covariance of each needle's pose, CT axes, twist order.
         threshold_mm: One number or shape (k,).
         freedom: As in `touch_chance`.
         surface_mm: As in `proximity`: every structure's surface lies off by a normal number of its own.

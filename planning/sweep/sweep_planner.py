@@ -83,7 +83,7 @@ def plan_sweep(
     Args:
         context: Of a case that says where the arm's base is.
         start: Theta and beta, rad.
-        end: The same; beta goes the shorter way around.
+        end: (theta, beta) of the end; beta takes the shorter arc.
         seed: Of the approach's planner.
         progress: Called with directions checked and all of them.
 

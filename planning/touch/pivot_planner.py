@@ -42,7 +42,7 @@ RADII = (0.6, 0.8, 0.45)
 """Distances from the shoulder at which the flange is tried, over the arm's reach without its wrist."""
 
 HEIGHTS = (0.0, 0.3, -0.3, 0.6)
-"""Heights above the shoulder at which it is tried, likewise."""
+"""Heights above the shoulder at which the flange is tried, over the same reach."""
 
 SIDES = 12
 """Directions from the base in which they lie."""

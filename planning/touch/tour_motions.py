@@ -81,7 +81,7 @@ class TouchPlan(TouchTour):
     Attributes:
         left_out: Marker to why it is not touched, in words.
         expected_mm: Of the tip at the target when the registration comes from these touches (rms), mm.
-        worst_mm: The same with the worst of the poses that could be taken, mm.
+        worst_mm: ``expected_mm`` with the worst of the poses that could be taken, mm.
     """
 
     left_out: Mapping[str, str]
@@ -197,7 +197,7 @@ class ApproachCheckers:
 
     Attributes:
         whole: The arm with its needle.
-        blunted: The same with a needle that is `TIP_MM` shorter.
+        blunted: The checker of a needle that is `TIP_MM` shorter.
     """
 
     whole: CellChecker

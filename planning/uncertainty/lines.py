@@ -324,8 +324,8 @@ def needle_uncertainty(
         origin: Shape (3,), mm, the covariance's point of reference.
         outward: Shape (3,), unit.
         cov_ct: Shape (6, 6), CT axes.
-        surface_mm: As there.
-        freedom: As there.
+        surface_mm: Deviation of each structure's surface, mm, as in `proximity`.
+        freedom: Of the errors' size, as in `touch_chance`.
     """
     across = frame_about(outward)[:, :2]
     keep = np.zeros((6, 5))

@@ -220,7 +220,7 @@ def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
 
 
 def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
-    """The pose error of trials: touches as there, and errors of the estimated size taken as declared."""
+    """The pose error of trials: touches as the trials draw them, errors of the estimated size as if declared."""
     errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
     noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
     test = NoiseTest(fit.test.count, float(fit.test.freedom))

@@ -111,7 +111,7 @@ def _in_reach(folder: Path) -> bool:
 
 @cache
 def _known_in_reach(folder: Path, uid: int, gid: int, mode: int) -> bool:
-    """The same of a folder of this owner and mode: the folders around it are looked at once in a process."""
+    """`_in_reach` of a folder of this owner and mode; the folders around it are looked at once in a process."""
     status = folder.stat()
     _refuse_foreign(folder, status)
     if not _open_to_others(status, stat.S_IXGRP, stat.S_IXOTH):

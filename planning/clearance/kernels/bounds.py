@@ -21,7 +21,7 @@ SINE_SLACK = np.float32(1e-5)
 """Added to 1 - q^2: many times float32's rounding of it."""
 
 COSINE_SLACK = np.float32(2e-6)
-"""Added to |q|, likewise."""
+, likewise."""|"""Added to |q|: many times float32's rounding of it."""|, likewise."""
 
 TINY = np.float32(1e-30)
 """Keeps a division finite; far below any square of a length that matters."""
@@ -98,7 +98,7 @@ def line_distances(  # type: ignore[no-untyped-def]  # as above
     """Squared distances of a line from the triangles of a block, projected on the plane across the line.
 
     Args:
-        typing_context: As above.
+        typing_context: Numba's; not given by the caller.
         local: Shape (b, 9, 16), float32, corners from the block's centre.
         block: Which.
         e: Three float32 numbers, first unit vector across the line.

@@ -40,7 +40,7 @@ class Triangle(NamedTuple):
     corners: Floats
     """Shape (n + 3, 3), mm; the last three are filled in turn."""
     inner: Floats
-    """Shape (n + 3, 3), mm, likewise: see :class:`Hulls`."""
+    """Shape (n + 3, 3), mm: corners of the enclosed hulls, see :class:`Hulls`, and of the triangle."""
     starts: Ints
     ends: Ints
     """Of each corner the neighbours, see :class:`Hulls`."""

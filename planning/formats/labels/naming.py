@@ -205,7 +205,7 @@ def select(
         names: Label to name.
         present: The labels of the map.
         avoid: Pattern to margin in mm.
-        unknown: Likewise, for which it is unknown whether a path may cross it.
+        unknown: Patterns of structures of which it is unknown whether a path may cross them.
         traverse: Patterns of what may be crossed.
         target: Patterns of what holds the lesion.
         ignore: Patterns of what does not count.

@@ -214,7 +214,7 @@ def is_layered(content: bytes, path: Path) -> bool:
 
 
 def _without_last(raw: NrrdText) -> NrrdText:
-    """The same header without a fourth axis of length 1 behind the three of space."""
+    """The header without a fourth axis of length 1 behind the three of space."""
     fields = dict(raw.fields)
     sizes, directions = fields.get("sizes", "").split(), fields.get("spacedirections", "")
     if fields.get("dimension") != "4" or sizes[3:] != ["1"] or not directions.endswith("none"):

@@ -82,7 +82,7 @@ class Pivot:
         cov_tip: Shape (3, 3), mm^2, of the tip, from all that is declared.
         misses_mm: Shape (n,): the distance of each tip from their place.
         expected_mm: Their root mean square as the declared touch noise leaves it.
-        expected_whole_mm: The same with what the arm errs by, where that was declared.
+        expected_whole_mm: The expectation with the arm's errors too, where they are declared.
     """
 
     tip_flange: Floats

@@ -194,7 +194,7 @@ class ServoCase:
         model: The arm.
         skin: The head's surface, image frame, mm.
         markers: The markers' centres, image frame, in truth.
-        targets: The targets, likewise.
+        targets: The targets, image frame, in truth.
         inputs: Every file, with role and hash.
     """
 

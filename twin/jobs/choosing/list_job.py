@@ -196,7 +196,7 @@ def check_targets(context: CaseContext, listed: ReadList, aimed: Callable[[Liste
 
 
 def write_checked(checked: CheckedList, context: CaseContext, out: Path) -> CheckedList:
-    """The same, with its rows as CSV and Parquet in a folder."""
+    """Write a checked list's rows as CSV and Parquet into a folder."""
     names, stages, note = (CSV, PARQUET), context.stages.seconds, context.watcher.note
     with writing(out, "check list", inputs=checked.inputs, seconds=stages, names=names, note=note) as draft:
         paths = (draft.folder / CSV, draft.folder / PARQUET)

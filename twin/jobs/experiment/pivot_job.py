@@ -179,7 +179,7 @@ class PivotTourRun:
 
     @property
     def expected_error_mm(self) -> float:
-        """The same (rms) as declared."""
+        """Expected error of the tip on the flange (rms), by the declared errors, mm."""
         return float(np.sqrt(np.trace(self.found.pivot.cov_tip)))
 
     def summary(self) -> dict[str, Any]:

@@ -64,7 +64,7 @@ class Use(NamedTuple):
 
 
 def _no_use(why: str) -> dict[str, Any]:
-    """The same of readings that register nothing."""
+    """The use of readings that register nothing, with the reason."""
     return {"why_not": why, "expected_tip_error_mm": None, "tip_error_mm": None, "fre_mm": None, "flags": []}
 
 

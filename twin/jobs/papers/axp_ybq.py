@@ -267,7 +267,7 @@ def reproduction_text(result: AxpYbqTables) -> str:
 
 
 def reproduction_summary(result: AxpYbqTables) -> dict[str, Any]:
-    """The same as plain values."""
+    """The specified numbers beside ours as plain values, for ``--json``."""
     rows = [
         {"what": r.what, "known": r.known, "ours": r.ours, "limit": r.limit, "unit": r.unit, "holds": r.passed}
         for r in result.rows

@@ -94,12 +94,12 @@ def data_address(picture: Path) -> str:
 
 
 def png_address(picture: bytes) -> str:
-    """The same of a PNG that is no file."""
+    """Data address of a PNG in memory."""
     return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
 
 
 def image_address(image: Image.Image, compress_level: int) -> str:
-    """The same of a picture that is no PNG yet."""
+    """Data address of an image, encoded as PNG."""
     stream = io.BytesIO()
     image.save(stream, format="PNG", compress_level=compress_level)
     return png_address(stream.getvalue())

@@ -52,7 +52,7 @@ class ViewCamera:
         return float(self.height / 2 / np.tan(self.fov / 2))
 
     def finer(self, factor: int) -> ViewCamera:
-        """The same view with more pixels."""
+        """This view with more pixels."""
         return replace(self, width=self.width * factor, height=self.height * factor)
 
     def project(self, points_ct: Floats) -> Floats:

@@ -352,7 +352,7 @@ class MovingPicture:
         return PixelBox(left // SAMPLES, top // SAMPLES, -(-right // SAMPLES), -(-bottom // SAMPLES))
 
     def another(self) -> MovingPicture:
-        """The same picture for another thread: what stands still is shared."""
+        """A copy of this picture for another thread; what does not move is shared."""
         made = copy(self)
         made._with_own_arrays()
         return made

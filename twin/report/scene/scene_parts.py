@@ -84,7 +84,7 @@ class SceneBody:
         return Surface(self.mesh, self.colour, self.alpha, rim, self.solid)
 
     def seen_from(self, eye_ct: Floats) -> Surface:
-        """The same for an eye (3,), mm: solid where that is seen to be so, and the eye is not within its box."""
+        """This part for an eye (3,), mm: solid where it looks solid, and the eye is not within its box."""
         low, high = self.mesh.bounds
         within = bool(np.all((low <= eye_ct) & (eye_ct <= high)))
         return replace(self.surface, solid=not within and self._hides_its_back)

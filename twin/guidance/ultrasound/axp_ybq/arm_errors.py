@@ -102,13 +102,13 @@ class ArmErrors(NamedTuple):
     """How both arms' errors move the flanges of a recording."""
 
     probe: Floats
-    """Shape (n, 6, 23), per standard deviation; (n, 6, 29) where play is declared."""
+    """Shape (n, 6, 23), motion per standard deviation of the probe's arm; (n, 6, 29) where play is declared."""
     needle: Floats
-    """The same."""
+    """The motion by the needle's arm, likewise shaped."""
     probe_play: Floats
     """How the declared play moves the flange, shape (n, 6)."""
     needle_play: Floats
-    """The same."""
+    """How the play of the needle's arm moves its flange, shape (n, 6)."""
     probe_arrival: Floats
     """Covariance, shape (n, 6, 6)."""
     needle_arrival: Floats

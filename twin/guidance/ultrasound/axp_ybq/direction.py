@@ -84,9 +84,9 @@ class SeenDirection(NamedTuple):
     agrees: NDArray[np.bool_]
     """Shape (n,)."""
     spread_rad: float
-    """Root mean square angle inside the image between what was measured and what V gives."""
+    """Root mean square angle inside the image between measured directions and those that V gives."""
     lean_rad: float
-    """The same across the image."""
+    """Root mean square angle across the image, out of its plane."""
     reversed: Bools
     """Shape (n,): the measured direction points from the tip to the hub."""
     sign_known: bool

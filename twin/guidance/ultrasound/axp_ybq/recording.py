@@ -64,7 +64,7 @@ class Recording:
         q_needle: Joints of the needle's arm, shape (n, 6), rad; given if and only if the probe's are.
         turn_probe: Direction of each probe joint's last rotation before it stopped, shape (n, 6): 1, -1, or 0
             where nobody knows. None where it was not recorded: the play's sign is then unknown.
-        turn_needle: The same of the needle's arm; both only with joints.
+        turn_needle: As ``turn_probe``, of the needle's arm; both only with joints.
         shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known. Only with
             directions; None where it was not measured: all directions then count the same.
 
