@@ -21,7 +21,7 @@ SINE_SLACK = np.float32(1e-5)
 """Added to 1 - q^2: many times float32's rounding of it."""
 
 COSINE_SLACK = np.float32(2e-6)
-, likewise."""|"""Added to |q|: many times float32's rounding of it."""|, likewise."""
+"""Added to |q|: many times float32's rounding of it."""
 
 TINY = np.float32(1e-30)
 """Keeps a division finite; far below any square of a length that matters."""
