@@ -140,12 +140,12 @@ class _Checker:
         self._skin = PlainSkin(anatomy.skin, case.target_ct)
         self._even = self._skin.closed and not self._skin.odd()
         demanding = [s for s in anatomy.checked if s.demands_margin]
-        meshes, self._beside = [s.mesh for s in demanding], np.array([s.outside for s in demanding], bool)
+        meshes, self._is_outside = [s.mesh for s in demanding], np.array([s.outside for s in demanding], bool)
         self._organs = np.concatenate([m.triangles for m in meshes] or [np.empty((0, 3, 3))]) - case.target_ct
         self._first = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)])
         self._limits = self._question.margins + self._question.radius
         self._limit = np.repeat(self._limits, np.diff(self._first))
-        self._outside = np.repeat(self._beside, np.diff(self._first))
+        self._outside = np.repeat(self._is_outside, np.diff(self._first))
         self._inside = [side_of(mesh, case.target_ct) is Side.INSIDE for mesh in meshes]
 
     def run(self, progress: Count | None) -> Verification:
@@ -233,7 +233,7 @@ class _Checker:
         if not self._first[column] <= row < self._first[column + 1] or cell.rho > WIDEST:
             return False
         surface = _bvh(self._organs[row], np.array([[0, 1, 2]]))
-        outside = self._beside[column]
+        outside = self._is_outside[column]
         length = self._learn(cell, whole).flange[0] - DEPTH_PAD_MM if outside else self._question.length
         ends = cell.corners * length
         axes = [_bvh(np.stack([np.zeros(3), end]), np.array([[0, 1, 1]])) for end in ends]
