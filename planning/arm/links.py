@@ -42,7 +42,7 @@ PIN_RADIUS_MM = 10.0
 """Radius of the pin that replaces a joint where the meshes leave a gap: well inside every link."""
 
 FLUSH_MM = 1e-4
-"""Meshes that overlap along their joint's axis by less than this end in one plane: rounding says whether they touch."""
+"""Overlap along their joint's axis below which two meshes end in one plane: whether they touch is rounding."""
 
 FLAT_MM = 0.05
 """Points that lie within such a sheet span no body: their hull would be one of rounding."""

@@ -34,7 +34,7 @@ ABOVE_MM = 200.0
 """A floor mount may stand so much higher than the target, a ceiling or side mount so much lower, by default."""
 
 RAIL_MM = 100.0
-"""A base at the rail stands at most so much higher or lower than the table's top, by default."""
+"""Height of a base at the rail above or below the table's top, at most, by default."""
 
 ROUNDS_MM = 50.0
 """Default bounds are multiples of this."""
@@ -48,7 +48,7 @@ FACINGS: Mapping[str, tuple[int, int, int]] = MappingProxyType(
 """A side mount's base axis, toward the target, in the bed frame."""
 
 POSITION_DIGITS = 1
-"""Positions are written to 0.1 mm: nobody stands a base more exactly."""
+"""Decimals of positions, 0.1 mm: no base is set up more exactly."""
 
 AXIS_DIGITS = 6
 """Axes are written to six digits: 1e-3 mm at a metre."""

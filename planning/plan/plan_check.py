@@ -193,7 +193,7 @@ ARM_NAMES = (
 
 
 def arm_document(model: UrModel) -> dict[str, Any] | None:
-    """The numbers of an arm; None for one of the table, whose name says them."""
+    """The numbers of an arm; None for one of the table, whose name gives them."""
     if UR_MODELS.get(model.name) == model:
         return None
     return {

@@ -34,7 +34,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import arm_document, check_geometry, rate_limits, read_arm
 
 PLAN_VERSION = 3
-"""Version of the file's layout. `arm` is absent for an arm of the table, whose name says its numbers."""
+"""Version of the file's layout. `arm` is absent for an arm of the table: its name gives its numbers."""
 
 PLAN_ALLOWED = f"a plan.json of version {PLAN_VERSION}; plan again"
 
@@ -150,7 +150,7 @@ def _same_rates(said: Any, known: dict[str, list[float]]) -> bool:
 
 
 def _check_names(document: dict[str, Any], path: Path) -> None:
-    """Refuse keys that no plan has: nothing says whether what they state is so."""
+    """Refuse keys that no plan has: nothing checks what they state."""
     for where, part, known in (
         ("", document, NAMES),
         ("approach.", document["approach"], PHASE_NAMES),

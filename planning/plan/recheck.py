@@ -83,7 +83,7 @@ def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:
 
 
 def _check_labels(plan: Plan, context: CaseContext, candidates: Candidates, path: Path) -> None:
-    """Refuse what a plan says of itself where the case says otherwise: people read these numbers."""
+    """Refuse a plan whose own numbers differ from the case's: people read them."""
     case, placement = context.case, context.placement
     error = float("nan") if placement is None else placement.target_error_mm
     if context.chance is not None:

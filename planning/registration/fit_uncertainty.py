@@ -215,7 +215,7 @@ def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where:
 
 
 def touches(case: Case, markers: MarkerPairs) -> Floats:
-    """How the arm stood when it touched each marker, shape (N, 6), rad: as the file says, or as it may have stood."""
+    """Joints of the arm at the touch of each marker, shape (N, 6), rad: the file's, or likely ones."""
     if markers.joints is not None:
         return markers.joints
     model, tip = case.robot.model, case.needle.length_mm

@@ -112,7 +112,7 @@ MAX_RESIDUAL_MM = 15.0
 """A marker that misses by more was swapped, moved or typed wrongly: the paper's worst set misses by 7 mm."""
 
 MIRROR_GAIN = 2.0
-"""A mirrored fit that is better than the proper one by this factor (and 1 mm) says that one side is mirrored."""
+"""Factor (and 1 mm) by which a mirrored fit must be better than the proper one: then one list is mirrored."""
 
 
 def _rms(residuals: Floats) -> float:

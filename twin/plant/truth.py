@@ -40,7 +40,7 @@ class MarkerNoise(NamedTuple):
     ct_mm: float
     """Where a marker is found in the CT."""
     touch_mm: float
-    """Where the robot says it touched it."""
+    """Position of the touch that the robot reports."""
 
 
 @dataclass(frozen=True, eq=False)

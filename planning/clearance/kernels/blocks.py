@@ -109,10 +109,10 @@ def _fill(vertices, faces, order, triangles):  # type: ignore[no-untyped-def]  #
 
 
 PARALLEL = 1e-6
-"""Fraction of its triangles' area below which a block's mean normal says nothing."""
+"""Length of a block's mean normal over its triangles' area, below which the normal is not used."""
 
 FAINT = 1e-140
-"""Length, mm^2, below which a mean normal says nothing: its square nears the least number, and is not its length's."""
+"""Length of a mean normal, mm^2, below which it is not used: its square is near the least number, and inexact."""
 
 
 @allocation_free(nogil=True)

@@ -33,7 +33,7 @@ from puncture_twin.planning.registration.placement import Placement, load_placem
 from puncture_twin.planning.registration.registration import Registration
 
 UPRIGHT = np.radians(30.0)
-"""An arm whose z axis lies so near to up stands on a floor, a rail or a cart, as most do."""
+"""Angle of the base's z axis from up up to which an arm is upright: on a floor, a rail or a cart, as most are."""
 
 EXPLAINED = 3.29
 """Times the expected (rms) error of a point: normal errors exceed it at most once in 1,000, in whatever directions they
@@ -80,12 +80,12 @@ class Reading:
 
     @property
     def upright(self) -> bool:
-        """Whether the arm stands; others hang, or reach out of a wall."""
+        """Whether the arm is mounted upright, not hanging or on a wall."""
         return self.tilt <= UPRIGHT
 
     @property
     def usual(self) -> tuple[bool, bool]:
-        """What speaks for it: the patient lies on something, and the arm stands."""
+        """Whether it is usual: the patient lies on something, and the arm is mounted upright."""
         return bool(self.rests_on), self.upright
 
     def better_than(self, other: Reading) -> bool:

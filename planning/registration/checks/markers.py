@@ -35,7 +35,7 @@ from puncture_twin.planning.registration.method import Renaming, renamings
 from puncture_twin.planning.registration.registration import Registration
 
 MARKER_ON_SKIN_MM = 30.0
-"""A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""
+"""Height of a skin marker: one whose centre is farther from the skin is on a frame, or is misread."""
 
 
 @dataclass(frozen=True, eq=False)

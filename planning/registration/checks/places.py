@@ -156,7 +156,7 @@ def out_of_reach(case: Case, T_base_ct: Floats) -> bool:
 
 
 def shoulder_within(case: Case, T_base_ct: Floats) -> str:
-    """The obstacle of frame ``ct`` that the shoulder lies in; a base that stands on one is in none. Empty for none."""
+    """Name of the obstacle of frame ``ct`` that contains the shoulder, or ""; a base on top of one is in none."""
     shoulder = _column_ct(case, T_base_ct)[1]
     boxes = (box for box in _boxes_ct(case) if np.all(np.abs(shoulder - box.center_mm) < box.size_mm / 2))
     return next((box.name for box in boxes), "")

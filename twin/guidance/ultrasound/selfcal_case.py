@@ -72,7 +72,7 @@ class ArmSection(Section):
 
 
 class NeedleArmSection(ArmSection):
-    """The needle's arm, and where its base stands: in the frame of the probe's arm, both upright."""
+    """The needle's arm, and the pose of its base in the frame of the probe's arm, both upright."""
 
     position_mm: Vector = (800.0, 0.0, 0.0)
     yaw_deg: Degrees = 180.0

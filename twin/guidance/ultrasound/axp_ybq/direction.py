@@ -90,7 +90,7 @@ class SeenDirection(NamedTuple):
     reversed: Bools
     """Shape (n,): the measured direction points from the tip to the hub."""
     sign_known: bool
-    """Whether the direction from flange to tip says which end of the needle the tip is."""
+    """Whether the direction from flange to tip determines which end of the needle is the tip."""
 
 
 def needle_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.bool_]) -> SeenDirection:
@@ -251,7 +251,7 @@ def tip_residuals(estimate: Estimate, recording: Recording) -> Floats:
 
 
 def tip_points(estimate: Estimate, recording: Recording) -> tuple[Floats, Floats]:
-    """The tip in end1, as the image says, and in base2, as the needle's arm says; both (n, 3), mm."""
+    """The tip in end1, by the image, and in base2, by the needle's arm; both (n, 3), mm."""
     in_end1 = (recording.P * estimate.scale) @ estimate.R_X[:, :2].T + estimate.t_X
     in_base2 = recording.B[:, :3, :3] @ estimate.t_Q + recording.B[:, :3, 3]
     return in_end1, in_base2

@@ -92,7 +92,7 @@ def scaled_jacobian(
 
 
 def tips_centre(estimate: Estimate, recording: Recording) -> Floats:
-    """The middle of all tips as the needle's arm says, shape (3,), mm, base2."""
+    """The middle of all tips by the needle's arm, shape (3,), mm, base2."""
     return np.asarray(tip_points(estimate, recording)[1].mean(axis=0))
 
 

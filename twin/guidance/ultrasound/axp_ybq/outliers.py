@@ -122,7 +122,7 @@ FALSE_ALARMS = 0.01
 """Chance that a recording without outliers loses a pose."""
 
 ROUNDING = 1e-6
-"""Mm, and rad: residuals of this size are rounding, and none of them stands out."""
+"""Mm, and rad: residuals of this size are rounding, and no outliers."""
 
 ALARM_FRACTION = 0.6
 """Fraction of the spread that is believed while outliers may be in it: a false alarm costs time, not accuracy."""

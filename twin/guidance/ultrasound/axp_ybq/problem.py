@@ -57,7 +57,7 @@ class Problem(NamedTuple):
     active: NDArray[np.int_]
     """Which of the 19 parameters are free."""
     lean_rad: float = 0.0
-    """How far needles lean out of the slice and still show: all that a direction seen in the image says across it."""
+    """How far a needle may lean out of the slice and still be seen; across, the image shows no more of a direction."""
     arms: ArmErrors | None = None
     """Errors of both arms, where they are declared."""
 
