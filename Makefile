@@ -17,13 +17,18 @@ KILLS ?= 10
 # Python keeps what it compiles, whatever the shell says: to read every module anew takes each process seconds.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: FORCE demo test browser quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel docs pictures meshes clean
+.PHONY: FORCE demo test versions simulator browser quick durations slips fuzz kill kill-batch lint mutants install links reinstall kernels wheel release docs pictures meshes clean
 
-demo: install
+demo: install simulator
 	$(BIN)/python run_twin.py demo --out $(OUT)
 
-test: install browser lint
+test: install simulator browser lint
 	$(BIN)/pytest -q -n auto --dist loadfile
+	@[ -z "$$CI" ] || $(MAKE) --no-print-directory versions
+
+# Beside this environment: the newest Python, and the lowest version of every part (two minutes; in CI a part of make test).
+versions: install
+	$(BIN)/python -m tools.versions
 
 # While one works: what takes under 0.07 s a test, without real data.
 quick: install
@@ -68,21 +73,26 @@ $(LINKS):
 	@ln -sfn ../$(@F) $@
 
 # The stamp holds what was installed: files that are only newer, as after a checkout, install nothing again.
-VERSION := -c 'import sys; print("Python %d.%d" % sys.version_info[:2])'
-STAMP := { cat pyproject.toml constraints.txt; $(PYTHON) $(VERSION); }
+WHICH := -c 'import sys; print("Python %d.%d" % sys.version_info[:2])'
+STAMP := { cat pyproject.toml constraints.txt; $(PYTHON) $(WHICH); }
 $(VENV)/installed: FORCE
 	@[ -n "$(PYTHON)" ] || { echo "no Python 3.11, 3.12 or 3.13 with venv is here; Debian 12 and later, Ubuntu 24.04: apt install python3-venv"; exit 2; }
 	@$(STAMP) 2>/dev/null | cmp -s - $@ || $(MAKE) --no-print-directory reinstall PYTHON=$(PYTHON)
 
 reinstall:
-	@[ "$$($(BIN)/python $(VERSION) 2>&1)" = "$$($(PYTHON) $(VERSION))" ] || rm -rf $(VENV)
+	@[ "$$($(BIN)/python $(WHICH) 2>&1)" = "$$($(PYTHON) $(WHICH))" ] || rm -rf $(VENV)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,test]'
-	@$(BIN)/python -c "import pybullet" 2>/dev/null || { echo "building the simulator: PyBullet has no wheel for this Python (8 minutes; needs g++ and python3-dev)"; \
-	  $(BIN)/pip install --quiet --constraint constraints.txt pybullet; } || \
-	  echo "no simulator: demo, rehearse, servo, selfcal, reproduce and their tests need it; all else works (so does PYTHON=python3.11)"
+	@$(MAKE) --no-print-directory simulator
 	$(MAKE) --no-print-directory kernels
 	$(STAMP) > $(VENV)/installed
+
+# PyBullet has no wheel after Python 3.11. Where it could not be built, the next make demo or make test tries again.
+simulator:
+	@$(BIN)/python -c "import pybullet" 2>/dev/null || { command -v g++ >/dev/null && \
+	  echo "building the simulator: PyBullet has no wheel for this Python (8 minutes; needs g++ and python3-dev)" && \
+	  $(BIN)/pip install --quiet --constraint constraints.txt pybullet; } || \
+	  echo "NO SIMULATOR: demo, rehearse, servo, selfcal, reproduce and their tests need it; all else works. apt install g++ python3-dev, or PYTHON=python3.11"
 
 # The page is tested in one: Debian's where it may be installed, else Playwright's own.
 browser:
@@ -91,11 +101,11 @@ browser:
 	  $(BIN)/playwright install chromium >/dev/null 2>&1 || \
 	  echo "NO BROWSER IS HERE: the page's tests in one are skipped, and fail where CI is set; apt install chromium"
 
-# Compiled here, not while a person waits for a first answer. What is not compiled here is where it is first used.
+# Compiled here, not while a person waits for a first answer; by a search where there is no simulator. What is not compiled here is where it is first used.
 kernels:
 	@echo "compiling the kernels (a minute)"
 	@out=$$(mktemp -d) && export PUNCTURE_TWIN_CACHE=$$out/cache && \
-	  { $(BIN)/python run_twin.py demo --out $$out/demo && \
+	  { { $(BIN)/python run_twin.py demo --out $$out/demo || $(BIN)/python run_twin.py search meshes/abdomen --out $$out/demo; } && \
 	    $(BIN)/python run_twin.py check meshes/abdomen --theta 64 --beta 98; } > $$out/log 2>&1 || \
 	  { tail -n 1 $$out/log; echo "kernels will be compiled where they are first used"; }; rm -rf $$out
 
@@ -103,11 +113,17 @@ kernels:
 wheel: install
 	$(BIN)/pip wheel --quiet --no-deps --wheel-dir out/wheels .
 
+# A commit and a tag, after linters, quick tests and the wheel in an empty environment: make release VERSION=0.2.0
+VERSION ?=
+release: install
+	$(BIN)/python -m tools.release $(VERSION)
+
 # The pages and the API reference, as a site in out/site.
 docs: install
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[twin,docs]'
 	$(BIN)/python docs/command_line.py
 	$(BIN)/python docs/default_roles.py
+	$(BIN)/python docs/sentences.py
 	$(BIN)/mkdocs build --quiet
 
 pictures: demo

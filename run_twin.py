@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MOST_SEEDS = 10_000
 """Rooms or draws of one command; each takes seconds."""
 
-app = typer.Typer(add_completion=False, no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = typer.Typer(no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
 
@@ -61,11 +61,11 @@ def _without_command(context: typer.Context, version: VersionOption = False) -> 
 def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> None:
     """The main job on the embedded abdomen: search, plan, rehearse, report."""
     require_extra("twin", "demo")
-    from puncture_twin.twin.jobs.patient import main_job, text
+    from puncture_twin.twin.jobs.patient import main_job
 
     with prepared(meshes_folder() / "abdomen") as context:
         run = main_job.demo_case(context, out_dir)
-    finish("demo", run, run.summary(), text.rehearsal_text(run), as_json)
+    finish("demo", run, run.summary(), run.text(), as_json)
 
 
 @app.command()
@@ -159,14 +159,14 @@ def search(
     as_json: JsonOption = False,
 ) -> None:
     """Judge every entry direction of a case; write the table, the map, the scene and the page."""
-    from puncture_twin.twin.jobs.patient import main_job, text
+    from puncture_twin.twin.jobs.patient import main_job
 
     folder = out_folder(out_dir, case, "search")
     certify = main_job.certify_options(certified, certify_size, certify_touch)
     with prepared(case, arm=arm, engine=engine) as context:
         checked = context.cross_check(check_again) if check_again else None
         run = main_job.search_case(context, folder, pictures=pictures, checked=checked, certify=certify)
-    finish("search", run, run.summary(), text.search_text(run), as_json)
+    finish("search", run, run.summary(), run.text(), as_json)
 
 
 @app.command()
@@ -176,11 +176,11 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Prove every cell of a certificate again, with a plain checker that shares none of the fast code."""
-    from puncture_twin.twin.jobs.patient import answers, text
+    from puncture_twin.twin.jobs.patient import answers
 
     with prepared(case, arm=False) as context:
         report = answers.verify_certificate(certificate, context)
-    finish("verify", report, report, text.certificate_text(report), as_json)
+    finish("verify", report, report, answers.certificate_text(report), as_json)
 
 
 @app.command()
@@ -254,12 +254,12 @@ def plan(
     as_json: JsonOption = False,
 ) -> None:
     """Search, plan to the best candidate that the arm can come to, or to the one that is named; write plan.json."""
-    from puncture_twin.twin.jobs.patient import main_job, text
+    from puncture_twin.twin.jobs.patient import main_job
 
     folder = out_folder(out_dir, case, "plan")
     with prepared(case) as context:
         run = main_job.plan_case(context, folder, choice)
-    finish("plan", run, run.summary(), text.plan_text(run), as_json)
+    finish("plan", run, run.summary(), run.text(), as_json)
 
 
 @app.command()
@@ -283,7 +283,7 @@ def rehearse(
     """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
     require_extra("twin", "rehearse")
     from puncture_twin.twin.jobs.experiment.sweep_job import sweep_case, sweep_end, sweep_text
-    from puncture_twin.twin.jobs.patient import main_job, text
+    from puncture_twin.twin.jobs.patient import main_job
     from puncture_twin.twin.jobs.patient.run import room_count
 
     rooms, folder = room_count(seeds, physics), out_folder(out_dir, source, "rehearse")
@@ -298,7 +298,7 @@ def rehearse(
             run = main_job.rehearse_plan(context, source, folder, rooms)
         else:
             run = main_job.rehearse_case(context, folder, rooms, choice)
-    finish("rehearse", run, run.summary(), text.rehearsal_text(run), as_json)
+    finish("rehearse", run, run.summary(), run.text(), as_json)
 
 
 @app.command()
@@ -414,7 +414,9 @@ def export(
     format_name: Annotated[
         str,
         typer.Option(
-            "--format", metavar="FORMAT", help="urscript, ros2, moveit, csv, slicer, candidates-csv or candidates-json."
+            "--format",
+            metavar="FORMAT",
+            help="urscript, ros2, moveit, csv, slicer, candidates-csv, candidates-json, or a package's own.",
         ),
     ],
     case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,
@@ -448,14 +450,14 @@ def register(
     as_json: JsonOption = False,
 ) -> None:
     """Register a case's markers, or two lists of markers; print residuals, the expected error and its sources."""
-    from puncture_twin.twin.jobs.patient import answers, text
+    from puncture_twin.twin.jobs.patient import answers
 
     report = answers.register_report(source, markers_base, target, space, fle)
     if picture is not None:
         from puncture_twin.twin.jobs.patient.pictures import write_budget_picture
 
         write_budget_picture(report, picture)
-    finish("register", report, report, text.registration_text(report), as_json)
+    finish("register", report, report, answers.registration_text(report), as_json)
 
 
 @app.command()
@@ -469,7 +471,7 @@ def selfcal(
     """Let two arms calibrate themselves by ultrasound, AXP = YBQ, and send the needle to targets in the image."""
     require_extra("twin", "selfcal")
     from puncture_twin.twin.jobs.selfcal.job import run_selfcal
-    from puncture_twin.twin.jobs.selfcal.text import selfcal_facts, selfcal_text
+    from puncture_twin.twin.jobs.selfcal.report import selfcal_facts, selfcal_text
 
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:

@@ -58,7 +58,7 @@ STAGES = {
     },
     "planning.anatomy.unseen": {"beyond_labels": "beyond labels"},
     "planning.evidence.checks": {"findings": "evidence"},
-    "planning.clearance.fast_engine": {"FastEngine.__init__": "engine's blocks"},
+    "planning.clearance.fast_engine": {"_packed": "engine's blocks", "_remembered": "engine's blocks"},
     "planning.search.search": {"search": "search"},
 }
 """By module: what of it is timed under which row; a name that a checkout lacks is left out."""

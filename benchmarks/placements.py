@@ -22,7 +22,7 @@ import scipy
 
 from puncture_twin.planning.evidence.edges import edge_image
 from puncture_twin.planning.evidence.label_placement import Source, assess
-from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.labels.label_surface import mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical, read_volume
 
 COUNTS = (1, 3, 6, 15, 60)
@@ -142,7 +142,7 @@ def meshes_of(patient: Patient) -> dict[str, object]:
             continue
         T = patient.T.copy()
         T[:3, 3] += T[:3, :3] @ [one.start for one in box]
-        found[str(label)] = field_surface(inside.astype(np.float32) - 0.5, T, where=str(label))
+        found[str(label)] = mask_surface(inside, T, where=str(label))
     return found
 
 

@@ -98,7 +98,7 @@ def reached(rod: CarriedRod, points_base: Floats, branch: int) -> Floats:
     """Joints that put the nominal ball on points (n, 3), one branch, shape (n, 6), rad."""
     q = inverse(rod.model, flange_poses(rod, points_base))[:, branch]
     if np.isnan(q).any():
-        raise NoAnswerError(f"branch {branch} does not reach")
+        raise NoAnswerError(f"branch {branch} does not reach", code="out_of_reach")
     return q
 
 

@@ -33,14 +33,14 @@ from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.clearance.fast_engine import near_faces
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.reach.standoff import own_lengths
+from puncture_twin.planning.reach.standoff import case_axis_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touching_configuration
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.method import Method
-from puncture_twin.planning.registration.noise_test import NoiseTest
 from puncture_twin.planning.registration.placement import aimed, load_placement
 from puncture_twin.planning.registration.registration import aim_at, register
+from puncture_twin.planning.registration.residuals import NoiseTest
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, demanding, refined_chances
@@ -321,7 +321,7 @@ def _touched(of: Scene, puncture: Puncture, rooms: Trials, shift: float) -> np.n
     """Which rooms touch what, shape (n, k); their tips are no farther off than a shift."""
     case, checked = of.context.case, of.context.anatomy.checked
     columns, radius = demanding(checked), case.needle.radius_mm
-    lengths = own_lengths(case, of.context.anatomy, puncture.outward_ct[None])[0]
+    lengths = case_axis_lengths(case, of.context.anatomy, puncture.outward_ct[None])[0]
     turn = np.linalg.norm(rooms.outward_ct - puncture.outward_ct, axis=1).max(initial=0.0)
     touched = np.zeros((len(rooms.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):

@@ -29,7 +29,7 @@ FUNCTIONS = {
     "planning.registration.placement": {"load_placement": "files"},
     "planning.anatomy.anatomy": {"load_anatomy": "meshes"},
     "planning.evidence.checks": {"findings": "inputs compared"},
-    "planning.clearance.fast_engine": {"FastEngine.__init__": "engine's blocks"},
+    "planning.clearance.fast_engine": {"_packed": "engine's blocks", "_remembered": "engine's blocks"},
     "planning.collision.workcell": {"case_checker": "workcell"},
     "planning.search.search": {"organ_distances": "search", "organ_candidates": "search"},
     "planning.search.constraints": {"with_reach": "reach"},

@@ -13,10 +13,14 @@ HEAD = """# Command line
 prints its help, and `--version` prints the version. Exit codes: 0 done; 1 done, and the answer is no; 2 bad input, one
 line that says what, where and what is allowed; 3 the program failed; 130 interrupted; 141 nobody reads what it prints
 (as after `| head -1`). With `--json` stdout holds one JSON object and nothing else; progress goes to stderr. Where bad
-input is refused, or nothing is found, the object has `error` alone: `code` (one word), `sentence`, `where`, `allowed`,
-`numbers`; the line stands on stderr as ever. Without
+input is refused, or nothing is found, the object has `error` alone: `code` (the kind of mistake:
+[sentences.md](sentences.md)), `sentence`, `where`, `allowed`, `numbers`; the line stands on stderr as ever. Without
 `--out` files go to `out/`, into a folder named after case and command (`out/abdomen-search`). What is written:
 [outputs.md](outputs.md).
+
+`run-twin --install-completion` lets bash, zsh, fish or PowerShell, whichever it is called from, complete commands and
+options from its next start on (1 from any other); `--show-completion` prints the script instead, as
+`_RUN_TWIN_COMPLETE=source_bash run-twin` does wherever it is called from.
 
 *Written by `python docs/command_line.py` from the help of each command (`run-twin COMMAND --help`).*
 """

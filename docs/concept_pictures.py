@@ -151,7 +151,7 @@ def body_and_air():
     hu = rendered(parts, grid, noise_hu=12.0, rng=rng).astype(np.float32)
     spacing = np.array(grid.spacing_mm)
     body = body_mask(hu, spacing, where="supine phantom").body
-    outside = outside_mask(OutsideImage(hu, body, grid.affine, spacing), AIR_HU)
+    outside = outside_mask(OutsideImage(hu, body, np.zeros_like(body), grid.affine, spacing), AIR_HU)
     low, (nx, ny, _) = np.array(grid.low_mm), grid.shape
     row = int(np.argmin(np.abs(low[2] + spacing[2] * np.arange(grid.shape[2]) - 30.0)))
     x, y = low[0] + spacing[0] * np.arange(nx), low[1] + spacing[1] * np.arange(ny)

@@ -14,11 +14,11 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, log_rotation, pose
 
 SLIP = pose(exp_rotation(np.array([0.0, 0.0, np.radians(1.0)])), [0.0, 0.0, 3.0])
-"""How the patient might slip, in the CT frame: 3 mm to the head and a turn of 1 degree about that axis."""
+"""A slip of the patient, in the CT frame: 3 mm to the head and a rotation of 1 degree about that axis."""
 
 
 def main() -> None:
-    """Register, and print the pose, what each marker misses by, and the error to expect at the target."""
+    """Register, and print the pose, each marker's residual, and the error to expect at the target."""
     files = sys.argv[1:3] or [folder() / "abdomen" / name for name in ("markers_ct.csv", "touch.csv")]
     target_ct = [float(word) for word in (sys.argv[3:6] or ("-90", "-10", "60"))]
     markers_ct, markers_base = (pt.read_points(file) for file in files)
@@ -30,7 +30,7 @@ def main() -> None:
     expected = found.expected_tre_mm(np.array([target_ct]))[0]
     print(f"FRE {found.fre_mm:.2f} mm, which is not the error at the target: {expected:.2f} mm (rms) is expected there")
     for flag in found.flags:
-        print(f"weak: {flag}")
+        print(f"weak: {flag.sentence}")
     T_base_slipped = found.T_base_ct @ SLIP
     missed = np.linalg.norm(apply(T_base_slipped, np.array(target_ct)) - apply(found.T_base_ct, np.array(target_ct)))
     print(f"a slip of 3 mm and 1 degree after the touch would move the target by {missed:.2f} mm")

@@ -82,7 +82,7 @@ def check(context: CaseContext, theta_deg: float, beta_deg: float) -> Explanatio
     """
     if not (0.0 <= theta_deg <= 180.0 and 0.0 <= beta_deg <= 360.0):
         what = f"theta {theta_deg}, beta {beta_deg}"
-        raise InputError(what, where="check", allowed="theta_deg 0 to 180, beta_deg 0 to 360")
+        raise InputError(what, where="check", allowed="theta_deg 0 to 180, beta_deg 0 to 360", code="out_of_range")
     return context.explain(float(np.radians(theta_deg)), float(np.radians(beta_deg)))
 
 
@@ -235,7 +235,9 @@ def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS", up: str
         known, axis = (Unit(unit), Space(space)), None if up is None else Up(up)
     except ValueError as error:
         allowed = "mm, cm or m; LPS, RAS or local; y or z"
-        raise InputError(f"unit {unit!r}, space {space!r}, up {up!r}", where=str(path), allowed=allowed) from error
+        raise InputError(
+            f"unit {unit!r}, space {space!r}, up {up!r}", where=str(path), allowed=allowed, code="unknown_choice"
+        ) from error
     return read_mesh(Path(path), unit=known[0], space=known[1], up=axis)
 
 
@@ -334,7 +336,9 @@ def _named(points: Points, where: str) -> NamedPoints:
     try:
         values = np.array([np.asarray(point, dtype=np.float64) for point in points.values()])
     except (TypeError, ValueError) as error:
-        raise InputError(f"a point is no three numbers ({error})", where=where, allowed=allowed) from error
+        raise InputError(
+            f"a point is no three numbers ({error})", where=where, allowed=allowed, code="not_a_number"
+        ) from error
     if values.ndim != 2 or values.shape[1] != 3:
-        raise InputError(f"points of shape {values.shape}", where=where, allowed=allowed)
+        raise InputError(f"points of shape {values.shape}", where=where, allowed=allowed, code="wrong_shape")
     return NamedPoints(tuple(points), guard_points(values, tuple(points), where=where), None)

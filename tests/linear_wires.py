@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 
 Floats = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def fit_image(frames: WireFrames, wires: Wires) -> Floats:
         InputError: Too few frames, or a probe that hardly moved.
     """
     if len(frames.points_px) < LEAST_FRAMES:
-        raise InputError(f"{len(frames.points_px)} frames", where="wires", allowed=f"{LEAST_FRAMES} or more")
+        refuse(f"{len(frames.points_px)} frames", "wires", f"{LEAST_FRAMES} or more", "too_few_points")
     across = np.eye(3) - wires.directions[:, :, None] * wires.directions[:, None, :]
     T, scaled = frames.T_reference_probe, frames.points_px / PIXELS
     weights = np.concatenate([scaled, np.ones((*scaled.shape[:2], 1))], axis=2)
@@ -87,7 +87,7 @@ def fit_image(frames: WireFrames, wires: Wires) -> Floats:
     solution, _, _, values = np.linalg.lstsq(system, right.ravel(), rcond=None)
     if values[-1] < LEAST_RATIO * values[0]:
         what = f"the probe hardly moved (singular value ratio {values[-1] / values[0]:.1e})"
-        raise InputError(what, where="wires", allowed="frames from several sides of the wires")
+        refuse(what, "wires", "frames from several sides of the wires", "undetermined")
     x1, x2, origin = solution.reshape(3, 3) / np.array([[PIXELS], [PIXELS], [1.0]])
     normal = np.cross(x1, x2)
     T_probe_image = np.eye(4)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.twin.guidance.stereo.cameras.bundle import Bundle, Observations, PixelSpreads, adjust
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 
@@ -38,9 +38,8 @@ def calibrate_planar(
         InputError: Fewer than three views, points off the plane, or views that are all parallel to the picture.
     """
     if pixels.ndim != 4 or pixels.shape[1] < MIN_VIEWS or np.any(board[:, 2] != 0):
-        raise InputError(
-            f"pixels of shape {pixels.shape}", where=where, allowed=f"(cameras, views >= {MIN_VIEWS}, k, 2), z = 0"
-        )
+        what = f"pixels of shape {pixels.shape}"
+        refuse(what, where, f"(cameras, views >= {MIN_VIEWS}, k, 2), z = 0", "too_few_points")
     alone = [_one(board, views, size, sigma_px, where) for views in pixels]
     if len(alone) == 1:
         return alone[0]
@@ -90,7 +89,7 @@ def _focal(homographies: list[Floats], where: str) -> float:
         right += [-h1[2] * h2[2], h2[2] ** 2 - h1[2] ** 2]
     inverse = float(np.dot(left, right) / np.dot(left, left))
     if not (np.isfinite(inverse) and inverse > 0):
-        raise InputError("the views do not fix the focal length", where=where, allowed="boards tilted several ways")
+        refuse("the views do not fix the focal length", where, "boards tilted several ways", "undetermined")
     return float(1 / np.sqrt(inverse))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from linear_wires import WireFrames, Wires
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import read_input
 
 Floats = NDArray[np.float64]
@@ -41,7 +41,7 @@ def read_wires(path: Path) -> Wires:
     placed = _named_transform(root, "Phantom", "Reference", path)
     wires = list(root.iter("Wire"))
     if not wires:
-        raise InputError("no wire", where=path, allowed="a PLUS device set with a PhantomDefinition")
+        refuse("no wire", path, "a PLUS device set with a PhantomDefinition", "empty")
     front, back = (_ends(wires, end, path) @ placed[:3, :3].T + placed[:3, 3] for end in ("Front", "Back"))
     along = back - front
     directions = along / np.linalg.norm(along, axis=1, keepdims=True)
@@ -72,10 +72,10 @@ def _frames(parent: ElementTree.Element, wires: Wires, path: Path) -> WireFrames
         listed = _found(frame, "SegmentedPoints", where).findall("Point")
         seen = {p.get("WireName"): _numbers(_attribute(p, "Position", where), 3, where)[:2] for p in listed}
         if set(seen) != set(wires.names):
-            raise InputError(f"points on {len(seen)} wires", where=where, allowed=f"one on each of {len(wires.names)}")
+            refuse(f"points on {len(seen)} wires", where, f"one on each of {len(wires.names)}", "wrong_count")
         points.append([seen[name] for name in wires.names])
     if not poses:
-        raise InputError(f"no frame in {parent.tag}", where=path, allowed="frames with points on the wires")
+        refuse(f"no frame in {parent.tag}", path, "frames with points on the wires", "missing_key")
     return WireFrames(np.array(poses), np.array(points))
 
 
@@ -86,24 +86,26 @@ def _ends(wires: list[ElementTree.Element], end: str, path: Path) -> Floats:
 def _root(path: Path) -> ElementTree.Element:
     data = read_input(path, max_bytes=MAX_BYTES, where=str(path))
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise InputError("a document type", where=path, allowed="XML without one")
+        refuse("a document type", path, "XML without one", "xml_doctype")
     try:
         return ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InputError(f"XML cannot be read ({error})", where=path, allowed="a file that PLUS wrote") from error
+        raise InputError(
+            f"XML cannot be read ({error})", where=path, allowed="a file that PLUS wrote", code="xml_damaged"
+        ) from error
 
 
 def _found(parent: ElementTree.Element, tag: str, where: str | Path) -> ElementTree.Element:
     found = parent.find(f".//{tag}")
     if found is None:
-        raise InputError(f"no {tag}", where=where, allowed="a file that PLUS wrote")
+        refuse(f"no {tag}", where, "a file that PLUS wrote", "missing_key")
     return found
 
 
 def _attribute(element: ElementTree.Element, name: str, where: str | Path) -> str:
     value = element.get(name)
     if value is None:
-        raise InputError(f"{element.tag} without {name}", where=where, allowed="a file that PLUS wrote")
+        refuse(f"{element.tag} without {name}", where, "a file that PLUS wrote", "missing_key")
     return value
 
 
@@ -111,7 +113,9 @@ def _named_transform(root: ElementTree.Element, source: str, target: str, path: 
     for element in root.iter("Transform"):
         if (element.get("From"), element.get("To")) == (source, target):
             return _matrix(_attribute(element, "Matrix", path), path, rigid=source == "Phantom")
-    raise InputError(f"no transform from {source} to {target}", where=path, allowed="a file that PLUS wrote")
+    raise InputError(
+        f"no transform from {source} to {target}", where=path, allowed="a file that PLUS wrote", code="missing_key"
+    )
 
 
 def _matrix(text: str, where: str | Path, *, rigid: bool) -> Floats:
@@ -119,7 +123,7 @@ def _matrix(text: str, where: str | Path, *, rigid: bool) -> Floats:
     R = T[:3, :3]
     off = np.abs(R.T @ R - np.eye(3)).max()
     if T[3].tolist() != [0, 0, 0, 1] or (rigid and (off > RIGID_TO or np.linalg.det(R) < 0)):
-        raise InputError("a matrix that is no rigid motion", where=where, allowed=f"R^T R = 1 to {RIGID_TO:g}")
+        refuse("a matrix that is no rigid motion", where, f"R^T R = 1 to {RIGID_TO:g}", "not_rigid")
     return T
 
 
@@ -127,7 +131,9 @@ def _numbers(text: str, count: int, where: str | Path) -> list[float]:
     try:
         values = [float(word) for word in text.split()]
     except ValueError as error:
-        raise InputError(f"{text[:40]!r} holds no number ({error})", where=where, allowed=f"{count} numbers") from error
+        raise InputError(
+            f"{text[:40]!r} holds no number ({error})", where=where, allowed=f"{count} numbers", code="not_a_number"
+        ) from error
     if len(values) != count or not np.isfinite(values).all():
-        raise InputError(f"{text[:40]!r}", where=where, allowed=f"{count} finite numbers")
+        refuse(f"{text[:40]!r}", where, f"{count} finite numbers", "not_a_number")
     return values

@@ -1,15 +1,31 @@
-"""Commands that must be refused."""
+"""What must be refused: by its code, and the one line of a command."""
 
+import json
+from contextlib import contextmanager
+
+import pytest
+
+from puncture_twin.planning.base.errors import InputError
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import BAD_INPUT
 
 
-def refused(arguments, capfd):
-    """Run a command that must be refused; returns its one line."""
-    assert main([str(argument) for argument in arguments]) == BAD_INPUT
+@contextmanager
+def refused(code, *values, by=InputError):
+    """Within, an error of this code is raised that names these values; yields it as pytest does."""
+    with pytest.raises(by) as caught:
+        yield caught
+    assert caught.value.code == code, caught.value
+    line = str(caught.value)
+    assert "\n" not in line and all(str(value) in line for value in values), line
+
+
+def refused_command(arguments, capfd, code, *values):
+    """Run a command that must be refused with this code, in one line that names these values; returns the line."""
+    assert main([*map(str, arguments), "--json"]) == BAD_INPUT
     captured = capfd.readouterr()
-    assert captured.out == ""
-    lines = [line for line in captured.err.splitlines() if line.strip()]
-    assert len(lines) == 1, captured.err
-    assert "allowed: " in lines[0]
-    return lines[0]
+    error = json.loads(captured.out)["error"]
+    (line,) = [one for one in captured.err.splitlines() if one.strip() and ", took " not in one]  # a slow machine's
+    assert error["code"] == code and error["sentence"] in line and "allowed: " in line, (error, line)
+    assert all(value in line for value in values), line
+    return line

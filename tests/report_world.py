@@ -17,7 +17,7 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
 from puncture_twin.planning.search.choice import best_pick
-from puncture_twin.twin.report.page.page import write_page
+from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.slices.sheet import draw_slices
 from puncture_twin.twin.report.slices.subject import Subject
 
@@ -116,7 +116,13 @@ def make_anatomy(*, warnings=()):
     )
     skin = SimpleNamespace(mesh=_ball(SKIN_RADIUS, TARGET, 4), cut_faces=np.zeros(0, int), field_of_view=None)
     return SimpleNamespace(
-        structures=structures, surroundings=(), checked=structures, skin=skin, scan=None, warnings=tuple(warnings)
+        structures=structures,
+        surroundings=(),
+        checked=structures,
+        skin=skin,
+        scan=None,
+        warnings=tuple(warnings),
+        findings=(),
     )
 
 
@@ -231,7 +237,7 @@ def make_page(path):
     anatomy.scan = SimpleNamespace(hu_at=lambda points: np.where(np.abs(points).max(axis=1) < 150, 40.0, np.nan))
     plan, slices = make_plan(case, candidates), (draw_slices(Subject(case, anatomy, best_pick(candidates))),)
     told = (make_rehearsal(plan), make_registration())
-    write_page(case, anatomy, candidates, plan, *told, path, film="rehearsal.mp4", slices=slices)
+    write_page(Shown(case, anatomy, candidates, plan, *told, film="rehearsal.mp4", slices=slices), path)
     return candidates
 
 

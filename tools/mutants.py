@@ -54,7 +54,7 @@ RESIDUALS = tuple(
 
 REGISTRATION = (
     *(f"tests/registration/test_{name}.py" for name in ("registration_limits", "registration", "declared_errors")),
-    *(f"tests/registration/test_{name}.py" for name in ("register_command", "fits", "odd_marker")),
+    *(f"tests/registration/test_{name}.py" for name in ("register_command", "fits", "outlier_marker")),
     *RESIDUALS,
 )
 

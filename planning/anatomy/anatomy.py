@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.tables import support_warnings
 from puncture_twin.planning.anatomy.scan import Outside, Scan
-from puncture_twin.planning.anatomy.second_witness import Named
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.sources import StructureSources
 from puncture_twin.planning.anatomy.structure import Role as Role, Structure as Structure
+from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.anatomy.unseen import beyond_images, beyond_labels
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import Finding, InputError, Severity
+from puncture_twin.planning.base.errors import Finding, InputError, Severity, refuse
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
-from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.labels.label_surface import frame, framed_surface
 from puncture_twin.planning.formats.meshes.mesh_files import cached_mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -90,7 +90,7 @@ class Anatomy:
                 return structure
         names = ", ".join(s.name for s in self.structures)
         near = did_you_mean(name, (structure.name for structure in self.structures))
-        raise InputError(f"no structure '{name}'{near}", where="anatomy", allowed=names)
+        raise InputError(f"no structure '{name}'{near}", where="anatomy", allowed=names, code="unknown_structure")
 
 
 def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE) -> Anatomy:
@@ -140,7 +140,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
 
 
 def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Finding:
-    """What a rule guesses of an image: how much, where, which picture shows it, and the line that overrules it.
+    """Sentence on what a rule guessed of an image: how much, where, which picture shows it, what overrules it.
 
     Args:
         code: Of the finding; the structure that paths would pass through, where there is one.
@@ -170,7 +170,7 @@ def body_side(mesh: TriangleMesh, skin: Skin) -> str:
 def _outside(
     case: Case, scan: Scan, outside: Outside, structures: Sequence[Structure], warnings: list[str]
 ) -> tuple[Structure, ...]:
-    """What the CT shows outside of the body that is not air, and limbs that are pressed against it."""
+    """Surfaces of what the CT shows outside of the body that is not air, and of limbs pressed against it."""
     if case.ct.table != "none":
         warnings.extend(support_warnings(outside.supported, outside.open_faces))
     voxel_ct = scan.source.surfaces.voxel_ct
@@ -184,7 +184,7 @@ def _outside(
 
 
 def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterator[Structure]:
-    """What the CT shows inside the body that no structure names, unless the case takes that for free."""
+    """Surfaces of what the CT shows inside the body that no structure names, unless the case declares it free."""
     if case.ct.unnamed == "free":
         return
     written = [Named(one.name, one.mesh) for one in structures if one.source != OWN_TARGET]
@@ -208,7 +208,7 @@ def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
 
 
 def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh | None:
-    """What lies beyond what the body lies on in the case's CT, as `Anatomy.couch`.
+    """Load the surfaces beyond what the body lies on in the case's CT, as `Anatomy.couch`.
 
     Raises:
         InputError: A CT that cannot be trusted, or does not show the target.
@@ -218,33 +218,29 @@ def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh 
 
 
 def _check_count(case: Case, count: int) -> None:
-    """Of a case that states how many structures it has, before a surface is made; the CT adds others later."""
+    """Compare the number of structures with what the case states, before surfaces are made and the CT adds others."""
     if wrong := count_difference(case.stated_structures, count):
-        raise InputError(wrong, where=case.path, allowed="the number of structures that are read")
+        refuse(wrong, case.path, "the number of structures that are read", "structures_miscounted")
 
 
 def _check_names(case: Case, structures: list[Structure]) -> None:
     names = [structure.name for structure in structures]
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
-        raise InputError(f"structure '{twice[0]}' stands twice", where=case.path, allowed="unique names")
+        refuse(f"structure '{twice[0]}' stands twice", case.path, "unique names", "duplicate_name")
     if case.target_structure not in names:
-        raise InputError(
+        what = (
             f"target.structure '{case.target_structure}' is no structure of the case"
-            f"{did_you_mean(case.target_structure, names)}",
-            where=case.path,
-            allowed=", ".join(names),
+            f"{did_you_mean(case.target_structure, names)}"
         )
+        refuse(what, case.path, ", ".join(names), "unknown_structure")
 
 
 def _check_demands(case: Case, structures: list[Structure]) -> None:
-    """Where nothing demands a margin every path is "safe", which says nothing about a patient."""
+    """Refuse a case without margins: every path would be "safe", which says nothing about a patient."""
     if not any(structure.demands_margin for structure in structures):
-        raise InputError(
-            "no structure is to be avoided, so that no verdict would say anything about safety",
-            where=case.path,
-            allowed='at least one structure of role "avoid" or "unknown"',
-        )
+        what = "no structure is to be avoided, so that no verdict would say anything about safety"
+        refuse(what, case.path, 'at least one structure of role "avoid" or "unknown"', "nothing_to_avoid")
 
 
 def surface_distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
@@ -273,4 +269,6 @@ def ball(middle_ct: Floats, radius_mm: float) -> TriangleMesh:
     field = radius_mm - np.sqrt(x**2 + y**2 + z**2)
     field[field == 0.0] = -np.finfo(np.float32).eps
     T_ct_index = pose(np.eye(3) * cell, middle_ct + offset[0])
-    return field_surface(field / radius_mm, T_ct_index, where=OWN_TARGET)
+    framed, within = frame(field.shape)
+    within[:] = field / radius_mm
+    return framed_surface(framed, T_ct_index, where=OWN_TARGET)

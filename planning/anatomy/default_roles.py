@@ -1,4 +1,4 @@
-"""What a structure means to a needle where nobody says: one line per class or group of classes, each with its reason.
+"""Default roles of structures that a case says nothing of: a line per class or group of classes, with the reason.
 
 Names are those of TotalSegmentator's tasks and of Slicer's segments, in any spelling of capitals, spaces and signs:
 ``lung_upper_lobe_left``, "Left Lung". Of several lines that match a name the most specific holds, as in a case; but

@@ -29,7 +29,7 @@ class Organ(NamedTuple):
 
 
 def _rows(text: str) -> Iterator[tuple[str, str]]:
-    """What stands before and after the first colon of each row; what is indented goes on."""
+    """Rows of a table as (text before, text after) the first colon; an indented line continues the row above."""
     for row in re.split(r"\n(?=\S)", text.strip()):
         first, _, rest = row.partition(":")
         yield first, rest

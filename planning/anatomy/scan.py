@@ -1,4 +1,4 @@
-"""The CT of a case as a witness: what it shows outside of the body, and what inside that no structure names.
+"""A cross-check by the CT of a case: what it shows outside of the body, and what inside that no structure names.
 
 What the voxels hold in which points lie.
 """
@@ -21,22 +21,20 @@ from puncture_twin.planning.anatomy.body.limbs import limb_search
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_LONG_MM,
     OutsideImage,
-    beyond_face,
-    beyond_table,
     outside_mask,
     outside_surface,
 )
-from puncture_twin.planning.anatomy.body.tables import FACES, TableSide, find_support
-from puncture_twin.planning.anatomy.second_witness import Named, Unnamed, unnamed_surfaces
+from puncture_twin.planning.anatomy.body.tables import FACES, Face, TableSide, find_support
 from puncture_twin.planning.anatomy.skin import Skin, field_of_view
-from puncture_twin.planning.anatomy.surfaces import Imaged, kept_mesh, mesh_arrays
+from puncture_twin.planning.anatomy.surfaces import Imaged, cached_mesh, mesh_arrays
+from puncture_twin.planning.anatomy.unnamed import Named, Unnamed, unnamed_surfaces
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.formats.labels.label_surface import field_surface
+from puncture_twin.planning.formats.labels.label_surface import mask_surface
 from puncture_twin.planning.formats.mesh_guard import fits
 from puncture_twin.planning.geometry.containment import contains
-from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 
@@ -56,7 +54,7 @@ class Outside(NamedTuple):
 
     mesh: TriangleMesh | None
     couch: TriangleMesh | None
-    open_faces: tuple[tuple[int, int], ...]
+    open_faces: tuple[Face, ...]
 
     @property
     def supported(self) -> bool:
@@ -79,32 +77,35 @@ class Scan:
     skin: Skin | None
 
     def outside(self, air_hu: float) -> Outside:
-        """What is denser than air outside of the body, and beyond which faces of the image nothing is known."""
+        """Surfaces outside of the body denser than air, and the image's faces beyond which nothing is known."""
 
-        def make() -> list[TriangleMesh | None]:
+        def make() -> Arrays:
             ct = self._ct
-            image = OutsideImage(ct.hu, self._body, ct.T_ct_index, ct.spacing_mm, measured=ct.unscanned)
+            image = OutsideImage(ct.hu, self._body, ct.unscanned, ct.T_ct_index, ct.spacing_mm)
             mask = outside_mask(image, air_hu)
-            meshes = self._outside_meshes(image, mask)
-            if all(mesh is None or fits(mesh) for mesh in meshes):
-                return meshes
-            return self._outside_meshes(replace(image, beyond_mm=BEYOND_LONG_MM), mask)
+            meshes, faces = self._outside_meshes(image, mask)
+            if not all(mesh is None or fits(mesh) for mesh in meshes):
+                meshes, faces = self._outside_meshes(replace(image, beyond_mm=BEYOND_LONG_MM), mask)
+            return {**_of_meshes(meshes), "open": np.array([face in faces for face in FACES])}
 
-        solids, supports, *faces = self._kept({"what": "outside", "air_hu": air_hu}, make)
-        open_faces = tuple(face for face, box in zip(FACES, faces, strict=True) if box is not None)
-        return Outside(_joined([solids, supports, *faces]), supports, open_faces)
+        kept = self._kept_arrays({"what": "outside", "air_hu": air_hu}, make)
+        mesh, couch = _to_meshes(kept)
+        return Outside(mesh, couch, tuple(itertools.compress(FACES, kept["open"])))
 
-    def _outside_meshes(self, image: OutsideImage, mask: Bools) -> list[TriangleMesh | None]:
-        """What is outside of the body, what lies beyond tables, and what beyond each open face."""
-        measured = mask & ~image.unscanned.voxels
-        support = find_support(measured, image.body, image.spacing_mm, self._tables, self._ct.shown)
-        supports = [beyond_table(image, side) for side in (*self._tables, *support.drawn)]
-        wider = image.beyond_mm[0]
-        faces = [beyond_face(image, *face, wider_mm=wider) if face in support.open_faces else None for face in FACES]
-        return [outside_surface(image, mask, where=self._ct.where), _joined(supports), *faces]
+    def _outside_meshes(self, image: OutsideImage, mask: Bools) -> tuple[list[TriangleMesh | None], tuple[Face, ...]]:
+        """What is not known to be free; of it what lies beyond tables; and the open faces."""
+        support = find_support(mask & ~image.unscanned, image.body, image.spacing_mm, self._tables, self._ct.shown)
+        beyond, slopes = np.zeros_like(mask), [0.0, 0.0]
+        for side in (*self._tables, *support.drawn):
+            beyond |= side.beyond(mask.shape)
+            slopes[side.face[0]] = side.slope
+        image = replace(image, slopes=(slopes[0], slopes[1]))
+        where = self._ct.where
+        shown = outside_surface(image, mask | beyond, support.open_faces, where=where)
+        return [shown, outside_surface(image, beyond, where=where)], support.open_faces
 
     def end(self) -> tuple[FieldOfView, Floats] | None:
-        """Where this image cuts a body whose skin is not its own, and points (n, 3) of its outlines there, LPS mm.
+        """Where this image cuts a body whose skin comes from elsewhere, and points (n, 3) of its outlines, LPS mm.
 
         None where it does nowhere, or the skin is its own and tells.
         """
@@ -119,7 +120,7 @@ class Scan:
             points = apply(T, np.concatenate(corners))
             return {"T": view.T_ct_box, "size": view.size_mm, "cut": view.cut, "points": points}
 
-        kept = self.source.kept({"what": "end", "skin": self.skin.mesh.digest}, make, dict, by=__name__)
+        kept = self._kept_arrays({"what": "end"}, make)
         return (FieldOfView(kept["T"], kept["size"], kept["cut"]), kept["points"]) if kept["cut"].any() else None
 
     @property
@@ -142,14 +143,14 @@ class Scan:
             limbs = search.limbs()
             if not limbs.any():
                 return None
-            return field_surface(limbs.astype(np.float32) - 0.5, search.T_ct_index, where=self._ct.where)
+            return mask_surface(limbs, search.T_ct_index, where=self._ct.where)
 
         named = [f"{one.name} {one.mesh.digest}" for one in structures]
         made_from = {"what": "attached limbs", "target": target_ct.tolist(), "structures": named}
         return self._kept(made_from, lambda: [make()])[0]
 
     def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
-        """What is dense, or gas, inside the body and in no structure.
+        """Surfaces of what is dense, or gas, inside the body and in no structure.
 
         Args:
             structures: Every structure of the case but the skin.
@@ -219,15 +220,12 @@ class Scan:
         self, made_from: dict[str, Any], make: Callable[[], list[TriangleMesh | None]]
     ) -> list[TriangleMesh | None]:
         """Meshes from the cache, made where they are not there; None is kept too."""
+        return _to_meshes(self._kept_arrays(made_from, lambda: _of_meshes(make())))
+
+    def _kept_arrays(self, made_from: dict[str, Any], make: Callable[[], Arrays]) -> Arrays:
+        """What is made of this CT and the skin, from the cache."""
         skin = None if self.skin is None else self.skin.mesh.digest
-        made_from = {"skin": skin, **made_from}
-        return self.source.kept(made_from, lambda: _of_meshes(make()), _to_meshes, by=__name__)
-
-
-def _joined(meshes: Sequence[TriangleMesh | None]) -> TriangleMesh | None:
-    """Those that are there as one, or None."""
-    found = [mesh for mesh in meshes if mesh is not None]
-    return joined(found) if found else None
+        return self.source.kept({"skin": skin, **made_from}, make, dict, by=__name__)
 
 
 def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:
@@ -239,7 +237,7 @@ def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:
 
 
 def _to_meshes(stored: Arrays) -> list[TriangleMesh | None]:
-    return [kept_mesh(stored, n) if f"faces{n}" in stored else None for n in range(int(stored["count"]))]
+    return [cached_mesh(stored, n) if f"faces{n}" in stored else None for n in range(int(stored["count"]))]
 
 
 def nearest(values: NDArray[np.float32], T_index_ct: Floats, points_ct: Floats) -> Floats:

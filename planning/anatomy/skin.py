@@ -8,16 +8,20 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, filled_slices
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, WIDE, Box, FieldOfView, shifted, spacing_of
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.labels.label_surface import box_in, field_surface
+from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.formats.labels.label_surface import (
+    box_in,
+    frame,
+    framed_surface,
+    mask_surface,
+)
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.volume_files import canonical
 from puncture_twin.planning.geometry.containment import settled_crossings
@@ -61,7 +65,7 @@ class Skin:
 
     @property
     def nbytes(self) -> int:
-        """What mesh and flags hold."""
+        """Bytes of mesh and flags."""
         return self.mesh.nbytes + self.cut_faces.nbytes
 
 
@@ -77,14 +81,16 @@ def skin_of_image(image: CtImage) -> Skin:
     Raises:
         InputError: If no body is found, or no air around it.
     """
-    box = box_in(image.found.body, beside=1)  # beyond it the field is negative
-    body, above = image.found.body[box], np.subtract(image.hu[box], BODY_HU, dtype=np.float32)
-    unlike = ((above > 0) != body) | (above == 0)  # what counts as body, or as air, whatever its value
-    field = np.abs(above, out=above)
-    field[unlike] = HU_RANGE
-    np.clip(field, HU_LEAST, HU_RANGE, out=field)
-    np.negative(field, out=field, where=~body)
-    return _skin(field, image.found, image.T_ct_index, image.where, [one.start for one in box])
+    box = box_in(image.found.body, margin=1)  # beyond it the field is negative
+    framed, field = frame([one.stop - one.start for one in box])
+    for plane, hu, body in zip(field, image.hu[box], image.found.body[box], strict=True):
+        np.subtract(hu, BODY_HU, out=plane, dtype=np.float32)
+        unlike = ((plane > 0) != body) | (plane == 0)  # what counts as body, or as air, whatever its value
+        np.clip(np.abs(plane), HU_LEAST, HU_RANGE, out=plane)
+        np.copyto(plane, HU_RANGE, where=unlike)
+        np.negative(plane, out=plane, where=~body)
+    mesh = framed_surface(framed, image.T_ct_index, where=image.where, first=[one.start for one in box])
+    return _skin(mesh, image.found, image.T_ct_index)
 
 
 def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> Skin:
@@ -101,18 +107,18 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
     where = f"{labelmap.path}, label {label}"
     if label not in labelmap.boxes:
         allowed = f"the labels present: {', '.join(map(str, labelmap.labels_present()))}"
-        raise InputError("no voxel has the label of the skin", where=where, allowed=allowed)
+        refuse("no voxel has the label of the skin", where, allowed, "label_absent")
     oriented = canonical(labelmap.labels, labelmap.T_ct_index)
     box = box or tuple((0, n) for n in oriented.values.shape)
     body = filled_slices(oriented.values[tuple(slice(*ends) for ends in box)] == label)
     if body.all():
-        raise InputError("no air around the body", where=where, allowed="a label with a border inside the image")
-    found = BodyMask(body, np.zeros_like(body), ())
-    return _skin(np.where(body, 0.5, -0.5), found, shifted(oriented.T_ct_index, box), where)
+        refuse("no air around the body", where, "a label with a border inside the image", "no_air")
+    T_ct_box = shifted(oriented.T_ct_index, box)
+    return _skin(mask_surface(body, T_ct_box, where=where), BodyMask(body, np.zeros_like(body), ()), T_ct_box)
 
 
 def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
-    """A mesh that is the whole skin, or the skin of a body that was cut at some sides.
+    """The skin of a mesh: of a whole body, or of one that was cut at some sides.
 
     Args:
         mesh: In LPS mm (or the local frame, without cuts).
@@ -135,7 +141,7 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
         sides[axis, end] = True
         in_plane = np.all(np.abs(mesh.triangles[:, :, axis] - (low, high)[end][axis]) < CUT_PLANE_MM, axis=1)
         if not in_plane.any():
-            raise InputError(f"no flat end at its {name}", where="skin mesh", allowed="a side where the body was cut")
+            refuse(f"no flat end at its {name}", "skin mesh", "a side where the body was cut", "no_flat_end")
         cut_faces |= in_plane
     return Skin(mesh, cut_faces, FieldOfView(pose(np.eye(3), low), high - low, sides), warnings)
 
@@ -164,14 +170,7 @@ def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
     return tuple(ends)
 
 
-def _skin(
-    field: NDArray[np.floating],
-    found: BodyMask,
-    T_ct_index: Floats,
-    where: str | Path,
-    first: ArrayLike = 0,
-) -> Skin:
-    mesh = field_surface(field, T_ct_index, where=where, first=first)
+def _skin(mesh: TriangleMesh, found: BodyMask, T_ct_index: Floats) -> Skin:
     view = field_of_view(found.body, T_ct_index)
     centres = mesh.triangles.mean(axis=1)
     cut_faces = _on_cut_border(view, spacing_of(T_ct_index), centres) | _at_unscanned(found, T_ct_index, centres)
@@ -179,7 +178,7 @@ def _skin(
 
 
 def field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
-    """Up to the outer faces of the border voxels that the body reaches."""
+    """The box that was imaged, up to the outer faces of the border voxels that the body reaches."""
     spacing = spacing_of(T_ct_index)
     axes, origin = T_ct_index[:3, :3], T_ct_index[:3, 3]
     T_ct_image = pose(axes / spacing, origin - 0.5 * axes.sum(axis=1))

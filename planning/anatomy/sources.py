@@ -11,9 +11,9 @@ from puncture_twin.planning.anatomy.body.tables import Shown
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin, flat_ends
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.anatomy.surfaces import Imaged, VolumeSurfaces, kept_skin
+from puncture_twin.planning.anatomy.surfaces import Imaged, VolumeSurfaces, cached_skin
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
@@ -53,7 +53,7 @@ class StructureSources:
         return Structure(section.name, role, margin_mm, mesh, source, voxel_ct=voxel_ct)
 
     def many(self, section: StructuresSection) -> list[partial[Structure]]:
-        """All labels of one map, or masks of one folder, that the rules do not ignore; their surfaces when called."""
+        """All labels of a map, or masks of a folder, that the rules do not ignore; their surfaces are made on call."""
         if section.mask_set is not None:
             return self._masks(section, section.mask_set)
         name = section.source
@@ -137,18 +137,16 @@ class StructureSources:
         local = self._case.space is Space.LOCAL or section.cut is not None
         ends = () if local else kept.get((flat_ends.__name__, mesh.digest), partial(flat_ends, mesh), _no_bytes)
         if ends:
-            raise InputError(
-                f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?",
-                where=self._case.path,
-                allowed=f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin",
-            )
+            what = f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?"
+            allowed = f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin"
+            refuse(what, self._case.path, allowed, "skin_cut_unstated")
         cut = section.cut or ()
-        return kept_skin(mesh, cut, self._cache)
+        return cached_skin(mesh, cut, self._cache)
 
     def _seen(
         self, name: str, label: int | None, structures: Sequence[Structure], stated: Sequence[str] | None
     ) -> Imaged:
-        """What a CT, or the label of a body, shows of it."""
+        """Voxels of a CT, or of a body's label, that show the body's outside."""
         if (name, label) not in self._imaged:
             volume = self._volume(name) if label is None else self._labels(name)
             organs, ct = [(one.mesh, one.voxel_mm) for one in structures], self._case.ct
@@ -160,11 +158,8 @@ class StructureSources:
         """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
         own, named = skin_section.ct, self._case.ct.file
         if own is not None and named not in {None, own}:
-            raise InputError(
-                f"[ct] file '{named}' is not the CT of the skin, '{own}'",
-                where=self._case.path,
-                allowed="one CT: leave out [ct] file where the skin comes from a CT",
-            )
+            allowed = "one CT: leave out [ct] file where the skin comes from a CT"
+            refuse(f"[ct] file '{named}' is not the CT of the skin, '{own}'", self._case.path, allowed, "several_cts")
         name = own or named
         if name is None:
             return None
@@ -172,17 +167,15 @@ class StructureSources:
         seen = self._seen(name, None, structures, skin_section.cut if own else None)
         scan = Scan(name, seen, None if own else skin)
         if not scan.contains(self._case.target_ct):
-            raise InputError(
-                f"[ct] file '{name}' does not show the target: a slip of file or space?",
-                where=self._case.path,
-                allowed="a CT that holds the target, in the space of the structures",
-            )
+            what = f"[ct] file '{name}' does not show the target: a slip of file or space?"
+            allowed = "a CT that holds the target, in the space of the structures"
+            refuse(what, self._case.path, allowed, "target_outside_ct")
         return scan
 
     def _mesh(self, section: StructureSection) -> TriangleMesh:
         where = f"{self._case.path}: structure '{section.name}'"
         if section.mesh is None or section.unit is None:
-            raise InputError("no mesh with a unit", where=where, allowed="mesh and unit")
+            refuse("no mesh with a unit", where, "mesh and unit", "missing_source")
         file, by_default = self._file(section.mesh), section.space is None
         space = parse_space(section.space, where=where) if section.space else self._case.space
         unit = parse_unit(section.unit, where=where)
@@ -196,7 +189,7 @@ class StructureSources:
 
     def _label(self, section: StructureSection) -> TriangleMesh:
         if section.labelmap is None or section.label is None:
-            raise InputError(f"'{section.name}' has no source", where=self._case.path, allowed="mesh or labelmap")
+            refuse(f"'{section.name}' has no source", self._case.path, "mesh or labelmap", "missing_source")
         return self._labels(section.labelmap).label(section.label)
 
     def _labels(self, name: str) -> VolumeSurfaces:
@@ -215,9 +208,7 @@ class StructureSources:
 
     def _refuse_local(self, name: str, kind: str) -> None:
         if self._case.space is Space.LOCAL:
-            raise InputError(
-                f'{kind} {name} in a case of space "local"', where=self._case.path, allowed='space "LPS" or "RAS"'
-            )
+            refuse(f'{kind} {name} in a case of space "local"', self._case.path, 'space "LPS" or "RAS"', "local_space")
 
     def _volume(self, name: str) -> VolumeSurfaces:
         if name not in self._volumes:
@@ -226,7 +217,7 @@ class StructureSources:
         return self._volumes[name]
 
     def _open(self, name: str) -> VolumeSurfaces:
-        """A volume that nobody else holds, so that its voxels go when it does."""
+        """A volume held by its caller alone, so that its voxels are freed with it."""
         source = self._case.volumes.source(name)
         hashes = (self._case.files.sha256(file) for file in source.files)
         return VolumeSurfaces(source, (*hashes, *source.part), self._cache)

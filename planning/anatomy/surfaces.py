@@ -47,7 +47,7 @@ MASK_BYTES = 3
 
 
 class Present(NamedTuple):
-    """What a label map or mask holds.
+    """The labels that a map or mask holds.
 
     Attributes:
         labels: Those that have a voxel, rising.
@@ -58,7 +58,7 @@ class Present(NamedTuple):
     rounded_by: float
 
     def notes(self, path: Path) -> tuple[str, ...]:
-        """What a person should be told of how a file was read."""
+        """Notes for a person on how a file was read."""
         said = f"{path.name}: its labels are up to {self.rounded_by:.2g} off whole numbers, and were rounded"
         return (said,) if self.rounded_by else ()
 
@@ -111,7 +111,7 @@ class VolumeSurfaces:
         return self._kept("labels present", lambda: _of_present(self.labelmap), _to_labels)
 
     def mask(self) -> Present:
-        """Of a file that is one structure's mask its voxels' value; none where it is empty."""
+        """The voxels' value in a file that is one structure's mask; none where it is empty."""
 
         def make() -> Arrays:
             labels = labelmap_of(self.volume, may_be_empty=True)
@@ -123,12 +123,12 @@ class VolumeSurfaces:
     def label(self, label: int) -> TriangleMesh:
         """The surface of one label, LPS mm."""
         return self._kept(
-            f"label {label}", lambda: mesh_arrays(label_mesh(self.labelmap, label, where=self.path)), kept_mesh
+            f"label {label}", lambda: mesh_arrays(label_mesh(self.labelmap, label, where=self.path)), cached_mesh
         )
 
     @cached_property
     def ct_image(self) -> CtImage:
-        """All voxels of a CT."""
+        """All voxels of the CT."""
 
         def make() -> CtImage:
             return ct_image(vars(self).pop("volume", None) or self.source.volume())  # nobody asks for it again
@@ -143,7 +143,7 @@ class VolumeSurfaces:
         shown: Shown = PATIENT,
         stated: Collection[str] | None = None,
     ) -> Imaged:
-        """What a scanner saw of a body, without what was laid around it.
+        """A scanner's image of a body, without padding around it.
 
         Args:
             label: Of the body, in a label map; None where this is a CT.
@@ -163,7 +163,7 @@ class VolumeSurfaces:
         return _of_content(content_of(labels.values == label, labels.T_ct_index))
 
     def held(self, what: str, make: Callable[[], Value], size: Callable[[Value], int]) -> Value:
-        """What is made from this file, and is held in memory alone, where that does not push out all else."""
+        """Value made from this file, cached in memory alone, where that does not displace everything else."""
         memory = self.cache.memory
 
         def held_bytes(value: Value) -> int:
@@ -174,7 +174,7 @@ class VolumeSurfaces:
     def kept(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
     ) -> Value:
-        """What is made from this file and from what ``made_from`` says; see `Cache.value`."""
+        """Value made from this file and from what ``made_from`` states, cached; see `Cache.value`."""
         return self.cache.value({"files": self.sha256, "readers": _readers(), **made_from}, make, read, by=by)
 
     def _kept(self, what: str, make: Callable[[], Arrays], read: Callable[[Arrays], Value]) -> Value:
@@ -183,7 +183,7 @@ class VolumeSurfaces:
 
 @dataclass(frozen=True)
 class Imaged:
-    """What a scanner saw: a CT, or a label that is the body, without what was laid around it.
+    """A scanner's image of a body: a CT, or a body's label, without padding around it.
 
     Attributes:
         surfaces: Of the whole file.
@@ -231,7 +231,7 @@ class Imaged:
         return self.surfaces.kept({"box": self.box, "shown": asdict(self.shown), **made_from}, make, read, by=by)
 
 
-def kept_skin(mesh: TriangleMesh, cut: Sequence[str], cache: Cache) -> Skin:
+def cached_skin(mesh: TriangleMesh, cut: Sequence[str], cache: Cache) -> Skin:
     """`skin_from_mesh` of a mesh and the sides at which the body was cut, from the cache."""
     made_from = {"what": "skin of a mesh", "mesh": mesh.digest, "cut": list(cut)}
     return cache.value(made_from, lambda: _of_skin(skin_from_mesh(mesh, cut)), _to_skin, by=__name__)
@@ -243,7 +243,7 @@ def _readers() -> str:
 
 
 def mesh_arrays(mesh: TriangleMesh, number: int | str = "") -> Arrays:
-    """A surface for the cache, and what takes longest to find of it; see `kept_mesh`."""
+    """A surface for the cache, and what takes longest to find of it; see `cached_mesh`."""
     facts = np.array([mesh.closed, mesh.wound_alike])
     return {f"vertices{number}": mesh.vertices, f"faces{number}": mesh.faces, f"facts{number}": facts}
 
@@ -257,13 +257,13 @@ def _of_skin(skin: Skin) -> Arrays:
 
 def _to_skin(stored: Arrays) -> Skin:
     view = FieldOfView(stored["T_ct_box"], stored["size_mm"], stored["cut"]) if "T_ct_box" in stored else None
-    mesh, cut_faces = kept_mesh(stored), stored["cut_faces"]
+    mesh, cut_faces = cached_mesh(stored), stored["cut_faces"]
     if cut_faces.shape != (len(mesh.faces),):
         raise ValueError("one flag for each triangle")
     return Skin(mesh, cut_faces, view, tuple(str(warning) for warning in stored["warnings"]))
 
 
-def kept_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
+def cached_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
     """A surface, which went through the guard before it was stored, and does again: kept files may be anything.
 
     Args:

@@ -17,14 +17,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
+from scipy.sparse.csgraph import connected_components
 
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, FieldOfView
-from puncture_twin.planning.anatomy.body.outside_body import prism
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import LabelGrid, Role, Structure, label_grids
 from puncture_twin.planning.base.arrays import Floats, widened
-from puncture_twin.planning.base.errors import Finding, InputError, Severity
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.label_surface import mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
@@ -40,6 +41,8 @@ ASIDE_MM = 400.0
 """So far it goes on beyond a face that cuts its side: no trunk is wider than 800 mm."""
 USUAL_MM = 150.0
 """By so much a body without arms is wider than where an image cuts it: hips below a waist, shoulders above a chest."""
+ARM_MM3 = 1.5e5
+"""An adult's arm has this in 40 mm of its length, a child's in 100; no bottle or cushion lies at both sides."""
 OUTLINE_MM = 10.0
 """The outline at a face is that of the body's last so many mm: slices of twice as much show it."""
 SAME_MM = 0.01
@@ -63,13 +66,13 @@ class Beyond(NamedTuple):
 
 
 def beyond_images(case: Case, skin: Skin, scan: Scan | None) -> Beyond:
-    """What lies beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere."""
+    """Solids assumed beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere."""
     ends = [] if skin.field_of_view is None else [(skin.field_of_view, skin.mesh.vertices)]
     of_scan = None if scan is None else scan.end()
     ends = [end for end in [*ends, *([] if of_scan is None else [of_scan])] if end[0].cut.any()]
     if not ends:
         return Beyond((), ())
-    found = [assumed(case, view) for view, _ in ends]
+    found = [assumed(case, view, skin) for view, _ in ends]
     mesh = joined([beyond_image(*end, one.wider_mm, _breath(case)) for end, one in zip(ends, found, strict=True)])
     solid = Structure(BEYOND_IMAGE, Role.UNKNOWN, case.ct.margin_mm, mesh, "beyond the image", True, np.zeros((3, 3)))
     own = "; cut of the skin's table, [] if all of it is skin" if case.skin_section.mesh else ""
@@ -77,20 +80,35 @@ def beyond_images(case: Case, skin: Skin, scan: Scan | None) -> Beyond:
     return Beyond((solid,), tuple({one.sentence: one for one in said}.values()))
 
 
-def assumed(case: Case, view: FieldOfView) -> Assumed:
-    """What holds of a case: a person's word, or the usual where no arm can lie beyond.
+def assumed(case: Case, view: FieldOfView, skin: Skin) -> Assumed:
+    """Width assumed beyond a case's image: as a person states it, or the usual where no arm can be beyond.
 
     An arm that is stretched out lies farther from the trunk than anything usual: unless there is none, or the image
-    shows the arms and the body's whole width, all that lies beyond a cut is unknown.
+    shows the arms (a person says so, or they are seen at both sides) and the body's whole width, all that lies beyond a
+    cut is unknown.
     """
     ct = case.ct
     if ct.beyond_mm is not None:
         return Assumed(ct.beyond_mm, "[ct] beyond_mm")
     if ct.arms == "none" or case.region == "phantom":
         return Assumed(USUAL_MM, "no arms" if ct.arms == "none" else "a phantom")
-    if ct.arms == "present" and not view.cut[0].any():
+    if not view.cut[0].any() and (ct.arms == "present" or _shows_arms(skin.mesh)):
         return Assumed(USUAL_MM, "the image shows the arms, and the body's whole width")
     return Assumed(np.inf, "nothing says where the arms lie")
+
+
+def _shows_arms(skin: TriangleMesh) -> bool:
+    """Whether beside the trunk, at its left and at its right, lie parts of the body that are as large as arms are."""
+    edges = np.concatenate([skin.faces[:, :2], skin.faces[:, 1:]])
+    graph = scipy.sparse.coo_array((np.ones(len(edges), bool), edges.T), (len(skin.vertices),) * 2)
+    part = connected_components(graph, directed=False)[1][skin.faces[:, 0]]
+    a, b, c = np.moveaxis(skin.triangles - skin.bounds.mean(axis=0), 1, 0)
+    volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
+    trunk, sides = skin.triangles[part == volume.argmax(), :, 0], set()
+    for number in np.flatnonzero((volume > ARM_MM3) & (volume < volume.max())):
+        aside = skin.triangles[part == number, :, 0] - trunk.mean()
+        sides.add(np.sign(aside.mean()) if np.abs(aside).min() > np.ptp(trunk) / 4.0 else 0.0)
+    return bool({-1.0, 1.0} <= sides)
 
 
 def beyond_image(view: FieldOfView, points_ct: Floats, wider_mm: float, moved_ct: Floats | None = None) -> TriangleMesh:
@@ -137,6 +155,18 @@ def _outline(points: Floats, wider_mm: float) -> Floats:
     along = (np.roll(away, -1) - away * np.cos(step)) / np.sin(step)
     corners = away[:, None] * normals + along[:, None] * np.stack([-normals[:, 1], normals[:, 0]], axis=1)
     return np.asarray(corners[np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) > SAME_MM])
+
+
+def prism(T_ct_box: Floats, outline: Floats, axis: int, between: tuple[float, float]) -> TriangleMesh:
+    """What stands over a convex polygon, shape (n, 2), between two planes across an axis, seen from outside; mm."""
+    n = len(outline)
+    index = np.concatenate([np.insert(outline, axis, at, axis=1) for at in between])
+    i, j = np.arange(n), np.roll(np.arange(n), -1)
+    fan = np.stack([np.zeros(n - 2, int), np.arange(1, n - 1), np.arange(2, n)], axis=1)
+    sides = np.concatenate([np.stack([i, i + n, j], axis=1), np.stack([j, i + n, j + n], axis=1)])
+    faces = np.concatenate([fan, fan[:, ::-1] + n, sides]).astype(np.int32)
+    mesh = TriangleMesh(apply(T_ct_box, index), faces)
+    return mesh if mesh.volume > 0.0 else TriangleMesh(mesh.vertices, faces[:, ::-1])
 
 
 def _breath(case: Case) -> Floats:
@@ -211,7 +241,7 @@ class _Extent:
 
     @property
     def gaps(self) -> Floats:
-        """By how many voxels the body goes on beyond each low and high face, shape (2, 3)."""
+        """Number of voxels by which the body goes on beyond each low and high face, shape (2, 3)."""
         low, high = self.box
         return np.stack([low - self.low, self.high - high])
 
@@ -241,7 +271,7 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure]) -> Be
         said = ENDS.format(name=grid.name, voxels=extent.gaps.max())
         if not skin.mesh.closed:
             allowed = "a label map of the whole body about the target, or a closed skin"
-            raise InputError(f"{said} (the skin is open)", where=case.path, allowed=allowed)
+            refuse(f"{said} (the skin is open)", case.path, allowed, "labels_end")
         warnings.append(f"{said} ({BEYOND_LABELS})")
         margins.append(margin)
         meshes += list(_slabs(extent, skin.mesh))
@@ -249,7 +279,7 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure]) -> Be
 
 
 def _largest_margin(case: Case, grid: LabelGrid, structures: Sequence[Structure]) -> float:
-    """Of the labels that are there, those that patterns name and that may lie beyond, and of what nobody named; mm."""
+    """Largest margin, mm, of structures that may lie beyond an image: those that patterns name, and unnamed ones."""
     sections = [one for one in case.structures if one.source == grid.name]
     named = [margin for one in sections for margin in (*one.avoid.values(), *one.unknown.values())]
     return max([case.ct.margin_mm, *named, *(one.margin_mm for one in grid.own(structures))])
@@ -268,7 +298,7 @@ def _refuse_without_target(case: Case, grid: LabelGrid) -> None:
     index = apply(np.linalg.inv(grid.voxels.T_ct_index), case.target_ct[None])[0]
     if np.any(index < -0.5) or np.any(index > np.array(grid.voxels.shape) - 0.5):
         what = f"label map {grid.name} ends before the target, so that all about it is unknown"
-        raise InputError(what, where=case.path, allowed="label maps that hold the target")
+        refuse(what, case.path, "label maps that hold the target", "labels_end")
 
 
 def _slabs(extent: _Extent, skin: TriangleMesh) -> Iterator[TriangleMesh]:

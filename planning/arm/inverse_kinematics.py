@@ -33,7 +33,7 @@ TURN = 2.0 * math.pi
 
 
 def inverse(model: UrModel, T_base_flange: Floats) -> Floats:
-    """All configurations that reach each flange pose.
+    """All joint configurations that put the flange at each pose.
 
     Args:
         model: The arm.

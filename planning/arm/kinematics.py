@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.ur import UR_MODELS, UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.formats.points import JointRecording
 
@@ -449,7 +449,7 @@ def check_arm(
     arm = f"; those of a {' or '.join(likely)} do not" if likely else ""
     what = f"the joints of {names[row]} put the tool of a {model.name} {own[row]:.1f} mm from where it was{arm}"
     allowed = f"within {MOST_OFF_MM:g} mm: joints of the case's arm, in their unit, with its needle"
-    raise InputError(what, where=where, allowed=allowed, code="joints_of_another_arm")
+    refuse(what, where, allowed, "joints_of_another_arm")
 
 
 def check_recording(model: UrModel, tip_mm: float, recording: JointRecording, *, where: str | Path) -> None:

@@ -23,7 +23,7 @@ from puncture_twin.planning.arm.urdf.lengths import NOTHING_STATED, StatedLimits
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined, packed_meshes, unpacked_meshes
 
 LINK_NAMES = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -42,7 +42,7 @@ PIN_RADIUS_MM = 10.0
 """Radius of the pin that replaces a joint where the meshes leave a gap: well inside every link."""
 
 FLUSH_MM = 1e-4
-"""Meshes that overlap along their joint's axis by less than this end in one plane: rounding says whether they touch."""
+"""Overlap along their joint's axis below which two meshes end in one plane: whether they touch is rounding."""
 
 FLAT_MM = 0.05
 """Points that lie within such a sheet span no body: their hull would be one of rounding."""
@@ -81,9 +81,6 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
     What is clear of them is clear of the link; the price is a few mm where a link is hollow. Most of the UR3's own
     meshes are open, where "inside" means nothing; a hull is always closed.
 
-    Args:
-        model: The arm.
-
     Raises:
         InputError: If no meshes ship for this model, or one cannot be used.
     """
@@ -101,7 +98,6 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
 
 
 def _convex_links(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
-    """The pieces of each link."""
     pieces = [
         tuple(piece for mesh in meshes for piece in _pieces(mesh, name, model))
         for name, meshes in zip(LINK_NAMES, _link_shapes(model), strict=True)
@@ -140,7 +136,7 @@ def _link_shapes(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
 def _pieces(mesh: TriangleMesh, name: str, model: UrModel) -> tuple[TriangleMesh, ...]:
     pieces = convex_pieces(mesh, SLABS.get(name, 1))
     if not pieces:
-        raise InputError(f"a shape of the {name} is flat", where=model_urdf(model).where, allowed="bodies, not sheets")
+        refuse(f"a shape of the {name} is flat", model_urdf(model).where, "bodies, not sheets", "flat_mesh")
     return pieces
 
 
@@ -204,7 +200,7 @@ def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[Tr
             allowed = (
                 f"shapes that meet along their joint's axis, to {MOST_GAP_MM:g} mm: see their unit, scale and origin"
             )
-            raise InputError(what, where=model_urdf(model).where, allowed=allowed)
+            refuse(what, model_urdf(model).where, allowed, "links_apart")
         pins.append(tuple(_pin(a - PIN_ROOT_MM, b + PIN_ROOT_MM) for a, b in gaps))
     return [*pins, ()]
 
@@ -248,7 +244,7 @@ def model_urdf(model: UrModel) -> ArmUrdf:
         return model.urdf
     if not model.shipped:
         what = f"the arm {model.name!r} is known by its numbers alone"
-        raise InputError(what, where="robot", allowed="the case that names its URDF")
+        refuse(what, "robot", "the case that names its URDF", "urdf_missing")
     return _shipped(model.name)
 
 
@@ -264,7 +260,7 @@ def _shipped(name: str) -> ArmUrdf:
     path = meshes.folder() / SHAPES / f"{name}.urdf"
     if not path.is_file():
         allowed = ", ".join(sorted(p.stem for p in path.parent.glob("*.urdf")))
-        raise InputError(f"no link meshes for robot {name!r}", where=f"meshes/{SHAPES}", allowed=allowed)
+        refuse(f"no link meshes for robot {name!r}", f"meshes/{SHAPES}", allowed, "no_link_meshes")
     return read_arm_urdf(
         path.read_bytes(),
         path,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.links import convex_pieces
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 
@@ -47,7 +47,7 @@ class ToolBody:
         """
         pieces = convex_pieces(self.mesh, SLABS)
         if not pieces:
-            raise InputError("the mesh is flat", where=self.key, allowed="a body, not a sheet")
+            refuse("the mesh is flat", self.key, "a body, not a sheet", "flat_mesh")
         return pieces
 
     def __eq__(self, other: object) -> bool:
@@ -90,13 +90,10 @@ class Tool:
         for name in ("needle_length_mm", "shaft_mm", "needle_diameter_mm", "holder_diameter_mm"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
-                raise InputError(f"{name} = {value}", where="tool", allowed="finite and above 0")
+                refuse(f"{name} = {value}", "tool", "finite and above 0", "not_positive")
         if self.shaft_mm > self.needle_length_mm:
-            raise InputError(
-                f"shaft_mm = {self.shaft_mm}",
-                where="tool",
-                allowed=f"at most needle_length_mm = {self.needle_length_mm}",
-            )
+            allowed = f"at most needle_length_mm = {self.needle_length_mm}"
+            refuse(f"shaft_mm = {self.shaft_mm}", "tool", allowed, "out_of_range")
 
     @property
     def holder_length_mm(self) -> float:
@@ -136,15 +133,15 @@ class Box:
         rigid = T.shape == (4, 4) and bool(np.isfinite(T).all())
         rigid = rigid and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9) and np.linalg.det(T[:3, :3]) > 0
         if not rigid:
-            raise InputError("T_base_box is not rigid", where=f"box {self.name!r}", allowed="rotation and mm")
+            refuse("T_base_box is not rigid", f"box {self.name!r}", "rotation and mm", "not_rigid")
         if not all(np.isfinite(edge) and edge > 0.0 for edge in self.size_mm):
-            raise InputError(f"size_mm = {self.size_mm}", where=f"box {self.name!r}", allowed="three lengths above 0")
+            refuse(f"size_mm = {self.size_mm}", f"box {self.name!r}", "three lengths above 0", "not_positive")
         T.setflags(write=False)
         object.__setattr__(self, "T_base_box", T)
 
     @property
     def corners(self) -> Floats:
-        """Its eight corners, base frame, shape (8, 3), mm."""
+        """The eight corners of the box, base frame, shape (8, 3), mm."""
         local = np.array(list(product((-0.5, 0.5), repeat=3))) * self.size_mm
         return np.asarray(apply(self.T_base_box, local))
 
@@ -179,7 +176,7 @@ def gantry_boxes(
     """
     for name, value in (("bore_diameter_mm", bore_diameter_mm), ("wall_mm", wall_mm), ("depth_mm", depth_mm)):
         if not (np.isfinite(value) and value > 0.0):
-            raise InputError(f"{name} = {value}", where="gantry", allowed="finite and above 0")
+            refuse(f"{name} = {value}", "gantry", "finite and above 0", "not_positive")
     radius = bore_diameter_mm / 2.0
     inner, outer = radius * np.cos(np.pi / SIDES), radius + wall_mm
     size = (outer - inner, 2.0 * outer * np.tan(np.pi / SIDES), depth_mm)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 
 ELBOW = 2
 """Index of the elbow among the six joints."""
@@ -177,5 +177,5 @@ def ur_model(name: str) -> UrModel:
     """
     model = UR_MODELS.get(name.lower())
     if model is None:
-        raise InputError(f"unknown robot model {name!r}", where="robot model", allowed=", ".join(UR_MODELS))
+        refuse(f"unknown robot model {name!r}", "robot model", ", ".join(UR_MODELS), "unknown_robot")
     return model

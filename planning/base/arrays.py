@@ -1,9 +1,12 @@
 """The arrays of this project by what they hold; a docstring beside each use gives shape, unit and frame."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -23,6 +26,15 @@ def read_only(array: ArrayLike) -> Floats:
     copy = np.array(array, dtype=np.float64)
     copy.setflags(write=False)
     return copy
+
+
+def is_frozen(array: Any, dtype: DTypeLike) -> bool:
+    """Whether this is an array of a kind that nobody writes to, down to the memory that it looks at."""
+    if type(array) is not np.ndarray or array.dtype != dtype or not (array.flags.c_contiguous and array.flags.aligned):
+        return False
+    while type(array) is np.ndarray and not array.flags.writeable:
+        array = array.base
+    return array is None or type(array) is bytes
 
 
 def widened(mask: Bools, reach: Sequence[int] | NDArray[np.integer]) -> Bools:

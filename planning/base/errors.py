@@ -7,6 +7,7 @@ Parts of the installation that planner, map and page do without, and what is sai
 
 from __future__ import annotations
 
+import copy
 import json
 import sys
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NoReturn, Self
 
 MOST_WHAT, MOST_WHERE, MOST_ALLOWED = 400, 300, 600
 """Characters of an error's parts: what is longer loses its middle, so that the line can still be read."""
@@ -27,8 +28,11 @@ MOST_MESSAGE = 1_500
 class PlanningError(Exception):
     """Base of everything that the planner raises on purpose."""
 
+    code = "program_failed"
+    """The kind of mistake, for those who ask a program and not a person."""
+
     def __reduce__(self) -> tuple[Any, ...]:
-        """With all its parts, which a process that sends it makes again; they do not follow from the message alone."""
+        """For pickling between processes: all parts of the error, which its message alone does not hold."""
         return _error_again, (type(self), self.args, vars(self))
 
 
@@ -46,7 +50,7 @@ class InputError(PlanningError):
         what: What is wrong, with the offending value.
         where: The file, and the place in it (key, line, marker name).
         allowed: What would have been accepted.
-        code: What kind of fault it is, in one word, for those who ask a program and not a person.
+        code: What kind of mistake it is, in snake_case: the same kind has one code, wherever it is found.
         numbers: What was measured, by name with its unit.
     """
 
@@ -59,14 +63,29 @@ class InputError(PlanningError):
         *,
         where: str | Path,
         allowed: str,
-        code: str = "",
+        code: str,
         numbers: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         self.code, self.numbers = code, dict(numbers)
         self.what = one_line(what, self.most_what)
         self.where = one_line(str(where), MOST_WHERE)
         self.allowed = one_line(allowed, MOST_ALLOWED)
-        super().__init__(f"{self.where}: {self.what}; allowed: {self.allowed}")
+        super().__init__(self.what)
+
+    def __str__(self) -> str:
+        """One line: where, what, and what is allowed."""
+        return f"{self.where}: {self.what}; allowed: {self.allowed}"
+
+    def at(self, where: str | Path) -> Self:
+        """This error with another place in it."""
+        moved = copy.copy(self)
+        moved.where = one_line(str(where), MOST_WHERE)
+        return moved
+
+
+def refuse(what: str, where: str | Path, allowed: str, code: str) -> NoReturn:
+    """Raise an `InputError` of these parts: the usual way, where no other error is its cause."""
+    raise InputError(what, where=where, allowed=allowed, code=code)
 
 
 class InputListError(InputError):
@@ -75,16 +94,25 @@ class InputListError(InputError):
     most_what = 900
 
 
+class SchemaError(ValueError):
+    """What a file's schema refuses: a sentence about keys, and its code."""
+
+    def __init__(self, what: str, code: str) -> None:
+        self.code = code
+        super().__init__(what)
+
+
 class NoAnswerError(PlanningError):
     """The work was done and the answer is no. The command line exits with code 1.
 
     Args:
         message: What was not found.
+        code: Why not, as an `InputError` has it.
         counts: How many candidates fell to which reason.
     """
 
-    def __init__(self, message: str, *, counts: dict[str, int] | None = None) -> None:
-        self.counts = dict(counts or {})
+    def __init__(self, message: str, *, code: str, counts: Mapping[str, int] = MappingProxyType({})) -> None:
+        self.code, self.counts = code, dict(counts)
         super().__init__(message)
 
 
@@ -133,7 +161,7 @@ class Finding:
     way_out: str = ""
 
     def document(self) -> dict[str, object]:
-        """As it stands under ``findings`` of ``--json``."""
+        """The finding as it is listed under ``findings`` of ``--json``."""
         return {
             "code": self.code,
             "severity": str(self.severity),
@@ -177,7 +205,7 @@ def require_extra(extra: str, where: str, *, else_allowed: str = "") -> None:
 
 
 def _install_line(extra: str, missing: list[str]) -> str:
-    """What installs it, from where this was installed: the project is on no index."""
+    """Command that installs an extra, from where this package was installed: it is on no index."""
     if all(name in NO_WHEEL_FROM and sys.version_info >= NO_WHEEL_FROM[name][1] for name in missing):
         names = " ".join(NO_WHEEL_FROM[name][0] for name in missing)
         version = ".".join(map(str, sys.version_info[:2]))

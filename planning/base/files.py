@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 
 OUTPUT_NAMES = (
     "manifest.json",
@@ -53,7 +53,8 @@ def sha256(path: Path) -> str:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
+        what = f"cannot be read ({error.strerror})"
+        raise InputError(what, where=path, allowed="a readable file", code="unreadable") from error
 
 
 def is_plain_file(path: Path) -> bool:
@@ -84,12 +85,15 @@ def atomic(path: Path) -> Iterator[Path]:
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     except OSError as error:
         what = f"cannot be written ({error.strerror})"
-        raise InputError(what, where=_shown(path), allowed="a folder that may be written to") from error
+        where = _shown(path)
+        raise InputError(what, where=where, allowed="a folder that may be written to", code="unwritable") from error
     os.close(handle)
     temporary = Path(name)
     temporary.chmod(0o644)
     try:
         yield temporary
+        if path.is_dir():
+            refuse("is a folder", _shown(path), "the name of a file", "unwritable")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -107,9 +111,10 @@ def check_writable(folder: Path) -> Path:
         nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists() or place.is_symlink())
         usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) and _names_fit(nearest, folder)
     except (OSError, ValueError) as error:
-        raise InputError(f"output folder cannot be used ({error})", where=_shown(folder), allowed=allowed) from error
+        what = f"output folder cannot be used ({error})"
+        raise InputError(what, where=_shown(folder), allowed=allowed, code="unwritable") from error
     if not usable:
-        raise InputError("output folder cannot be written to", where=_shown(folder), allowed=allowed)
+        refuse("output folder cannot be written to", _shown(folder), allowed, "unwritable")
     return folder
 
 
@@ -124,32 +129,31 @@ def _shown(path: Path) -> str:
     return str(path).encode("utf-8", "replace").decode("utf-8")[:200]
 
 
-def read_input(path: Path, *, max_bytes: int, where: str) -> bytes:
-    """All bytes of a file.
+def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> bytes:
+    """Read all bytes of a file.
 
     Args:
         path: The file.
         max_bytes: A larger one is refused before it is read.
         where: How the error names it.
+        allowed: What is wanted there; empty for any file.
 
     Raises:
         InputError: If it is missing, no regular file, empty, too large, or not readable.
     """
-    allowed = f"a readable file of 1 to {max_bytes} bytes"
+    allowed = allowed or f"a readable file of 1 to {max_bytes} bytes"
     try:
         if not path.exists():
             other = _other_case(path)
-            raise InputError(
-                f"no such file; there is '{other}'" if other else "no such file", where=where, allowed=allowed
-            )
+            refuse(f"no such file; there is '{other}'" if other else "no such file", where, allowed, "no_such_file")
         if not path.is_file():
-            raise InputError("not a file but a directory or device", where=where, allowed=allowed)
+            refuse("not a file but a directory or device", where, allowed, "not_a_file")
         size = path.stat().st_size
         if not 0 < size <= max_bytes:
-            raise InputError(f"file of {size} bytes", where=where, allowed=allowed)
+            refuse(f"file of {size} bytes", where, allowed, "file_size")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # unreadable, or a path with a NUL in it
-        raise InputError(f"cannot be read ({error})", where=where, allowed=allowed) from error
+        raise InputError(f"cannot be read ({error})", where=where, allowed=allowed, code="unreadable") from error
 
 
 def absence(path: Path) -> str:
@@ -198,4 +202,5 @@ def decode_text(data: bytes, where: str) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"byte {error.start} is not text", where=where, allowed="text in UTF-8") from error
+        what = f"byte {error.start} is not text"
+        raise InputError(what, where=where, allowed="text in UTF-8", code="not_text") from error

@@ -1,12 +1,19 @@
-"""How far a piece of work is, told to whoever shows it, and how long its stages took. The planner never prints."""
+"""How far a piece of work is, told to whoever shows it, and how long its stages took. The planner never prints.
+
+Who embeds it hears of stages (INFO), of what each is at (DEBUG) and of a case's warnings by the logger `LOG`.
+"""
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
+
+LOG = logging.getLogger("puncture_twin")
+LOG.addHandler(logging.NullHandler())  # nothing is printed unless a program says where
 
 Count = Callable[[int, int], None]
 """Called with (done, to do), as often as something is done."""
@@ -41,16 +48,18 @@ class Watcher(Protocol):
 
 
 class Silent:
-    """Shows nothing."""
+    """Shows nothing, and logs what happens."""
 
     def step(self, stage: str, what: str) -> None:
-        """Nothing."""
+        """Log it for who looks closely."""
+        LOG.debug("%s: %s", stage, what)
 
     def count(self, stage: str, done: int, total: int, failed: int = 0) -> None:
-        """Nothing."""
+        """Nothing: it may be called a thousand times."""
 
     def note(self, line: str) -> None:
-        """Nothing."""
+        """Log it."""
+        LOG.info(line)
 
 
 @dataclass
@@ -74,4 +83,6 @@ class Stages:
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            took = time.perf_counter() - start
+            self.seconds[name] = self.seconds.get(name, 0.0) + took
+            LOG.info("%s: %.3f s", name, took)

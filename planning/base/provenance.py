@@ -1,4 +1,4 @@
-"""What a result was made from: every file once, with its role and the hash of the bytes that were parsed.
+"""Provenance of a result: every file that decided it, once, with its role and the hash of the bytes that were parsed.
 
 A path may name other bytes a moment later. So a file is read once, its hash is that of the bytes in memory, and
 whoever parses the file parses those bytes.
@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import absence, is_plain_file, read_input
 from puncture_twin.planning.base.strict_json import text
 
@@ -137,7 +137,7 @@ class InputFiles:
         known = self.sha256(name)
         content = read_input(self._folder / name, max_bytes=1 << 40, where=str(self._folder / name))
         if content_input("", name, content).sha256 != known:
-            raise InputError("has changed since it was read", where=self._folder / name, allowed="start again")
+            refuse("has changed since it was read", self._folder / name, "start again", "input_changed")
         return content
 
     def sha256(self, name: str) -> str:
@@ -160,6 +160,5 @@ class InputFiles:
     def _existing(self, name: str, key: str, where: Path) -> Path:
         file = self._folder / name
         if not is_plain_file(file):
-            what = f"{key}: file '{name[:200]}' {absence(file)}"
-            raise InputError(what, where=where, allowed=f"a file in {self._folder}")
+            refuse(f"{key}: file '{name[:200]}' {absence(file)}", where, f"a file in {self._folder}", "no_such_file")
         return file

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import read_input
 
 Value = TypeVar("Value")
@@ -51,7 +51,7 @@ def parse_json(data: bytes, *, where: str | Path, allowed: str) -> Any:
         text = data.decode("utf-8-sig")
         return json.loads(text, parse_constant=_refused, parse_float=_finite, object_pairs_hook=_unique_keys)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"JSON cannot be read ({error})", where=where, allowed=allowed) from error
+        raise InputError(f"JSON cannot be read ({error})", where=where, allowed=allowed, code="not_json") from error
 
 
 def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str) -> dict[str, Any]:
@@ -69,7 +69,7 @@ def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str
     document = parse_json(data, where=where, allowed=allowed)
     stated = document.get("version") if isinstance(document, dict) else None
     if isinstance(stated, bool) or stated != version:
-        raise InputError(f"version {_shown(stated)}", where=where, allowed=allowed)
+        refuse(f"version {_shown(stated)}", where, allowed, "unknown_version")
     return dict(document)
 
 
@@ -87,9 +87,11 @@ def fitting(where: str | Path, allowed: str) -> Iterator[None]:
     try:
         yield
     except KeyError as error:
-        raise InputError(f"key {error} is missing", where=where, allowed=allowed) from error
+        raise InputError(f"key {error} is missing", where=where, allowed=allowed, code="missing_key") from error
     except (TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
-        raise InputError(f"does not fit: {error}", where=where, allowed=allowed) from error
+        raise InputError(
+            f"does not fit: {error}", where=where, allowed=allowed, code=getattr(error.__cause__, "code", "bad_value")
+        ) from error
 
 
 def field(document: dict[str, Any], name: str, read: Callable[[Any], Value]) -> Value:

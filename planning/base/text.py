@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.errors import one_line, refuse
 
 MAX_NAME = 200
 """Characters of a name; the longest of TotalSegmentator has 29. A longer one is refused, never cut: two names that
@@ -26,7 +26,7 @@ ALLOWED_NAME = f"printable characters on one line, {MAX_NAME} at most: no escape
 
 
 def check_name(name: str, what: str, *, where: str | Path) -> str:
-    """A name that may be printed as it is.
+    """Check a name that is printed as it is, and return it.
 
     Args:
         name: The name as the file states it.
@@ -37,11 +37,11 @@ def check_name(name: str, what: str, *, where: str | Path) -> str:
         InputError: An empty name, one of more than `MAX_NAME` characters, or one with a control or format character.
     """
     if not name.strip():
-        raise InputError(f"{what} has an empty name", where=where, allowed=ALLOWED_NAME)
+        refuse(f"{what} has an empty name", where, ALLOWED_NAME, "bad_name")
     if len(name) > MAX_NAME:
-        raise InputError(f"{what} has a name of {len(name)} characters", where=where, allowed=ALLOWED_NAME)
+        refuse(f"{what} has a name of {len(name)} characters", where, ALLOWED_NAME, "bad_name")
     if not name.isprintable():
-        raise InputError(f"{what} has the name {name!a}", where=where, allowed=ALLOWED_NAME)
+        refuse(f"{what} has the name {name!a}", where, ALLOWED_NAME, "bad_name")
     return name
 
 
@@ -132,7 +132,7 @@ def card(title: str, facts: Facts, picture: str = "") -> str:
     Args:
         title: Plain text.
         facts: Names and values, plain text.
-        picture: HTML, such as an SVG; "" for none.
+        picture: HTML, such as an image; "" for none.
     """
     rows = "".join(
         f'<tr style="{ROW}"><th style="{NAME}">{escape(name)}</th><td style="{CELL}">{escape(value)}</td></tr>'
@@ -144,7 +144,7 @@ def card(title: str, facts: Facts, picture: str = "") -> str:
 
 
 def never_raises(make: Callable[[Value], str]) -> Callable[[Value], str]:
-    """What a notebook calls: where a value cannot be shown, its class and the error are."""
+    """Decorator for a notebook's hooks: where a value cannot be shown, its class and the error are."""
 
     @functools.wraps(make)
     def shown(value: Value) -> str:

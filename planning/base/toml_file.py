@@ -10,7 +10,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ValidationError
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, SchemaError, refuse
+from puncture_twin.planning.base.files import read_input
 
 MAX_BYTES = 1_000_000
 """Such a file is written by hand; a larger one is something else."""
@@ -42,9 +43,12 @@ _TOKEN = re.compile(
 
 def _one(value: object) -> object:
     if value != 1 or not isinstance(value, int) or isinstance(value, bool):
-        raise ValueError(f"schema {value!r} is not known; this version reads schema = 1")
+        raise SchemaError(f"schema {value!r} is not known; this version reads schema = 1", "unknown_version")
     return value
 
+
+CODES = {"extra_forbidden": "unknown_key", "missing": "missing_key"}
+"""What is wrong with a key, by Pydantic's word; any other is ``bad_value``."""
 
 SchemaOne = Annotated[int, BeforeValidator(_one)]
 """The key ``schema``: 1."""
@@ -61,9 +65,10 @@ def find_toml(path: Path | str, usual_name: str) -> Path:
     try:
         path = path / usual_name if path.is_dir() else path
         if path.exists() and not path.is_file():
-            raise InputError("is no plain file", where=path, allowed=allowed)
+            refuse("is no plain file", path, allowed, "not_a_file")
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot be looked up ({error})", where=str(path)[:80], allowed=allowed) from error
+        what = f"cannot be looked up ({error})"
+        raise InputError(what, where=str(path)[:80], allowed=allowed, code="unreadable") from error
     return path
 
 
@@ -73,12 +78,7 @@ def read_toml_bytes(path: Path, allowed: str) -> bytes:
     Raises:
         InputError: Unreadable, or too large.
     """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError("larger than 1 MB, not written by hand", where=path, allowed=allowed)
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed=allowed) from error
+    return read_input(path, max_bytes=MAX_BYTES, where=str(path), allowed=allowed)
 
 
 def parse_toml(
@@ -108,7 +108,7 @@ def parse_toml(
         check_toml_bounds(text, path, allowed)
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, a number that Python does not read
-        raise InputError(f"is not TOML: {error}", where=path, allowed=allowed) from error
+        raise InputError(f"is not TOML: {error}", where=path, allowed=allowed, code="not_toml") from error
     data = data if change is None else change(data)
     try:
         return model.model_validate(data)
@@ -117,7 +117,8 @@ def parse_toml(
         place, said = _said(data, first["loc"], first["msg"].removeprefix("Value error, "), first["type"])
         value = "" if isinstance(first["input"], dict | list | tuple | None) else f" (given: {first['input']!r:.60})"
         allowed = f"the keys, types and ranges of {keys}"
-        raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed) from error
+        code = getattr(first.get("ctx", {}).get("error"), "code", CODES.get(first["type"], "bad_value"))
+        raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed, code=code) from error
 
 
 def _said(data: object, keys: tuple[str | int, ...], message: str, kind: str) -> tuple[str, str]:
@@ -190,4 +191,4 @@ def _beyond(kind: str, found: str, depth: int, parts: int) -> str:
 
 
 def _refuse(wrong: str, where: Path | str, line: int, allowed: str) -> None:
-    raise InputError(f"line {line} {wrong}", where=where, allowed=allowed)
+    refuse(f"line {line} {wrong}", where, allowed, "toml_bounds")

@@ -17,8 +17,8 @@ from typing import Annotated, Any, NamedTuple, NoReturn
 
 from pydantic import Field
 
-from puncture_twin.planning.base.errors import InputError, one_line
-from puncture_twin.planning.base.files import is_folder, read_input
+from puncture_twin.planning.base.errors import InputError, one_line, refuse
+from puncture_twin.planning.base.files import decode_text, is_folder, read_input
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.base.toml_file import SchemaOne, parse_toml
@@ -70,7 +70,7 @@ def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]
         cases, inputs = _listed_cases(cohort)
     if not 0 < len(cases) <= MOST_CASES:
         what = f"holds {len(cases)} cases" if cases else "holds no case"
-        raise InputError(what, where=cohort, allowed=f"1 to {MOST_CASES} cases: {ALLOWED}")
+        refuse(what, cohort, f"1 to {MOST_CASES} cases: {ALLOWED}", "cohort_size")
     for one in cases:
         _check_path(one, cohort)
     return tuple(cases), inputs
@@ -82,13 +82,13 @@ def _check_path(case: CohortCase, cohort: Path) -> None:
         str(case.path.absolute()).encode("utf-8")
     except UnicodeEncodeError as error:
         what = f"the path '{one_line(case.stated, 100)}' is no UTF-8"
-        raise InputError(what, where=cohort, allowed="cases whose paths are UTF-8") from error
+        raise InputError(what, where=cohort, allowed="cases whose paths are UTF-8", code="not_text") from error
 
 
 def _listed_cases(path: Path) -> tuple[list[CohortCase], tuple[Input, ...]]:
     readers = {".csv": csv_cases, ".toml": toml_cases}
     if path.suffix.lower() not in readers:
-        raise InputError("is no cohort", where=path, allowed=ALLOWED)
+        refuse("is no cohort", path, ALLOWED, "not_a_cohort")
     content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     return readers[path.suffix.lower()](content, path), (content_input("cohort", path.name, content),)
 
@@ -120,7 +120,7 @@ def _refuse_unreadable(error: OSError) -> NoReturn:
 
 
 def _refuse(what: str, where: str) -> NoReturn:
-    raise InputError(what, where=where, allowed="folders of patients that can be read", code="cohort_not_whole")
+    refuse(what, where, "folders of patients that can be read", "cohort_not_whole")
 
 
 CASE, NAME, TARGET = "case", "name", "target"
@@ -148,39 +148,36 @@ def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
         if not any(row):
             continue
         if len(row) != len(header):
-            raise InputError(f"{len(row)} cells", where=where, allowed=f"{len(header)}, as in the header")
+            refuse(f"{len(row)} cells", where, f"{len(header)}, as in the header", "ragged_row")
         cases.append(_case(dict(zip(header, row, strict=True)), path, where))
     return cases
 
 
 def _rows(content: bytes, path: Path) -> Any:
     """Lines of a CSV as a reader that counts them."""
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"is not UTF-8 ({error})", where=path, allowed="a CSV in UTF-8") from error
+    text = decode_text(content, str(path))
     if "\0" in text or max(map(len, text.splitlines()), default=0) > LONGEST_CELL:
-        raise InputError("is no CSV", where=path, allowed=f"text, lines of at most {LONGEST_CELL} characters")
+        refuse("is no CSV", path, f"text, lines of at most {LONGEST_CELL} characters", "not_csv")
     return csv.reader(io.StringIO(text), strict=False)
 
 
 def _header(row: list[str], path: Path) -> list[str]:
     header = [cell.strip() for cell in row]
     if CASE not in header:
-        raise InputError(f"has no column '{CASE}'", where=f"{path}: line 1", allowed=ALLOWED_COLUMNS)
+        refuse(f"has no column '{CASE}'", f"{path}: line 1", ALLOWED_COLUMNS, "missing_column")
     for name in header:
         kind, _, key = name.partition(".")
         if name not in (CASE, NAME, TARGET) and not (kind in SECTIONS and key):
-            raise InputError(f"column '{name}' is not known", where=f"{path}: line 1", allowed=ALLOWED_COLUMNS)
+            refuse(f"column '{name}' is not known", f"{path}: line 1", ALLOWED_COLUMNS, "unknown_column")
         if header.count(name) > 1:
-            raise InputError(f"column '{name}' stands twice", where=f"{path}: line 1", allowed="each column once")
+            refuse(f"column '{name}' stands twice", f"{path}: line 1", "each column once", "duplicate_column")
     return header
 
 
 def _case(cells: dict[str, str], path: Path, where: str) -> CohortCase:
     stated = cells[CASE]
     if not stated.strip() or any(unprintable_texts(cells)):
-        raise InputError("has no case that can be printed", where=where, allowed="the path of a case")
+        refuse("has no case that can be printed", where, "the path of a case", "bad_name")
     return CohortCase(stated, path.parent / stated.strip(), cells.get(NAME, "").strip(), _options(cells, where))
 
 
@@ -267,7 +264,7 @@ def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
     axes = [axis for name, kind in AXES.items() if (axis := _axis(getattr(stated, name), name, kind, path))]
     count = len(found) * math.prod(len(axis) for axis in axes)
     if count > MOST_CASES:
-        raise InputError(f"makes {count} cases", where=path, allowed=f"at most {MOST_CASES}")
+        refuse(f"makes {count} cases", path, f"at most {MOST_CASES}", "cohort_size")
     combinations = [_combined(choices, path) for choices in product(*axes)]
     return [CohortCase(one, path.parent / one, name, options) for one in found for name, options in combinations]
 
@@ -278,7 +275,7 @@ def _matches(patterns: Sequence[str], path: Path) -> list[str]:
     for pattern in patterns:
         matches = sorted(glob.glob(pattern, root_dir=path.parent, recursive=True))  # noqa: PTH207  # absolute ones too
         if not matches:
-            raise InputError(f"cases '{pattern}' matches nothing", where=path, allowed="patterns of existing cases")
+            refuse(f"cases '{pattern}' matches nothing", path, "patterns of existing cases", "no_match")
         found |= dict.fromkeys(matches)
     return list(found)
 
@@ -299,7 +296,8 @@ def _table(values: Any, kind: str, where: str) -> Mapping[str, Any]:
         return {"position_mm": list(values)}
     if kind == "arm" and isinstance(values, str):
         return {"model": values}
-    raise InputError(f"option '{kind}' is no table", where=where, allowed="keys and values, as in the case")
+    what = f"option '{kind}' is no table"
+    raise InputError(what, where=where, allowed="keys and values, as in the case", code="not_a_table")
 
 
 def _combined(choices: Sequence[_Choice], path: Path) -> tuple[str, CaseOptions]:

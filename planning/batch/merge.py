@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.errors import InputError, one_line, refuse
 from puncture_twin.planning.base.files import is_folder, read_input
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.strict_json import or_null
@@ -33,12 +33,7 @@ NOT_RUN = "not run"
 
 
 def merged_rows(cases: Sequence[PlannedCase], out: Path) -> list[dict[str, Any]]:
-    """A row for each case of the plan, in its order; one that has none yet says so.
-
-    Args:
-        cases: The plan's.
-        out: The cohort's folder.
-    """
+    """A row for each case of the plan, in its order; one that has none yet says so."""
     return [_row(one, out) for one in cases]
 
 
@@ -91,7 +86,7 @@ def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
             known = fields.setdefault(one.name, one)
             if known.type != one.type:
                 what = f"column '{one.name}' is {known.type} in one case and {one.type} in another"
-                raise InputError(what, where=where, allowed="results of one version: batch plan and run again")
+                refuse(what, where, "results of one version: batch plan and run again", "tables_differ")
     return pa.schema(list(fields.values()))
 
 
@@ -197,7 +192,7 @@ class CaseChange(NamedTuple):
         case: As written.
         options: As JSON.
         before: Its row in the first; None where it is not there.
-        after: The same of the second.
+        after: The second cohort's row of the case.
     """
 
     case: str
@@ -230,7 +225,7 @@ class CaseChange(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """All cases of two cohorts.
+    """Two cohorts compared, case by case.
 
     Attributes:
         changes: In the order of the second, then what only the first has.
@@ -274,10 +269,11 @@ def read_cases(place: Path) -> list[dict[str, Any]]:
     try:
         table = pq.read_table(io.BytesIO(data))
     except (pa.ArrowException, OSError) as error:
-        raise InputError(f"is no table ({one_line(str(error), 100)})", where=path, allowed=ALLOWED) from error
+        what = f"is no table ({one_line(str(error), 100)})"
+        raise InputError(what, where=path, allowed=ALLOWED, code="not_parquet") from error
     missing = [name for name in (*NEEDED, *ENTRY) if name not in table.column_names]
     if missing:
-        raise InputError(f"has no column '{missing[0]}'", where=path, allowed=ALLOWED)
+        refuse(f"has no column '{missing[0]}'", path, ALLOWED, "missing_column")
     rows: list[dict[str, Any]] = table.to_pylist()
     return rows
 

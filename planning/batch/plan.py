@@ -23,7 +23,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from puncture_twin.planning.base.errors import InputError, PlanningError, one_line
+from puncture_twin.planning.base.errors import InputError, PlanningError, one_line, refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
@@ -171,7 +171,7 @@ def read_plan_table(out: Path) -> Plan:
     """
     path = out / PLAN_NAME
     if not path.is_file():
-        raise InputError("has no plan", where=out, allowed=NO_PLAN)
+        refuse("has no plan", out, NO_PLAN, "no_batch_plan")
     found = read_output(path, max_bytes=MAX_PLAN_BYTES)
     try:
         table = pq.read_table(io.BytesIO(found.data))
@@ -179,7 +179,8 @@ def read_plan_table(out: Path) -> Plan:
         made_by = (table.schema.metadata or {})[b"version"].decode()
         return Plan(tuple(PlannedCase(**row) for row in rows), found.sha256, made_by)
     except (pa.ArrowException, TypeError, KeyError, OSError) as error:
-        raise InputError(f"is no plan ({one_line(str(error), 100)})", where=path, allowed=NO_PLAN) from error
+        what = f"is no plan ({one_line(str(error), 100)})"
+        raise InputError(what, where=path, allowed=NO_PLAN, code="not_parquet") from error
 
 
 ROW_NAME, TABLE_NAME, PAGE_NAME = "row.json", "candidates.parquet", "report.html"
@@ -259,7 +260,7 @@ def discard(out: Path, case_id: str, work: Path) -> None:
     """Remove a result that is not final or not whole, at once or not at all."""
     folder = out / case_id
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise InputError(f"{case_id} there is not a result of this cohort", where=out, allowed="a folder of its own")
+        refuse(f"{case_id} there is not a result of this cohort", out, "a folder of its own", "folder_of_another")
     if folder.is_dir():
         gone = new_draft(work, case_id)
         folder.rename(gone / "old")

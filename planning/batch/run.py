@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, Memory
-from puncture_twin.planning.base.errors import InputError, one_line, require_extra
+from puncture_twin.planning.base.errors import InputError, one_line, refuse, require_extra
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.processes import worker_count
 from puncture_twin.planning.base.progress import Count, Watcher
@@ -62,7 +62,7 @@ class Part(NamedTuple):
         return f"{self.number}/{self.parts}"
 
     def of(self, items: Sequence[Item]) -> Sequence[Item]:
-        """This part's items: neighbours stay together, and every item is in one part."""
+        """The items of this part: neighbours stay together, and every item is in one part."""
         size = len(items)
         return items[(self.number - 1) * size // self.parts : self.number * size // self.parts]
 
@@ -78,7 +78,7 @@ def parse_part(text: str) -> Part:
     """
     found = re.fullmatch(r"([0-9]{1,7})/([0-9]{1,7})", text)
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
-        raise InputError(f"'{text[:40]}' is no part", where="--part", allowed=ALLOWED_PARTS)
+        refuse(f"'{text[:40]}' is no part", "--part", ALLOWED_PARTS, "bad_part")
     return Part(int(found[1]), int(found[2]))
 
 
@@ -92,12 +92,12 @@ def slurm_part(environment: Mapping[str, str]) -> Part | None:
         return None
     stated = {name: environment.get(name, "1" if name == STEP else "") for name in (TASK, COUNT, FIRST, STEP)}
     if not all(re.fullmatch(r"[0-9]{1,9}", value) for value in stated.values()):
-        raise InputError(f"{stated} are no numbers", where="SLURM's array", allowed=f"--part {ALLOWED_PARTS}")
+        refuse(f"{stated} are no numbers", "SLURM's array", f"--part {ALLOWED_PARTS}", "bad_part")
     task, count, first, step = (int(stated[name]) for name in (TASK, COUNT, FIRST, STEP))
     place, odd = divmod(task - first, max(step, 1))
     if odd or not 0 <= place < count:
         what = f"task {task} of an array of {count} from {first} in steps of {step}"
-        raise InputError(what, where="SLURM's array", allowed=f"an array without gaps, or --part {ALLOWED_PARTS}")
+        refuse(what, "SLURM's array", f"an array without gaps, or --part {ALLOWED_PARTS}", "bad_part")
     return Part(place + 1, count)
 
 
@@ -182,7 +182,7 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     plan = read_plan_table(out)
     if plan.version != version("puncture-twin"):
         what = f"the plan is of version {plan.version}, this is {version('puncture-twin')}"
-        raise InputError(what, where=out, allowed="batch plan again: what is unchanged since is not lost")
+        refuse(what, out, "batch plan again: what is unchanged since is not lost", "unknown_version")
     with running(out, request.part) as work:
         rows = request.part.of(plan.cases)
         cases = distinct(rows)
@@ -197,7 +197,7 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
             for done, end in enumerate(ends, start=1):
                 if end.full:
                     what = f"cannot be written ({end.full}); the cases that are done stay"
-                    raise InputError(what, where=out, allowed="a folder with enough free space")
+                    refuse(what, out, "a folder with enough free space", "unwritable")
                 counts.add(end)
                 watcher.count("cases", done, len(tasks), counts.failed)
     return counts
@@ -245,7 +245,8 @@ def running(out: Path, part: Part) -> Iterator[Path]:
         except OSError as error:
             full = disk_is_full(error, out)
             allowed = "a folder with enough free space" if full else "a folder that may be written to"
-            raise InputError(f"cannot be written ({error.strerror})", where=out, allowed=allowed) from error
+            what = f"cannot be written ({error.strerror})"
+            raise InputError(what, where=out, allowed=allowed, code="unwritable") from error
         stack.callback(shutil.rmtree, work, ignore_errors=True)
         yield work
 
@@ -257,7 +258,8 @@ def _locked(out: Path, name: str, kind: int) -> Iterator[None]:
         fcntl.flock(handle, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(handle)
-        raise InputError("another run is at work in this folder", where=out, allowed=ALLOWED_AT_ONCE) from None
+        what = "another run is at work in this folder"
+        raise InputError(what, where=out, allowed=ALLOWED_AT_ONCE, code="folder_in_use") from None
     try:
         yield
     finally:
@@ -290,11 +292,7 @@ class Estimate:
 
 
 def estimate(cases: Sequence[PlannedCase]) -> Estimate:
-    """Estimate a cohort from its first case that can be read, run twice, the second time warm.
-
-    Args:
-        cases: The plan's.
-    """
+    """Estimate a cohort from its first case that can be read, run twice, the second time warm."""
     readable = [one for one in cases if not one.refusal]
     refused = len(cases) - len(readable)
     if not readable:
@@ -408,7 +406,7 @@ class _WorkerCache:
 
 
 def on_scheduler(address: str) -> RunTasks:
-    """A function that runs cases on a scheduler's workers.
+    """Make a function that runs cases on a scheduler's workers.
 
     Args:
         address: Such as ``tcp://10.0.0.1:8786``.
@@ -422,13 +420,14 @@ def on_scheduler(address: str) -> RunTasks:
     def run(tasks: Sequence[CaseTask], limits: Limits) -> Generator[CaseEnd, None, None]:
         if limits != NO_LIMITS:
             what = "memory and time of a case are limited by Dask's workers"
-            raise InputError(what, where="--scheduler", allowed="dask worker --memory-limit alone")
+            refuse(what, "--scheduler", "dask worker --memory-limit alone", "dask_limits")
         try:
             library: Any = distributed
             client = library.Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             what = f"no scheduler answers there ({one_line(str(error), 150)})"
-            raise InputError(what, where=f"--scheduler {address[:80]}", allowed="tcp://HOST:PORT of one") from error
+            where = f"--scheduler {address[:80]}"
+            raise InputError(what, where=where, allowed="tcp://HOST:PORT of one", code="no_scheduler") from error
         with client:
             yield from _dask_ends(distributed, client, tasks)
 
@@ -443,8 +442,8 @@ def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Gene
             task = futures.pop(future)
             error = future.exception() if future.status == "error" else None
             if future.status not in ("error", "finished"):
-                what = f"the scheduler has lost a case ({future.status})"
-                raise InputError(what, where="--scheduler", allowed="a scheduler that stays; what is done is kept")
+                allowed = "a scheduler that stays; what is done is kept"
+                refuse(f"the scheduler has lost a case ({future.status})", "--scheduler", allowed, "scheduler_lost")
             if error is None:
                 yield future.result()
             elif isinstance(error, distributed.KilledWorker):

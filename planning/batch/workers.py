@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.batch.run_case import READY, CaseEnd, CaseTask, commit_failure, ended, work
 
 WORKER_DIED, TIMED_OUT, OUT_OF_MEMORY = "worker_died", "timed_out", "out_of_memory"
@@ -124,7 +124,7 @@ def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator
         InputError: Memory cannot be watched on this system.
     """
     if limits.memory_mb is not None and not Path(STATM.format(os.getpid())).exists():
-        raise InputError("memory cannot be watched here", where="--memory-mb", allowed="a system with /proc")
+        refuse("memory cannot be watched here", "--memory-mb", "a system with /proc", "memory_not_watched")
     queue, workers = TaskQueue(tasks), list[_Worker]()
     try:
         while queue or workers:

@@ -15,7 +15,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.needle.deflection import GAUGES, Bending, Shaft
-from puncture_twin.planning.reach.standoff import own_paths
+from puncture_twin.planning.reach.standoff import case_paths
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty, reading_noise, touches
 from puncture_twin.planning.registration.fits import fit_triad
 from puncture_twin.planning.registration.placement import aimed_uncertainty, default_method
@@ -67,7 +67,7 @@ def bent_path(case: Case, anatomy: Anatomy, outward_ct: Floats) -> BentPath | No
     """
     if case.bending is None:
         return None
-    paths = own_paths(case, anatomy.skin, outward_ct[None])
+    paths = case_paths(case, anatomy.skin, outward_ct[None])
     length = float(paths.path_length[0])
     return BentPath(case, anatomy, outward_ct, length, case.bending) if np.isfinite(length) else None
 
@@ -167,7 +167,7 @@ class Chain:
         return float(np.sqrt(np.trace(self.tip_mean_square())))
 
     def with_errors(self, errors: ErrorModel) -> Chain:
-        """With other errors; weighted again as they ask for, unless the method is a triad, or joint with the arm."""
+        """The chain with other declared errors; fitted again by them, unless the method is a triad, or joint."""
         method = self.method if self.method in {"triad", "joint"} else default_method(errors)
         return replace(self, errors=errors, method=method)
 

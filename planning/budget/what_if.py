@@ -38,7 +38,7 @@ class SourceCost:
     Attributes:
         source: As in `SOURCES`.
         alone_mm: The tip's rms error, were there no other.
-        without_mm: The same, were there all but this one; the registration's weights stay.
+        without_mm: Expected error with all sources but this one; the registration's weights stay.
     """
 
     source: str
@@ -179,7 +179,7 @@ def _with_rows(chain: Chain, rows: Ints) -> Chain:
 
 
 def _more_markers(chain: Chain, skin_points_ct: Floats) -> Iterator[Change]:
-    """More markers: one where it helps most, again and again; touched in the insertion's orientation."""
+    """The effect of more markers, each where it helps most, touched in the insertion's orientation."""
     points = skin_points_ct[:: max(1, len(skin_points_ct) // CANDIDATES)]
     q = _touch_like_insertion(chain, points)
     points, q = points[~np.isnan(q).any(axis=1)], q[~np.isnan(q).any(axis=1)]

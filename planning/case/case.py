@@ -108,7 +108,7 @@ class Case:
         return case_html(self)
 
     def aimed_at(self, target_ct: Floats) -> Case:
-        """This case with another target, shape (3,), mm: in the same structure, with the entry frame about it."""
+        """This case with another target in the same structure, shape (3,), mm; the entry frame moves with it."""
         target = read_only(target_ct)
         return replace(self, target_ct=target, T_ct_entry=view_frame(self.T_ct_entry[:3, :3], target))
 
@@ -190,7 +190,7 @@ def along_axis(case: Case) -> Vector:
 
 
 def _stated(axis: Axis | None, space: Space, otherwise: Floats) -> Vector:
-    """An axis that the case states, or another, in LPS (or the local frame)."""
+    """An axis that the case states, or the default, in LPS (or the local frame)."""
     if isinstance(axis, str):
         return ANATOMICAL_LPS[axis]
     vector = otherwise if axis is None else to_lps(np.array([axis]), space)[0]

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, Strict, model_validator
 
+from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.case.tables import (
     MAX_LABEL_MAPS,
@@ -46,13 +47,14 @@ Region = Literal["abdomen", "chest", "pelvis", "brain", "head", "neck", "spine",
 def _known_schema(value: object) -> object:
     if isinstance(value, bool) or value != 2:
         said = "not stated" if value is None else f"schema {value!r} is not known"
-        raise ValueError(f'{said}; write schema = 2, region = "...", and last [end] with structures = N')
+        what = f'{said}; write schema = 2, region = "...", and last [end] with structures = N'
+        raise SchemaError(what, "unknown_version")
     return value
 
 
 def _stated_region(value: object) -> object:
     if value is None:
-        raise ValueError(f"schema = 2 needs region, one of {', '.join(get_args(Region))}")
+        raise SchemaError(f"schema = 2 needs region, one of {', '.join(get_args(Region))}", "missing_key")
     return value
 
 
@@ -67,7 +69,7 @@ def _statements(data: Any) -> Any:
 
 
 def count_difference(stated: int, found: int) -> str:
-    """What to say of a case that has another number of structures than it states; the empty string if it has not."""
+    """Sentence on a case with another number of structures than it states; empty where they agree."""
     if stated == found:
         return ""
     return f"structures = {stated} is stated, and the case has {found}, the skin among them; was the file cut?"
@@ -116,9 +118,10 @@ class CaseFile(Section):
         at_top, at_end = self.structure_count, None if self.end is None else self.end.structures
         stated = at_top if at_end is None else at_end
         if stated is None:
-            raise ValueError("schema = 2 needs its last table, [end] with structures = N; was the file cut?")
+            what = "schema = 2 needs its last table, [end] with structures = N; was the file cut?"
+            raise SchemaError(what, "file_cut")
         if at_top not in {None, stated}:
-            raise ValueError(f"structures = {at_top} at the top and {at_end} in [end]; keep one")
+            raise SchemaError(f"structures = {at_top} at the top and {at_end} in [end]; keep one", "stated_twice")
         return stated
 
     @property
@@ -136,43 +139,46 @@ class CaseFile(Section):
         stated = self.stated_structures
         wrong = "" if self.structures else count_difference(stated, len(self.structure))
         if wrong:
-            raise ValueError(wrong)
+            raise SchemaError(wrong, "structures_miscounted")
         return self
 
     @model_validator(mode="before")
     @classmethod
     def _refuse_unprintable(cls, data: Any) -> Any:
         for text in unprintable_texts(data):
-            raise ValueError(f"{text[:60]!a} holds a control or format character; names and paths are plain text")
+            what = f"{text[:60]!a} holds a control or format character; names and paths are plain text"
+            raise SchemaError(what, "bad_name")
         return data
 
     @model_validator(mode="after")
     def _no_contradiction(self) -> Self:
         if self.registration is not None and self.robot.mount is not None:
-            raise ValueError("[registration] and [robot.mount] both say where the base is; keep one")
+            raise SchemaError("[registration] and [robot.mount] both say where the base is; keep one", "stated_twice")
         if self.errors is None and self.rehearsal.errors is not None:
-            raise ValueError("[rehearsal.errors] is a truth that differs from [errors], which is not there")
+            what = "[rehearsal.errors] is a truth that differs from [errors], which is not there"
+            raise SchemaError(what, "missing_errors")
         if self.errors is None and self.registration is not None and self.registration.correct:
-            raise ValueError(
-                "registration.correct needs [errors]: it tells the arm's errors by what is declared of them"
-            )
+            what = "registration.correct needs [errors]: it tells the arm's errors by what is declared of them"
+            raise SchemaError(what, "missing_errors")
         chances = (self.search.min_hit, self.search.max_touch, self.search.max_touch_of or None)
         if self.errors is None and any(chance is not None for chance in chances):
-            raise ValueError("search.min_hit and max_touch need [errors]: without declared errors there is no chance")
+            what = "search.min_hit and max_touch need [errors]: without declared errors there is no chance"
+            raise SchemaError(what, "missing_errors")
         if self.space == "local" and self.registration is not None and self.registration.transform is not None:
-            raise ValueError('registration.transform: a transform file speaks of patient space; space "local" has none')
+            what = 'registration.transform: a transform file speaks of patient space; space "local" has none'
+            raise SchemaError(what, "local_space")
         if self.space == "local" and self.ct.file is not None:
-            raise ValueError('ct.file: a CT says its own patient space; space "local" has none')
+            raise SchemaError('ct.file: a CT says its own patient space; space "local" has none', "local_space")
         if self.space == "local" and any(s.cut for s in self.structure):
-            raise ValueError('cut names sides of a patient; space "local" has none')
+            raise SchemaError('cut names sides of a patient; space "local" has none', "local_space")
         if self.space == "local" and self.search.frame not in {None, "ct"}:
-            raise ValueError('search.frame must be "ct" for space "local": it has no head and no front')
+            raise SchemaError('search.frame must be "ct" for space "local": it has no head and no front', "local_space")
         for name, count in Counter(s.name for s in self.structure).items():
             if count > 1:
-                raise ValueError(f"structure '{name}' stands twice; names are unique")
+                raise SchemaError(f"structure '{name}' stands twice; names are unique", "duplicate_name")
         skins = [s.name for s in self.structure if s.role == "skin"]
         if len(skins) != 1:
-            raise ValueError(f'one structure has role "skin"; here {skins or "none"}')
+            raise SchemaError(f'one structure has role "skin"; here {skins or "none"}', "not_one_skin")
         return self
 
     @model_validator(mode="after")
@@ -181,9 +187,11 @@ class CaseFile(Section):
             return self
         gantry = self.gantry
         if gantry is not None and not (isinstance(gantry.axis, tuple) and isinstance(gantry.up, tuple)):
-            raise ValueError('gantry: space "local" has no head and no front; give axis and up as vectors')
+            what = 'gantry: space "local" has no head and no front; give axis and up as vectors'
+            raise SchemaError(what, "local_space")
         if isinstance(self.place.up, str) or isinstance(self.place.along, str):
-            raise ValueError('place: space "local" has no head and no front; give up and along as vectors')
+            what = 'place: space "local" has no head and no front; give up and along as vectors'
+            raise SchemaError(what, "local_space")
         return self
 
 

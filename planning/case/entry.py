@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.rigid import frame_of_axes
 from puncture_twin.planning.geometry.spaces import Space, to_lps
@@ -85,11 +85,11 @@ def entry_frame(frame: str | EntryAxes | None, space: Space, *, where: str | Pat
         return to_lps(np.eye(3), space).T
     axes = EntryAxes(z="anterior", x="head") if frame == "bed" else frame
     if not isinstance(axes, EntryAxes):
-        raise InputError(f"frame '{frame}' is not known", where=where, allowed="ct, bed, or z and x axes")
+        refuse(f"frame '{frame}' is not known", where, "ct, bed, or z and x axes", "unknown_frame")
     z, x = (_axis(axis, space) for axis in (axes.z, axes.x))
     lengths = np.linalg.norm(z), np.linalg.norm(x)
     if min(lengths) == 0 or abs(z @ x) > AXES_PARALLEL * lengths[0] * lengths[1]:
-        raise InputError("search.frame: its axes are parallel or zero", where=where, allowed="two axes")
+        refuse("search.frame: its axes are parallel or zero", where, "two axes", "axes_parallel")
     return frame_of_axes(z, x)
 
 
@@ -195,7 +195,7 @@ class AngleGrid:
         return len(self.theta) * len(self.beta)
 
     def solid_angle(self) -> Floats:
-        """What each direction stands for, shape (m k,), sr: to the middle between neighbours, nothing beyond the grid.
+        """Solid angle of each direction, shape (m k,), sr: to the middle between neighbours, within the grid.
 
         The integral of sin θ dθ dβ over each cell: together they are the grid's whole solid angle.
         """

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.named_files import CaseVolumes
@@ -146,7 +146,7 @@ class ErrorModel:
 
 
 class Cells(NamedTuple):
-    """Of what a CT is made: pixel and slice spacing in mm, and the unit normal of its slices, shape (3,), LPS."""
+    """The voxels of a CT: pixel and slice spacing, mm, and the unit normal of its slices, shape (3,), LPS."""
 
     pixel_mm: float
     spacing_mm: float
@@ -178,7 +178,7 @@ def error_model(
         twice = sorted(stated & {"ct_pixel_mm", "ct_spacing_mm", "ct_in_plane_mm", "ct_slice_mm", "touch_mm"})
         if twice:
             message = f"registration.fle_mm and errors.{twice[0]} state the same error"
-            raise InputError(message, where=where, allowed="fle_mm alone, or CT and touch in [errors]")
+            refuse(message, where, "fle_mm alone, or CT and touch in [errors]", "stated_twice")
     reading, touch = _reading_cov(section, space, cells, where), _or(section.touch_mm, DEFAULT_TOUCH_MM)
     target = reading if section.target_mm is None else section.target_mm**2 * np.eye(3)
     if fle_mm is not None:
@@ -221,11 +221,10 @@ def _bed_axis(section: ErrorsSection, space: Space, cells: Cells | None, where: 
     """The unit vector across the slices, LPS (or the case's local frame)."""
     axis = section.bed_axis
     if axis is None and space is Space.LOCAL:
-        allowed = "bed_axis = [x, y, z], the direction across the slices"
         message = 'ct_slice_mm differs from ct_in_plane_mm, and space "local" has no bed'
-        raise InputError(message, where=where, allowed=allowed)
+        refuse(message, where, "bed_axis = [x, y, z], the direction across the slices", "local_space")
     if isinstance(axis, str) and space is Space.LOCAL:
-        raise InputError('bed_axis: space "local" has no head', where=where, allowed="bed_axis = [x, y, z]")
+        refuse('bed_axis: space "local" has no head', where, "bed_axis = [x, y, z]", "local_space")
     if axis is None:
         return np.array([0.0, 0.0, 1.0]) if cells is None else np.asarray(cells.normal_ct)
     vector = (
@@ -233,7 +232,7 @@ def _bed_axis(section: ErrorsSection, space: Space, cells: Cells | None, where: 
     )
     length = float(np.linalg.norm(vector))
     if length == 0:
-        raise InputError("bed_axis is zero", where=where, allowed="a direction")
+        refuse("bed_axis is zero", where, "a direction", "zero_direction")
     return np.asarray(vector / length)
 
 

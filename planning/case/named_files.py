@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import unfinished_warnings
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case_file import CaseFile
@@ -52,12 +52,6 @@ class NamedFile(NamedTuple):
 
 def read_named_files(content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes) -> tuple[str, ...]:
     """Read and hash whatever the case names, each file once; what costs little first.
-
-    Args:
-        content: The case file.
-        path: Where it is.
-        files: Takes what is read.
-        case_volumes: Takes the volumes.
 
     Returns:
         What is left open about being whole, one sentence each.
@@ -217,7 +211,7 @@ class CaseVolumes:
             found = parse_segmentation(path, name, self._files.content, series)
         elif series is None:
             what = f"rtstruct '{name}' needs the CT on which it was drawn, as a DICOM series"
-            raise InputError(what, where=self._path, allowed='ct = "FOLDER" beside it, or as the CT of the case')
+            refuse(what, self._path, 'ct = "FOLDER" beside it, or as the CT of the case', "rtstruct_without_ct")
         else:
             found = parse_structure_set(path, name, self._files.content, series)
         self._add_masks(name, found)
@@ -231,7 +225,7 @@ class CaseVolumes:
         return {called: _key(name, called) for called in self._masks[name].masks} if name in self._masks else {}
 
     def mask_notes(self, name: str) -> tuple[str, ...]:
-        """What to tell of the structures of such a file."""
+        """Notes on the structures of a file of masks."""
         return self._masks[name].notes if name in self._masks else ()
 
     def _read_series(self, path: Path, name: str, key: str) -> CtSeries:
@@ -273,19 +267,14 @@ LINE_FILES = (".csv", ".fcsv")
 
 
 def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tuple[str, ...]:
-    """What is left open about being whole, one sentence each.
-
-    Args:
-        content: The case file.
-        files: All that it names, read.
-        path: The case file, for the error.
+    """Sentences on files of which it is not known whether they are whole.
 
     Raises:
         InputError: A list whose last line does not end.
     """
     for name in _line_files(files):
         for said in unfinished_warnings(files.content(name), name):
-            raise InputError(said, where=path, allowed="files of which every line ends with a line break")
+            refuse(said, path, "files of which every line ends with a line break", "file_cut")
     if content.end is None:
         return (TOP_COUNT_NOTE,)
     return () if ends_with_end(files.content(path.name).decode("utf-8")) else (NOT_LAST_NOTE,)
@@ -302,7 +291,7 @@ def ends_with_end(text: str) -> bool:
 
 
 def robot_warnings(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:
-    """That nothing is said of where a robot is: no verdict is about it."""
+    """Warning of a case that does not say where a robot is: no verdict includes one."""
     located = content.registration is not None or content.robot.mount is not None
     nowhere = not located and bool({"robot", "tool"} & content.model_fields_set)
     return (ROBOT_NOWHERE.format(robot=robot.model.name),) if nowhere else ()

@@ -1,4 +1,4 @@
-"""What is stated in place of what a case file states: another target, margins, mount, needle, arm or errors.
+"""Options in place of what a case file states: another target, margins, mount, needle, arm or errors.
 
 The case file is not changed: its tables are, before they are validated, so that an option is held to the same rules as
 a line of the file. Options are an input of their own: no result of a case with options passes for one without.
@@ -15,7 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 
 OPTIONS_ROLE = "options"
 """Of the input that options are."""
@@ -74,7 +74,7 @@ class CaseOptions:
             elif kind == MARGINS:
                 _set_margins(changed, values, where)
             else:
-                _lay_over(_table(changed, TABLES[kind]), values)
+                _overlay(_table(changed, TABLES[kind]), values)
         return changed
 
 
@@ -94,15 +94,14 @@ def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
     """
     for kind, values in sections.items():
         if kind not in SECTIONS:
-            raise InputError(f"'{kind}' is no kind of option", where=where, allowed=", ".join(SECTIONS))
+            refuse(f"'{kind}' is no kind of option", where, ", ".join(SECTIONS), "unknown_key")
         if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
-            raise InputError(f"option '{kind}' is no table", where=where, allowed="keys and values, as in the case")
+            refuse(f"option '{kind}' is no table", where, "keys and values, as in the case", "not_a_table")
     try:
         plain = json.loads(CaseOptions({kind: values for kind, values in sections.items() if values}).text)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            f"an option cannot be used ({error})", where=where, allowed="finite numbers, texts, lists, tables"
-        ) from error
+        what = f"an option cannot be used ({error})"
+        raise InputError(what, where=where, allowed="finite numbers, texts, lists, tables", code="bad_value") from error
     return CaseOptions(plain)
 
 
@@ -112,7 +111,7 @@ def _table(data: dict[str, Any], name: str) -> dict[str, Any]:
     return table if isinstance(table, dict) else {}
 
 
-def _lay_over(table: dict[str, Any], values: Mapping[str, Any]) -> None:
+def _overlay(table: dict[str, Any], values: Mapping[str, Any]) -> None:
     for one, other in ALTERNATIVES:
         if one in values:
             table.pop(other, None)
@@ -128,13 +127,13 @@ def _set_margins(data: dict[str, Any], values: Mapping[str, Any], where: Path | 
     stated = list(_margins(data))
     for pattern, margin in values.items():
         if not isinstance(margin, int | float) or isinstance(margin, bool):
-            raise InputError(f"margins '{pattern}' is no number", where=where, allowed="mm")
+            refuse(f"margins '{pattern}' is no number", where, "mm", "not_a_number")
         if pattern == ADDED:
             continue
         fitting = [one for one in stated if fnmatchcase(one[0], pattern)]
         if not fitting:
             known = ", ".join(name for name, _, _ in stated) or "none"
-            raise InputError(f"margins '{pattern}' fits nothing that has a margin", where=where, allowed=known)
+            refuse(f"margins '{pattern}' fits nothing that has a margin", where, known, "no_match")
         for _, table, key in fitting:
             table[key] = margin
     for _, table, key in stated if ADDED in values else ():

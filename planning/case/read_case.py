@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.provenance import CASE_ROLE, InputFiles
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
@@ -52,7 +52,7 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
 def case_of(
     content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes, warnings: tuple[str, ...]
 ) -> Case:
-    """What a case file and the files that it names state, in LPS (or local) mm and radians; warnings go in front."""
+    """Make a case of its file and the files that it names, in LPS (or local) mm and radians."""
     space = Space(content.space)
     target = _target_of(content, path, space, files)
     robot = robot_of(content, space, path, files)
@@ -113,5 +113,5 @@ def _target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) -
     if target.name not in listed.names:
         names = ", ".join(listed.names)
         what = f"target.name '{target.name}' is not in {target.points}{did_you_mean(target.name, listed.names)}"
-        raise InputError(what, where=path, allowed=names)
+        refuse(what, path, names, "unknown_point")
     return read_only(listed.points[listed.names.index(target.name)].copy())

@@ -20,7 +20,7 @@ from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.arm.urdf.document import MOST_BYTES
 from puncture_twin.planning.arm.urdf.lengths import NOTHING_STATED, JointLimits, StatedLimits, narrowed
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case_file import CaseFile
@@ -71,11 +71,6 @@ def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> 
 def arm_of(section: RobotSection, files: InputFiles, path: Path) -> UrModel:
     """The arm's model; each file that decides it becomes an input of the case.
 
-    Args:
-        section: As the case states it.
-        files: The case's files.
-        path: The case file, for errors.
-
     Raises:
         InputError: An unknown name, a URDF or a mesh that cannot be used, or limits that are wider than the arm's own.
     """
@@ -96,8 +91,8 @@ def arm_of(section: RobotSection, files: InputFiles, path: Path) -> UrModel:
 def _mesh(address: str, *, urdf: str, files: InputFiles, path: Path) -> bytes:
     """The bytes of a mesh that a URDF names."""
     if "://" in address or PurePosixPath(address).is_absolute():
-        what = f"robot.urdf: mesh '{address}' is no path beside the URDF"
-        raise InputError(what, where=path, allowed="paths relative to the URDF's folder, such as meshes/base.stl")
+        allowed = "paths relative to the URDF's folder, such as meshes/base.stl"
+        refuse(f"robot.urdf: mesh '{address}' is no path beside the URDF", path, allowed, "outside_folder")
     name = str(PurePosixPath(urdf).parent / address)
     return files.read(MESH_ROLE, name, max_bytes=meshes.MAX_FILE_BYTES, key=f"robot.urdf: mesh '{address}'", where=path)
 
@@ -128,13 +123,13 @@ def bending_of(needle: NeedleSection, tissue: Mapping[str, TissueSection], where
     if not tissue:
         if stated:
             message = f"needle.{stated[0]}: how far it bends depends on the tissue, and there is none"
-            raise InputError(message, where=where, allowed="[tissue.PATTERN] for each pattern of names; or no such key")
+            refuse(message, where, "[tissue.PATTERN] for each pattern of names; or no such key", "no_tissue")
         return None
     if needle.bevel_deg is None:
-        raise InputError("[tissue] needs needle.bevel_deg", where=where, allowed="degrees; 0 for a symmetric tip")
+        refuse("[tissue] needs needle.bevel_deg", where, "degrees; 0 for a symmetric tip", "no_bevel")
     if REST not in tissue:
         message = f'[tissue."{REST}"] is missing: between the structures there is tissue too'
-        raise InputError(message, where=where, allowed=f'a table for "{REST}", the rest of the body')
+        refuse(message, where, f'a table for "{REST}", the rest of the body', "no_tissue")
     tissues = {pattern: Tissue(**section.model_dump()) for pattern, section in tissue.items()}
     return Bending(_shaft(needle, where), float(np.radians(needle.bevel_deg)), ByName(tissues))
 
@@ -144,12 +139,12 @@ def _shaft(needle: NeedleSection, where: str | Path) -> Shaft:
     if needle.gauge is None:
         return Shaft(needle.shaft_mm, needle.diameter_mm, 0.0, modulus)
     if needle.gauge not in GAUGES:
-        allowed = f"{min(GAUGES)} to {max(GAUGES)}"
-        raise InputError(f"needle.gauge {needle.gauge} is not in the chart", where=where, allowed=allowed)
+        what = f"needle.gauge {needle.gauge} is not in the chart"
+        refuse(what, where, f"{min(GAUGES)} to {max(GAUGES)}", "unknown_gauge")
     gauge = GAUGES[needle.gauge]
     if abs(gauge.outer_mm - needle.diameter_mm) > SAME_MM:
         message = f"needle.gauge {needle.gauge} is {gauge.outer_mm:g} mm wide, diameter_mm says {needle.diameter_mm:g}"
-        raise InputError(message, where=where, allowed=f"diameter_mm within {SAME_MM:g} of the gauge's")
+        refuse(message, where, f"diameter_mm within {SAME_MM:g} of the gauge's", "gauge_contradicted")
     return Shaft(needle.shaft_mm, gauge.outer_mm, 0.0 if needle.solid else gauge.inner_mm, modulus)
 
 
@@ -182,10 +177,10 @@ def _unit(direction: str | Vector, space: Space, where: str | Path) -> Floats:
     if isinstance(direction, str):
         if space is Space.LOCAL:
             message = f'breathing.direction: space "local" has no {direction}'
-            raise InputError(message, where=where, allowed="direction = [x, y, z]")
+            refuse(message, where, "direction = [x, y, z]", "local_space")
         return np.array(ANATOMICAL_LPS[direction], dtype=np.float64)
     vector = to_lps(np.array([direction], dtype=np.float64), space)[0]
     length = float(np.linalg.norm(vector))
     if length == 0:
-        raise InputError("breathing.direction is zero", where=where, allowed="a direction of any length")
+        refuse("breathing.direction is zero", where, "a direction of any length", "zero_direction")
     return np.asarray(vector / length)

@@ -15,7 +15,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.case.entry import entry_frame
 from puncture_twin.planning.case.tables import (
     AIR_HU,
@@ -73,7 +73,7 @@ class SearchSettings:
     Attributes:
         min_hit: Least chance to hit the target; None sets no limit.
         max_touch: Greatest chance to touch any one structure; None sets no limit.
-        max_touch_of: The same for single structures, by name, instead.
+        max_touch_of: Limits of single structures, by name, in place of ``max_touch``.
     """
 
     theta: tuple[float, float]
@@ -114,7 +114,7 @@ class CtSettings:
 
     @property
     def declared(self) -> tuple[str, ...]:
-        """What a person states of the image, one sentence each."""
+        """Sentences on what a person states of the image."""
         said = []
         if self.arms is not None:
             said.append("declared: " + ("no arms in the image" if self.arms == "none" else "arms in the image"))
@@ -234,21 +234,15 @@ def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
     x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
     lengths = np.linalg.norm(x), np.linalg.norm(z)
     if min(lengths) == 0 or abs(x @ z) > AXES_PARALLEL * lengths[0] * lengths[1]:
-        raise InputError("robot.mount: x_axis and z_axis are parallel or zero", where=path, allowed="two axes")
+        refuse("robot.mount: x_axis and z_axis are parallel or zero", path, "two axes", "axes_parallel")
     angle = float(np.degrees(np.arccos(x @ z / (lengths[0] * lengths[1]))))
     if abs(angle - 90.0) > AXES_SQUARE_DEG:
-        raise InputError(
-            f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart",
-            where=path,
-            allowed=f"a right angle, to {AXES_SQUARE_DEG:g} degree",
-        )
+        allowed = f"a right angle, to {AXES_SQUARE_DEG:g} degree"
+        refuse(f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart", path, allowed, "axes_not_square")
     far = float(np.linalg.norm(mount.position_mm))
     if 0.0 < far < LIKE_METRES:
-        raise InputError(
-            f"robot.mount: position_mm is {far:g} mm from the origin, which would be a base within the patient",
-            where=path,
-            allowed="millimetres (these look like metres)",
-        )
+        what = f"robot.mount: position_mm is {far:g} mm from the origin, which would be a base within the patient"
+        refuse(what, path, "millimetres (these look like metres)", "wrong_unit")
     T_ct_base = pose(frame_of_axes(z, x), to_lps(np.asarray([mount.position_mm]), space)[0])
     T_base_ct = np.asarray(np.linalg.inv(T_ct_base), np.float64)
     T_base_ct.setflags(write=False)
@@ -264,4 +258,4 @@ def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:
     try:
         return entry_frame(EntryAxes(z=z, x=x), space, where=path)
     except InputError as error:
-        raise InputError(f"{key} are parallel or zero", where=path, allowed="two axes") from error
+        raise InputError(f"{key} are parallel or zero", where=path, allowed="two axes", code="axes_parallel") from error

@@ -32,6 +32,7 @@ from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, HIGHEST
 from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.toml_types import (
     Anatomical,
@@ -98,19 +99,23 @@ class StructureSection(Section):
     def _one_source(self) -> Self:
         sources = [key for key in ("mesh", "labelmap", "ct") if getattr(self, key) is not None]
         if len(sources) != 1:
-            raise ValueError(f"'{self.name}' needs exactly one of mesh, labelmap, ct; it has {sources or 'none'}")
+            what = f"'{self.name}' needs exactly one of mesh, labelmap, ct; it has {sources or 'none'}"
+            raise SchemaError(what, "not_one_source")
         if (self.labelmap is None) != (self.label is None):
-            raise ValueError(f"'{self.name}': labelmap and label go together")
+            raise SchemaError(f"'{self.name}': labelmap and label go together", "keys_together")
         if self.mesh is not None and self.unit is None:
-            raise ValueError(f'\'{self.name}\': a mesh needs unit = "mm", "cm" or "m"; no mesh file says it')
+            what = f'\'{self.name}\': a mesh needs unit = "mm", "cm" or "m"; no mesh file says it'
+            raise SchemaError(what, "unit_not_stated")
         if self.mesh is None and (self.unit or self.space or self.up):
-            raise ValueError(f"'{self.name}': unit, space and up belong to a mesh; a volume says its own")
+            what = f"'{self.name}': unit, space and up belong to a mesh; a volume says its own"
+            raise SchemaError(what, "key_not_of_it")
         if self.ct is not None and self.role != "skin":
-            raise ValueError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"")
+            raise SchemaError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"", "key_not_of_it")
         if self.cut is not None and self.role != "skin":
-            raise ValueError(f"'{self.name}': cut belongs to the skin: it says where the body was cut")
+            what = f"'{self.name}': cut belongs to the skin: it says where the body was cut"
+            raise SchemaError(what, "key_not_of_it")
         if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
-            raise ValueError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"')
+            raise SchemaError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"', "key_not_of_it")
         return self
 
 
@@ -133,16 +138,17 @@ class StructuresSection(Section):
     def _one_source(self) -> Self:
         sources = [key for key in ("labelmap", "masks", "seg", "rtstruct") if getattr(self, key) is not None]
         if len(sources) != 1:
-            raise ValueError(
+            raise SchemaError(
                 "needs either labelmap (a file) or masks (a folder with one file a structure), not both; "
-                f"or seg (DICOM, or Slicer's .seg.nrrd), or rtstruct; it has {' and '.join(sources) or 'none'}"
+                f"or seg (DICOM, or Slicer's .seg.nrrd), or rtstruct; it has {' and '.join(sources) or 'none'}",
+                "not_one_source",
             )
         if self.labelmap is None and self.naming is not None:
-            raise ValueError(
-                "naming belongs to labelmap; masks are named after their files, SEG and RTSTRUCT state their names"
-            )
+            what = "naming belongs to labelmap; masks are named after their files, SEG and RTSTRUCT state their names"
+            raise SchemaError(what, "key_not_of_it")
         if self.ct is not None and self.seg is None and self.rtstruct is None:
-            raise ValueError("ct belongs to seg and rtstruct: the DICOM series on which they were drawn")
+            what = "ct belongs to seg and rtstruct: the DICOM series on which they were drawn"
+            raise SchemaError(what, "key_not_of_it")
         return self
 
     @property
@@ -201,7 +207,8 @@ class SearchSection(Section):
         for low, high in (self.theta_deg, self.beta_deg):
             rows *= (high - low) / self.step_deg + 1
         if rows > MAX_DIRECTIONS:
-            raise ValueError(f"step_deg {self.step_deg:g} makes {rows:,.0f} directions; {MAX_DIRECTIONS:,} at most")
+            what = f"step_deg {self.step_deg:g} makes {rows:,.0f} directions; {MAX_DIRECTIONS:,} at most"
+            raise SchemaError(what, "too_many")
         return self
 
     @model_validator(mode="after")
@@ -209,9 +216,10 @@ class SearchSection(Section):
         for key in ("theta_deg", "beta_deg"):
             low, high = getattr(self, key)
             if low > high:
-                raise ValueError(f"{key} [{low:g}, {high:g}] descends; it is [lowest, highest]")
+                raise SchemaError(f"{key} [{low:g}, {high:g}] descends; it is [lowest, highest]", "range_descends")
             if 0 < high - low < self.step_deg:
-                raise ValueError(f"step_deg {self.step_deg:g} is larger than the range {key} [{low:g}, {high:g}]")
+                what = f"step_deg {self.step_deg:g} is larger than the range {key} [{low:g}, {high:g}]"
+                raise SchemaError(what, "step_too_large")
         return self
 
 
@@ -228,7 +236,7 @@ class RankingSection(Section):
     @model_validator(mode="after")
     def _one_counts(self) -> Self:
         if not any(getattr(self, name) > 0 for name in type(self).model_fields):
-            raise ValueError("every weight is 0; one at least is above")
+            raise SchemaError("every weight is 0; one at least is above", "no_weight")
         return self
 
 
@@ -255,12 +263,13 @@ class NeedleSection(Section):
     @model_validator(mode="after")
     def _shaft_fits(self) -> Self:
         if self.shaft_mm > self.length_mm:
-            raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
+            raise SchemaError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}", "out_of_range")
         least = self.length_mm - self.shaft_mm + 10.0
         if self.lengths_mm and (self.length_mm not in self.lengths_mm or min(self.lengths_mm) < least):
-            raise ValueError(f"lengths_mm holds length_mm, and none below {least:g}: the holder, and 10 mm of shaft")
+            what = f"lengths_mm holds length_mm, and none below {least:g}: the holder, and 10 mm of shaft"
+            raise SchemaError(what, "out_of_range")
         if self.solid is not None and self.gauge is None:
-            raise ValueError("solid belongs to gauge; without one the shaft is solid, of diameter_mm")
+            raise SchemaError("solid belongs to gauge; without one the shaft is solid, of diameter_mm", "key_not_of_it")
         return self
 
 
@@ -276,7 +285,8 @@ class TissueSection(Section):
     @model_validator(mode="after")
     def _capsule_is_whole(self) -> Self:
         if (self.capsule_n > 0) != (self.capsule_mm > 0):
-            raise ValueError("capsule_n and capsule_mm go together: force at the rupture, and how far in it is")
+            what = "capsule_n and capsule_mm go together: force at the rupture, and how far in it is"
+            raise SchemaError(what, "keys_together")
         return self
 
 
@@ -292,9 +302,10 @@ class TargetSection(Section):
     @model_validator(mode="after")
     def _one_position(self) -> Self:
         if (self.position_mm is None) == (self.points is None):
-            raise ValueError("needs either position_mm or points (a file, with the target's name), not both")
+            what = "needs either position_mm or points (a file, with the target's name), not both"
+            raise SchemaError(what, "not_one_source")
         if self.structure is None and self.hit_radius_mm is None:
-            raise ValueError("needs structure, or hit_radius_mm where the target lies in no structure")
+            raise SchemaError("needs structure, or hit_radius_mm where the target lies in no structure", "missing_key")
         return self
 
 
@@ -314,10 +325,11 @@ class LimitsSection(Section):
     @model_validator(mode="after")
     def _ranges_ascend(self) -> Self:
         if (self.lowest_deg is None) != (self.highest_deg is None):
-            raise ValueError("lowest_deg and highest_deg go together")
+            raise SchemaError("lowest_deg and highest_deg go together", "keys_together")
         for joint, (low, high) in enumerate(zip(self.lowest_deg or (), self.highest_deg or (), strict=True)):
             if not low < high:
-                raise ValueError(f"joint {joint + 1}: lowest_deg {low:g} is not below highest_deg {high:g}")
+                what = f"joint {joint + 1}: lowest_deg {low:g} is not below highest_deg {high:g}"
+                raise SchemaError(what, "range_descends")
         return self
 
 
@@ -348,17 +360,16 @@ class RobotSection(Section):
     @model_validator(mode="after")
     def _one_arm(self) -> Self:
         if self.urdf is not None and "model" in self.model_fields_set:
-            raise ValueError("model and urdf both say which arm it is; keep one")
+            raise SchemaError("model and urdf both say which arm it is; keep one", "stated_twice")
         if self.urdf is None and "flange" in self.model_fields_set:
-            raise ValueError("flange names a link of urdf, which is not there")
+            raise SchemaError("flange names a link of urdf, which is not there", "key_not_of_it")
         return self
 
     @model_validator(mode="after")
     def _insertion_is_the_slower(self) -> Self:
         if self.insertion_speed_mm_s > self.tip_speed_mm_s:
-            raise ValueError(
-                f"insertion_speed_mm_s {self.insertion_speed_mm_s:g} is above tip_speed_mm_s {self.tip_speed_mm_s:g}"
-            )
+            what = f"insertion_speed_mm_s {self.insertion_speed_mm_s:g} is above tip_speed_mm_s {self.tip_speed_mm_s:g}"
+            raise SchemaError(what, "out_of_range")
         return self
 
 
@@ -368,7 +379,7 @@ MountName = Literal["floor", "rail", "ceiling", "side"]
 
 
 class MountBounds(Section):
-    """Where a base of one kind may stand, seen from the target; what is left out follows from the arm's length."""
+    """Bounds of the base's place for one kind of mount, from the target; the rest follows from the arm's length."""
 
     along_mm: Range | None = None
     across_mm: Range | None = None
@@ -379,12 +390,13 @@ class MountBounds(Section):
         for key in ("along_mm", "across_mm", "height_mm"):
             bounds = getattr(self, key)
             if bounds is not None and bounds[0] > bounds[1]:
-                raise ValueError(f"{key} [{bounds[0]:g}, {bounds[1]:g}] descends; it is [lowest, highest]")
+                what = f"{key} [{bounds[0]:g}, {bounds[1]:g}] descends; it is [lowest, highest]"
+                raise SchemaError(what, "range_descends")
         return self
 
 
 class PlaceSection(Section):
-    """Where ``place`` may stand the arm."""
+    """Bounds within which ``place`` searches for the arm's base."""
 
     mounts: tuple[MountName, ...] | None = None
     step_mm: Annotated[Number, Field(ge=20, le=500)] = 150.0
@@ -400,9 +412,9 @@ class PlaceSection(Section):
     @model_validator(mode="after")
     def _mounts_make_sense(self) -> Self:
         if self.mounts is not None and (not self.mounts or len(set(self.mounts)) < len(self.mounts)):
-            raise ValueError(f"mounts {list(self.mounts)}: at least one, each once")
+            raise SchemaError(f"mounts {list(self.mounts)}: at least one, each once", "duplicate_name")
         if self.rail.across_mm is not None:
-            raise ValueError("rail.across_mm: a rail lies beside the table; rail_gap_mm says how far")
+            raise SchemaError("rail.across_mm: a rail lies beside the table; rail_gap_mm says how far", "key_not_of_it")
         return self
 
 
@@ -436,9 +448,10 @@ class RegistrationSection(Section):
     @model_validator(mode="after")
     def _corrected(self) -> Self:
         if self.correct_joints_deg is not None and not self.correct:
-            raise ValueError("correct_joints_deg is the insertion that correct = true corrects for")
+            raise SchemaError("correct_joints_deg is the insertion that correct = true corrects for", "keys_together")
         if self.correct and self.method not in {None, "weighted"}:
-            raise ValueError(f'correct = true has a fit of its own; method "{self.method}" has another')
+            what = f'correct = true has a fit of its own; method "{self.method}" has another'
+            raise SchemaError(what, "conflicting_keys")
         return self
 
     @model_validator(mode="after")
@@ -446,25 +459,30 @@ class RegistrationSection(Section):
         markers = [key for key in ("markers_ct", "markers_base") if getattr(self, key) is None]
         if self.transform is None:
             if markers:
-                raise ValueError(f"{' and '.join(markers)}: missing; markers_ct and markers_base, or transform")
+                what = f"{' and '.join(markers)}: missing; markers_ct and markers_base, or transform"
+                raise SchemaError(what, "missing_key")
             if self.transform_maps or self.base_axes:
-                raise ValueError("transform_maps and base_axes belong to transform")
+                raise SchemaError("transform_maps and base_axes belong to transform", "key_not_of_it")
             return self
         if len(markers) == 1:
-            raise ValueError(f"{markers[0]}: missing; beside transform both lists of markers, which it is held against")
+            what = f"{markers[0]}: missing; beside transform both lists of markers, which it is held against"
+            raise SchemaError(what, "missing_key")
         placing = (*_OF_MARKERS, *_OF_COMPARISON) if markers else _OF_MARKERS
         given = [key for key in placing if getattr(self, key)]
         if given:
-            raise ValueError(f"transform stands in place of markers; {', '.join(given)} belongs to markers")
+            what = f"transform stands in place of markers; {', '.join(given)} belongs to markers"
+            raise SchemaError(what, "key_not_of_it")
         if self.transform_maps is None:
-            raise ValueError(
+            raise SchemaError(
                 'transform needs transform_maps = "base_to_ct" (as Slicer saves a transform that moves the CT to the '
-                'robot) or "ct_to_base": no file says which way it goes'
+                'robot) or "ct_to_base": no file says which way it goes',
+                "missing_key",
             )
         if self.base_axes is None:
-            raise ValueError(
+            raise SchemaError(
                 'transform needs base_axes = "RAS" (the robot\'s x, y, z are what Slicer shows as R, A, S) or "LPS" '
-                "(they stand in the file as they are)"
+                "(they stand in the file as they are)",
+                "missing_key",
             )
         return self
 
@@ -489,7 +507,7 @@ def stated_base_ct(section: RegistrationSection, T_file: Floats) -> Floats:
 
 
 def other_readings(section: RegistrationSection, T_base_ct: Floats) -> dict[str, Floats]:
-    """What T_base_ct would be with other values of ``transform_maps`` and ``base_axes``, by these keys as text.
+    """T_base_ct under other values of ``transform_maps`` and ``base_axes``, by these keys as text.
 
     Args:
         section: As the case states it.
@@ -541,12 +559,12 @@ class ErrorsSection(Section):
     def _cell_or_deviation(self) -> Self:
         for cell, deviation in (("ct_pixel_mm", "ct_in_plane_mm"), ("ct_spacing_mm", "ct_slice_mm")):
             if getattr(self, cell) is not None and getattr(self, deviation) is not None:
-                raise ValueError(f"{cell} and {deviation} state the same error; keep one")
+                raise SchemaError(f"{cell} and {deviation} state the same error; keep one", "stated_twice")
         return self
 
 
 class RehearsalSection(Section):
-    """What the twin's truth is drawn from; the planner never reads it."""
+    """From what the twin draws its ground truth; the planner never reads it."""
 
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
     truth_base: str | None = None
@@ -578,7 +596,8 @@ class BreathingSection(Section):
     @model_validator(mode="after")
     def _full_inhale_is_a_phase(self) -> Self:
         if self.phases > 1 and self.phases % 2:
-            raise ValueError(f"phases {self.phases}: an even number, so that full inhale is one of them, or 1")
+            what = f"phases {self.phases}: an even number, so that full inhale is one of them, or 1"
+            raise SchemaError(what, "out_of_range")
         return self
 
 

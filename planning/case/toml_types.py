@@ -18,19 +18,20 @@ from pydantic import (
     model_validator,
 )
 
+from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.text import MAX_NAME
 from puncture_twin.planning.formats.points import plainly_radians
 
 
 def _plain_name(value: str) -> str:
     if not re.fullmatch(r"[^\W_]([\w .\-]*[\w.\-])?", unicodedata.normalize("NFC", value)):
-        raise ValueError("letters, digits, spaces and . _ - alone, a letter or digit first")
+        raise SchemaError("letters, digits, spaces and . _ - alone, a letter or digit first", "bad_name")
     return value
 
 
 def _degrees(value: tuple[float, ...]) -> tuple[float, ...]:
     if plainly_radians(value):
-        raise ValueError(f"all six within {max(map(abs, value)):g} of zero: radians? They are degrees")
+        raise SchemaError(f"all six within {max(map(abs, value)):g} of zero: radians? They are degrees", "wrong_unit")
     return value
 
 
@@ -73,5 +74,5 @@ class Section(BaseModel):
                 if key not in known:
                     near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
                     hint = f"did you mean '{near[0]}'? " if near else ""
-                    raise ValueError(f"unknown key '{key}'; {hint}keys here: {', '.join(known)}")
+                    raise SchemaError(f"unknown key '{key}'; {hint}keys here: {', '.join(known)}", "unknown_key")
         return data

@@ -153,7 +153,7 @@ class Children:
 
 
 def split(cells: Cells, letters: NDArray[np.str_]) -> Children:
-    """Halve every cell as its letter says; parts in the order of their cells, low θ first, then low β."""
+    """Halve every cell along the axes of its letter; parts in the order of their cells, low θ first, then low β."""
     kind = np.select([letters == "t", letters == "b"], [0, 1], 2)
     parent = np.repeat(np.arange(len(cells)), _COUNT[kind])
     part = np.arange(len(parent)) - np.repeat(np.cumsum(_COUNT[kind]) - _COUNT[kind], _COUNT[kind])

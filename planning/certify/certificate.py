@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
@@ -202,13 +202,13 @@ def leaves_of(cap: Cells, tree: tuple[str, ...], where: str | Path = "certificat
         letters = np.array(list(level), dtype="U1")
         if len(letters) != len(cells) or not np.isin(letters, list("tbqSRU")).all():
             what = f"level {depth} of the tree has {len(letters)} cells or an unknown letter"
-            raise InputError(what, where=where, allowed=f"{len(cells)} of t, b, q, S, R, U")
+            refuse(what, where, f"{len(cells)} of t, b, q, S, R, U", "certificate_damaged")
         inner = np.isin(letters, list("tbq"))
         theta.append(cells.theta[~inner])
         beta.append(cells.beta[~inner])
         cells = split(cells.take(inner), letters[inner]).cells
     if len(cells):
-        raise InputError(f"the tree ends with {len(cells)} cells missing", where=where, allowed="a whole tree")
+        refuse(f"the tree ends with {len(cells)} cells missing", where, "a whole tree", "certificate_damaged")
     return Cells(np.concatenate(theta), np.concatenate(beta))
 
 
@@ -264,10 +264,6 @@ def read_certificate(path: Path) -> Certificate:
 def parse_certificate(data: bytes, path: Path) -> Certificate:
     """Check that a certificate's bytes are whole and agree with themselves; `checker.verify` proves it.
 
-    Args:
-        data: The file's bytes.
-        path: The file, for errors.
-
     Raises:
         InputError: Not a certificate, another version, missing or contradicting parts.
     """
@@ -275,12 +271,12 @@ def parse_certificate(data: bytes, path: Path) -> Certificate:
     with fitting(path, CERTIFICATE_ALLOWED):
         certificate = _certificate(document, path)
     for name in sorted(set(document) - NAMES):
-        raise InputError(f"key '{name}' is not known", where=path, allowed=", ".join(sorted(NAMES)))
+        refuse(f"key '{name}' is not known", path, ", ".join(sorted(NAMES)), "unknown_key")
     stated, counted = document.get("summary"), json.loads(json.dumps(certificate.summary()))
     if stated != counted:
         wrong = [key for key in counted if not isinstance(stated, dict) or stated.get(key) != counted[key]]
         what = f"its summary does not follow from its cells ({', '.join(wrong) or 'other keys'})"
-        raise InputError(what, where=path, allowed="an unchanged certificate")
+        refuse(what, path, "an unchanged certificate", "certificate_damaged")
     return certificate
 
 
@@ -290,7 +286,7 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     leaves = leaves_of(question.cap(), tree, path)
     rows = document["witness"]
     if len(rows) != len(leaves):
-        raise InputError(f"{len(rows)} witnesses for {len(leaves)} cells", where=path, allowed="one for each")
+        refuse(f"{len(rows)} witnesses for {len(leaves)} cells", path, "one for each", "certificate_damaged")
     reasons, structures, triangles, bounds = zip(*rows, strict=True)
     return Certificate(
         question=question,
@@ -371,13 +367,7 @@ def _map(certificate: Any) -> str:
 
 
 def with_safe_cone(case: Case, candidates: Candidates, certificate: Certificate) -> Candidates:
-    """The candidates with their safe cones, ranked again.
-
-    Args:
-        case: The case of both.
-        candidates: A search's result.
-        certificate: The case's certified map.
-    """
+    """The candidates with their safe cones, ranked again."""
     cone, rows = np.full(len(candidates), np.nan), np.flatnonzero(candidates.safe)
     cone[rows] = certificate.safe_cone(candidates.outward_ct[rows])
     return ranked(case, replace(candidates, safe_cone=cone, cone_source=CONE_CERTIFIED))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.case.case import Case
@@ -71,7 +71,7 @@ class _Cell:
         return np.asarray(self._R @ np.array([np.sin(t) * np.cos(b), np.sin(t) * np.sin(b), np.cos(t)]))
 
     def parts(self, letter: str) -> list[_Cell]:
-        """Its halves or quarters, low θ first, then low β."""
+        """The cell's halves or quarters, low θ first, then low β."""
         (t0, t1), (b0, b1) = self.theta, self.beta
         t, b = 0.5 * (t0 + t1), 0.5 * (b0 + b1)
         thetas = [(t0, t), (t, t1)] if letter in "tq" else [(t0, t1)]
@@ -120,16 +120,16 @@ def verify(
 def _check_question(certificate: Certificate, case: Case, anatomy: Anatomy, error: PoseError | None) -> None:
     stated = certificate.question
     if not (np.all(np.isfinite(stated.theta)) and 0 <= stated.theta[0] <= stated.theta[1] <= np.pi + 1e-12):
-        raise InputError(f"theta {stated.theta} is no range", where="certificate", allowed="0 to pi")
+        refuse(f"theta {stated.theta} is no range", "certificate", "0 to pi", "out_of_range")
     derived = question_of(case, anatomy, theta=stated.theta, beta=stated.beta, touch=stated.touch, error=error)
     changed = differing_input(stated.inputs, derived.inputs)
     if changed is not None:
         what = f"input '{changed}' is not the one that the certificate was made from"
-        raise InputError(what, where="certificate", allowed=f"a certificate of {case.path}, unchanged since")
+        refuse(what, "certificate", f"a certificate of {case.path}, unchanged since", "input_changed")
     for name in vars(derived):
         if name != "inputs" and not np.array_equal(getattr(stated, name), getattr(derived, name)):
             what = f"its {name} is not that of the case: the certificate was made for something else"
-            raise InputError(what, where="certificate", allowed=f"a certificate of {case.path}, unchanged since")
+            refuse(what, "certificate", f"a certificate of {case.path}, unchanged since", "certificate_of_another")
 
 
 class _Checker:
@@ -140,12 +140,12 @@ class _Checker:
         self._skin = PlainSkin(anatomy.skin, case.target_ct)
         self._even = self._skin.closed and not self._skin.odd()
         demanding = [s for s in anatomy.checked if s.demands_margin]
-        meshes, self._beside = [s.mesh for s in demanding], np.array([s.outside for s in demanding], bool)
+        meshes, self._is_outside = [s.mesh for s in demanding], np.array([s.outside for s in demanding], bool)
         self._organs = np.concatenate([m.triangles for m in meshes] or [np.empty((0, 3, 3))]) - case.target_ct
         self._first = np.cumsum([0, *(len(mesh.faces) for mesh in meshes)])
         self._limits = self._question.margins + self._question.radius
         self._limit = np.repeat(self._limits, np.diff(self._first))
-        self._outside = np.repeat(self._beside, np.diff(self._first))
+        self._outside = np.repeat(self._is_outside, np.diff(self._first))
         self._inside = [side_of(mesh, case.target_ct) is Side.INSIDE for mesh in meshes]
 
     def run(self, progress: Count | None) -> Verification:
@@ -215,7 +215,7 @@ class _Checker:
             theta, beta = (f"{np.degrees(low):.4f}..{np.degrees(high):.4f}" for low, high in (cell.theta, cell.beta))
             claim = {"S": "safe", "R": f"rejected ({reason})", "U": "small"}[letter]
             what = f"cell {row} (theta {theta}, beta {beta} degrees) is not proven {claim}"
-            raise InputError(what, where="certificate", allowed="claims that follow from the case")
+            refuse(what, "certificate", "claims that follow from the case", "cell_not_proven")
 
     def _safe(self, known: _Known) -> bool:
         """Whether no structure comes near, and the skin is crossed once, soon enough and steeply enough."""
@@ -233,7 +233,7 @@ class _Checker:
         if not self._first[column] <= row < self._first[column + 1] or cell.rho > WIDEST:
             return False
         surface = _bvh(self._organs[row], np.array([[0, 1, 2]]))
-        outside = self._beside[column]
+        outside = self._is_outside[column]
         length = self._learn(cell, whole).flange[0] - DEPTH_PAD_MM if outside else self._question.length
         ends = cell.corners * length
         axes = [_bvh(np.stack([np.zeros(3), end]), np.array([[0, 1, 1]])) for end in ends]

@@ -33,7 +33,7 @@ class Zones:
 
 @dataclass(frozen=True, eq=False)
 class Lists:
-    """For each of n cells the triangles that may matter to it: ``items[start[i]:start[i + 1]]``."""
+    """Of each of n cells, the triangles that may matter to it: ``items[start[i]:start[i + 1]]``."""
 
     start: Ints
     items: Ints

@@ -9,7 +9,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.cells import Cells
@@ -79,11 +79,11 @@ def question_of(
         ("tissue", case.bending, "a needle that does not bend"),
     ):
         if declared is not None:
-            allowed = f"a case without [{table}]; or a search, which counts it"
-            raise InputError(f"[{table}]: a certificate proves {straight}", where=case.path, allowed=allowed)
+            what = f"[{table}]: a certificate proves {straight}"
+            refuse(what, case.path, f"a case without [{table}]; or a search, which counts it", "not_certifiable")
     theta, beta = theta or case.search.theta, beta or case.search.beta
     if not (0 <= theta[0] <= theta[1] <= np.pi + 1e-12 and beta[0] <= beta[1] <= beta[0] + 2 * np.pi + 1e-12):
-        raise InputError("the cap is no range of angles", where="certify", allowed="theta 0 to 180, beta 0 to 360")
+        refuse("the cap is no range of angles", "certify", "theta 0 to 180, beta 0 to 360", "out_of_range")
     demanding = [s for s in anatomy.checked if s.demands_margin]
     return Question(
         case_name=case.name,
@@ -111,10 +111,10 @@ def _margins(case: Case, demanding: list[Structure], touch: float | None, error:
     if touch is None:
         return margins
     if not 0.0 < touch <= MOST_TOUCH:
-        raise InputError(f"chance to touch {touch:g}", where="certify", allowed=f"above 0, at most {MOST_TOUCH:g}")
+        refuse(f"chance to touch {touch:g}", "certify", f"above 0, at most {MOST_TOUCH:g}", "out_of_range")
     if error is None:
         message = "a chance to touch cannot be certified: only markers and [errors] give the needle's error"
-        raise InputError(message, where=case.path, allowed="[registration] with markers, and [errors]; or no chance")
+        refuse(message, case.path, "[registration] with markers, and [errors]; or no chance", "not_certifiable")
     farthest = np.array([np.linalg.norm(s.mesh.vertices - case.target_ct, axis=1).max() for s in demanding])
     waiting = farthest_flange(case.needle, case.search.max_skin_angle)
     lengths = np.array([waiting if s.outside else case.needle.length_mm for s in demanding])

@@ -21,7 +21,7 @@ CONE_PAD_RAD = 3e-7
 LENGTH_PAD_MM = 1e-5
 """Widens every depth: rounding at a metre is 1e-10, and crossings within 1e-6 mm are one."""
 
-IN_DOUBT = 1e-11
+SIDE_ROUNDING = 1e-11
 """A test ray whose edge function is below this, relative to the edge's ends, may pass on either side."""
 
 
@@ -171,7 +171,7 @@ def _pierced(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
     """1 where the ray along u crosses the triangle, 0 where it does not, -1 where rounding might decide."""
     la, lb, lc = np.sqrt(_dot(a, a)), np.sqrt(_dot(b, b)), np.sqrt(_dot(c, c))
     wa, wb, wc = _dot(u, _cross(b, c)), _dot(u, _cross(c, a)), _dot(u, _cross(a, b))
-    ea, eb, ec = IN_DOUBT * lb * lc, IN_DOUBT * lc * la, IN_DOUBT * la * lb
+    ea, eb, ec = SIDE_ROUNDING * lb * lc, SIDE_ROUNDING * lc * la, SIDE_ROUNDING * la * lb
     left = wa > ea or wb > eb or wc > ec
     right = wa < -ea or wb < -eb or wc < -ec
     if left and right:

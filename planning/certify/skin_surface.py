@@ -82,7 +82,7 @@ def _folds(mesh: TriangleMesh, corners: Floats) -> Bools:
 
 
 def welded(vertices: Floats) -> NDArray[np.int64]:
-    """For each vertex the number of the place where it lies, shape (n,)."""
+    """Number of the place of each vertex, shape (n,): vertices at one place share it."""
     order = np.lexsort((vertices + 0.0).T)
     new = (np.diff(vertices[order], axis=0) != 0).any(axis=1)
     place = np.empty(len(vertices), np.int64)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
@@ -81,7 +81,7 @@ def certify(
     question = question_of(case, anatomy, theta=theta, beta=beta, touch=touch, error=error)
     if not SMALLEST_SIZE <= size <= np.pi:
         allowed = f"{np.degrees(SMALLEST_SIZE):g} to 180 degrees"
-        raise InputError(f"size {np.degrees(size):g} degrees", where="certify", allowed=allowed)
+        refuse(f"size {np.degrees(size):g} degrees", "certify", allowed, "out_of_range")
     evaluator = _Evaluator(question, anatomy, case.needle)
     record = _Record()
     cells, state = question.cap(), evaluator.start()

@@ -1,7 +1,7 @@
-"""The interface of clearance engines, and needle-to-organ clearance by whichever engine measures.
+"""Needle-to-organ clearance: the interface of clearance engines, and what holds whichever engine measures.
 
-An engine is prepared for surfaces once and measures from any target; `measure` adds the verdict at margins, where FCL
-decides ties, and `normals_of` the unit vectors from the nearest triangles.
+An engine gives the distance of needle axes from surfaces. `measure` makes clearances of them, and says which violate a
+margin (FCL decides ties); `normals_of` gives the unit vectors from the nearest triangles.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class AxisDistances:
         distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they intersect.
         depth: Shape (n, k), distance from the target, along the axis, of the axis point nearest to the structure;
             where they intersect, of the first point of intersection.
-        nearest: Shape (n, k), a triangle of the structure that is as near, a row of the engine's `triangles`.
+        nearest: Shape (n, k), a nearest triangle of the structure, as a row of the engine's `triangles`.
     """
 
     distance: Floats
@@ -45,8 +45,8 @@ class AxisDistances:
 class ClearanceEngine(Protocol):
     """A clearance engine: prepared once for a set of surfaces, it measures from any target.
 
-    An engine sees surfaces only. That a needle lies wholly inside a closed surface is the caller's to find, and is
-    decided by the target alone, because every axis starts there (see `puncture_twin.planning.clearance.engine`).
+    An engine sees surfaces only, not what is inside of them. A needle wholly inside a closed surface is found by
+    `measure`, from the target alone, because every axis starts there.
     """
 
     @property
@@ -62,10 +62,13 @@ class ClearanceEngine(Protocol):
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
     ) -> AxisDistances:
-        """Exact distances of the axes from ``target_ct`` (3,) along ``outward_ct`` (n, 3).
+        """Exact distances of n axes from k structures, as arrays that the caller may change.
 
-        ``length`` is one number, shape (k,) or (n, k), mm: as long is an axis for each structure. The arrays are the
-        caller's to change. Without ``shown`` no progress is reported: the same axes are tested again.
+        Args:
+            target_ct: Shape (3,), where every axis starts, mm.
+            outward_ct: Shape (n, 3), unit vectors along the axes.
+            length: Of the axes, one number, shape (k,) or (n, k), mm: it may differ between structures.
+            shown: Whether progress is reported; not where axes are measured again.
         """
         ...
 
@@ -74,7 +77,7 @@ class ClearanceEngine(Protocol):
         ...
 
     def of(self, columns: Ints) -> ClearanceEngine:
-        """The same engine for some of its structures, in this order; nothing is prepared again."""
+        """This engine for some of its structures, in the order of ``columns``; nothing is prepared again."""
         ...
 
 
@@ -95,19 +98,19 @@ def too_near(
     distance: Floats,
     limit: float,
 ) -> NDArray[np.bool_]:
-    """Whether axes come nearer to a structure's surface than a limit, shape (n,); FCL decides what is a tie.
+    """Whether axes come nearer to a structure's surface than a limit, shape (n,); FCL decides ties.
 
     Args:
         engine: Which measured the distances.
-        structure: Its place in the engine.
-        target_ct: Shape (3,).
+        structure: Its column in the engine.
+        target_ct: Shape (3,), mm.
         outward_ct: Shape (n, 3), unit vectors.
         length: Of the axes, one number or shape (n,), mm.
         distance: Shape (n,), of the axes from the surface, mm.
         limit: Needle radius plus margin, mm.
     """
     nearer, lengths = distance < limit, np.broadcast_to(length, len(outward_ct))
-    for row in np.flatnonzero(np.abs(distance - limit) < NEAR_THRESHOLD_MM):
+    for row in np.flatnonzero(np.abs(distance - limit) < NEAR_THRESHOLD_MM):  # a tie: FCL may reject, never accept
         nearer[row] = distance[row] < limit - ROUNDING_MM or engine.collides(
             structure, target_ct, outward_ct[row], float(lengths[row]), limit
         )
@@ -120,8 +123,8 @@ class Clearances:
 
     Attributes:
         clearance: Shape (n, k), axis distance minus needle radius, never below minus the radius.
-        depth: Shape (n, k), where along the needle, from the target.
-        violated: Shape (n, k), the structure demands a margin and does not get it, by its distance or by FCL's word.
+        depth: Shape (n, k), distance from the target, along the needle, of the point nearest to the structure.
+        violated: Shape (n, k), whether the clearance is less than the structure's margin; FCL decides ties.
     """
 
     clearance: Floats
@@ -139,28 +142,28 @@ def measure(
     radius: float,
     axes: AxisDistances | None = None,
 ) -> Clearances:
-    """Measure the clearance of all candidates, with the verdict at each margin.
+    """Clearance of n candidates from k structures, and whether it violates each margin.
 
-    Every axis starts at the target: where the target lies inside a closed structure, the whole axis is inside it or
-    crosses its surface, and the distance is 0 whatever the surfaces say.
+        clearance = distance of the axis from the surface - needle radius;  violated: clearance < margin
 
     Args:
         engine: Prepared for the meshes of ``structures``, in that order.
         structures: The k structures.
-        target_ct: Shape (3,).
+        target_ct: Shape (3,), mm.
         outward_ct: Shape (n, 3), unit vectors.
-        length: How far the needle's axis goes from the target, one number, shape (k,) or (n, k), mm.
+        length: Of the needle's axis from the target, one number, shape (k,) or (n, k), mm.
         radius: Needle radius, mm.
-        axes: What the engine has measured of them already; None measures them.
+        axes: Their distances where the engine has measured them already; None measures them.
     """
     lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), (len(outward_ct), len(structures)))
     if axes is None:
         axes = engine.measure(target_ct, outward_ct, lengths)
         distance, depth = axes.distance, axes.depth
-    else:  # the caller's, who needs them as they are
-        distance, depth = axes.distance.copy(order="K"), axes.depth.copy(order="K")  # a structure's row by row
+    else:  # the caller needs its arrays unchanged; order "K" keeps each structure's distances contiguous
+        distance, depth = axes.distance.copy(order="K"), axes.depth.copy(order="K")
     violated = np.zeros_like(distance, bool)
     for column, structure in enumerate(structures):
+        # Every axis starts at the target: where that is inside, each axis is inside too or crosses the surface.
         if contains(structure.mesh, target_ct):
             distance[:, column] = depth[:, column] = 0.0
         if structure.demands_margin:
@@ -173,15 +176,15 @@ def measure(
 
 
 def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Floats, axes: AxisDistances) -> Floats:
-    """Unit vectors from each surface to each axis, shape (n, k, 3); NaN where they intersect.
+    """Unit vectors from each surface's nearest point to each axis, shape (n, k, 3); NaN where they intersect.
 
-    Nothing is searched again. Where several points of a surface are equally near, it is any one of them.
+    They follow from the nearest triangles, without another search; of several nearest points any one is taken.
 
     Args:
-        triangles: Of the engine that measured: of each surface, shape (m, 9), corners in rows, mm.
-        target_ct: Shape (3,), where the axes start.
-        outward_ct: Shape (n, 3), unit.
-        axes: Measured from there, their ``nearest`` rows of ``triangles``.
+        triangles: Of the engine that measured; for each surface shape (m, 9), corners in rows, mm.
+        target_ct: Shape (3,), where the axes start, mm.
+        outward_ct: Shape (n, 3), unit vectors.
+        axes: Distances of these axes; ``nearest`` are rows of ``triangles``.
     """
     target, outward = (np.array(given, dtype=np.float64, order="C") for given in (target_ct, outward_ct))
     normal = np.empty((len(triangles), len(outward), 3))
@@ -193,15 +196,15 @@ def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Float
 
 @nb.njit(cache=True)
 def axis_normals(triangles, nearest, distance, depth, target, outward, normal):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``normal`` (n, 3): unit, from the nearest point of each axis' nearest triangle to the axis; NaN on contact.
+    """Fill ``normal`` (n, 3) with the unit vectors of one surface: see `normals_of`; NaN on contact.
 
     Args:
         triangles: Shape (m, 9), corners in rows, mm.
         nearest: Shape (n,), row of each axis' nearest triangle.
         distance: Shape (n,), mm.
         depth: Shape (n,), of the nearest axis point, mm.
-        target: Shape (3,), where the axes start.
-        outward: Shape (n, 3), unit.
+        target: Shape (3,), where the axes start, mm.
+        outward: Shape (n, 3), unit vectors.
         normal: Filled.
     """
     for i in range(len(outward)):

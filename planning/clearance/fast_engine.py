@@ -1,8 +1,8 @@
-"""The fast engine: exact distances of all needle axes at once, from surfaces packed once and placed about a target.
+"""The fast engine: exact distances of all needle axes from all surfaces at once (docs/concepts/fast-search.md).
 
-Directions are measured in bundles: neighbours on the sphere go through the tree together. The order of a surface's
-triangles in its blocks is cached (it takes half of the packing's time). `near_faces` gives the faces that a slightly
-displaced needle can touch.
+A surface is packed once into blocks of 16 triangles under a tree (`kernels.blocks`) and placed about each target. The
+directions are cut into bundles of neighbours, which go through the tree together (`kernels.surface_search`).
+`near_faces` gives the faces that a slightly displaced needle can touch.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, NO_MEMORY, Cache, Memory
 from puncture_twin.planning.base.cache.entry_file import Arrays
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.processes import on_threads
 from puncture_twin.planning.base.progress import Count
@@ -33,8 +33,8 @@ from puncture_twin.planning.clearance.kernels.segment_triangle import (
     nearest_triangle,
     spheres_around,
 )
-from puncture_twin.planning.clearance.kernels.side_by_side import Found, scratch_for
-from puncture_twin.planning.clearance.kernels.tile_search import COUNTED, search_tiles
+from puncture_twin.planning.clearance.kernels.side_by_side import SearchOutput, scratch_for
+from puncture_twin.planning.clearance.kernels.surface_search import COUNTED, search_bundles
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -45,32 +45,32 @@ MOST_THREADS = 16
 """Threads at most: more were never tried."""
 
 PIECE_TRIANGLES = 20_000
-"""A structure is searched in two pieces and one more for every so many triangles, each with its share of the
-directions, so that no thread waits long for another at the end: a small one close to the target takes as long as a
-large one. Pieces do not depend on threads: which of equally near triangles is named may."""
+"""A structure is searched in two pieces and one more for every so many triangles, each with a part of the directions,
+so that no thread waits long for another at the end: a small one close to the target takes as long as a large one. The
+pieces do not depend on the number of threads: they may decide which of equally near triangles is named."""
 
 WORTH_THREADS = 20_000
 """Answers, or triangles to pack: a few milliseconds of work. Below, starting threads takes as long."""
 
 LONGEST_MM = 1e9
-"""A needle that could reach the nodes that only fill a level up would be measured from them."""
+"""Longest axis that is measured: a longer one could reach the empty nodes that fill up a level of the tree
+(`blocks.FAR_MM`)."""
 
 
 class FastEngine:
     """Exact distances by bundles of directions over trees of discs; FCL where a verdict hangs on rounding.
 
-    Answers what `FclEngine` answers, to rounding of float64. Prepared once for a patient's surfaces, measured from any
-    target.
+    Answers what `FclEngine` answers, to rounding of float64. Surfaces are packed when it is first asked, once for all
+    targets.
 
     Args:
         meshes: The k surfaces, in the CT frame, mm.
         progress: Called with (structures done in all directions, structures).
-        cache: Where what is found of the surfaces is kept; its memory keeps them packed.
-        threads: At most so many pieces of the work are done side by side, and one a core; each is done by itself, so
-            the answer is the same to the bit.
+        cache: Of the order of each surface's triangles; its memory holds packed surfaces.
+        threads: Threads at most, one a core; the answer does not depend on them, to the bit.
 
     Attributes:
-        counts: Shape (7,), what all searches so far went through, see `tile_search.COUNTED`.
+        counts: Shape (7,), how much work all searches so far have done, see `surface_search.COUNTED`.
     """
 
     def __init__(
@@ -80,9 +80,8 @@ class FastEngine:
         cache: Cache = NO_CACHE,
         threads: int = MOST_THREADS,
     ) -> None:
-        memory = cache.memory
-        self._blocks = _packed(meshes, threads, cache) if memory is NO_MEMORY else _remembered(meshes, memory)
-        self._seen: tuple[Floats, tuple[PlacedSurface, ...]] | None = None
+        self._meshes, self._cache = tuple(meshes), cache
+        self._placed: tuple[Floats, tuple[PlacedSurface, ...]] | None = None
         self._threads = threads
         self._progress = progress
         self.counts = np.zeros(len(COUNTED), np.int64)
@@ -90,12 +89,14 @@ class FastEngine:
     @property
     def triangles(self) -> tuple[Floats, ...]:
         """Triangles of each structure, in blocks; see `ClearanceEngine`."""
-        return tuple(blocks.triangles for blocks in self._blocks)
+        return tuple(blocks.triangles for blocks in self.blocks)
 
-    @property
+    @cached_property
     def blocks(self) -> tuple[Blocks, ...]:
         """Packed blocks of each structure; see `ClearanceEngine`."""
-        return self._blocks
+        if self._cache.memory is NO_MEMORY:
+            return _packed(self._meshes, self._threads, self._cache)
+        return _remembered(self._meshes, self._cache.memory)
 
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
@@ -103,84 +104,84 @@ class FastEngine:
         """Exact distances of n axes from all k structures; see `ClearanceEngine`."""
         target = np.ascontiguousarray(target_ct, dtype=np.float64)
         outward = np.ascontiguousarray(outward_ct, dtype=np.float64).reshape(-1, 3)
-        shape = (len(self._blocks), len(outward))
+        shape = (len(self._meshes), len(outward))
         lengths = np.broadcast_to(np.asarray(length, dtype=np.float64), shape[::-1]).T
         _refuse_unsound(target, outward, lengths)
         answer = AxisDistances(np.empty(shape), np.empty(shape), np.empty(shape, np.int32))
         pieces = self._pieces(target, outward, lengths, answer)
-        counts = np.zeros((len(pieces), len(COUNTED)), np.int64)
+        counts = np.zeros((len(pieces), len(COUNTED)), np.int64)  # a row per piece: no two threads write to the same
         threads = self._threads if np.prod(shape) >= WORTH_THREADS else 1
         for done in on_threads(lambda k: measure_structure(target, *pieces[k], counts[k]), len(pieces), threads):
             if shown and self._progress is not None:
-                self._progress(done * len(self._blocks) // len(pieces), len(self._blocks))
+                self._progress(done * shape[0] // len(pieces), shape[0])
         self.counts += counts.sum(axis=0)
         return AxisDistances(answer.distance.T, answer.depth.T, answer.nearest.T)
 
     def _pieces(
         self, target: Floats, outward: Floats, lengths: Floats, answer: AxisDistances
-    ) -> list[tuple[Tiles, Blocks, PlacedSurface, Floats, AxisDistances]]:
-        """Arguments of each `measure_structure`: the largest structures first, in runs of directions.
+    ) -> list[tuple[Bundles, Blocks, PlacedSurface, Floats, AxisDistances]]:
+        """Arguments of each call of `measure_structure`: one structure and a run of bundles; largest structures first.
 
-        Here rows of ``answer`` are structures.
+        The rows of ``answer`` and ``lengths`` are structures here.
         """
-        seen, tiles, pieces = self._seen_from(target), bundle(outward), []
-        for row in sorted(range(len(self._blocks)), key=lambda row: -len(self._blocks[row].triangles)):
-            blocks = self._blocks[row]
+        placed, bundles, pieces = self._placed_about(target), bundle(outward), []
+        for row in sorted(range(len(self.blocks)), key=lambda row: -len(self.blocks[row].triangles)):
+            blocks = self.blocks[row]
             own = AxisDistances(answer.distance[row], answer.depth[row], answer.nearest[row])
-            for part in tiles.parts(2 + len(blocks.triangles) // PIECE_TRIANGLES):
-                pieces.append((part, blocks, seen[row], lengths[row], own))
+            for part in bundles.parts(2 + len(blocks.triangles) // PIECE_TRIANGLES):
+                pieces.append((part, blocks, placed[row], lengths[row], own))
         return pieces
 
-    def _seen_from(self, target: Floats) -> tuple[PlacedSurface, ...]:
-        """The surfaces as seen from a target; those of the last target are cached."""
-        if self._seen is None or not np.array_equal(self._seen[0], target):
-            self._seen = (target.copy(), tuple(placed_surface(blocks, target) for blocks in self._blocks))
-        return self._seen[1]
+    def _placed_about(self, target: Floats) -> tuple[PlacedSurface, ...]:
+        """All surfaces placed about a target; those of the last target are cached."""
+        if self._placed is None or not np.array_equal(self._placed[0], target):
+            self._placed = (target.copy(), tuple(placed_surface(blocks, target) for blocks in self.blocks))
+        return self._placed[1]
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`.
 
-        FCL is queried for the triangles near the axis alone, with the same result as for all of them: a surface touches
-        a capsule where one of its triangles does, FCL tests each triangle by itself, and one that is farther from the
-        axis than the radius by more than FCL's tolerance it calls free. `near_faces` leaves out no block whose distance
-        from the axis is, by its lower bound, within the radius and `FCL_BEYOND_MM`.
+        FCL is queried for the triangles near the axis alone, with the same result as for all of them: FCL tests each
+        triangle by itself, and calls one free that is farther from the axis than the radius and its tolerance.
+        `near_faces` leaves out no block that may be nearer than the radius and `FCL_BEYOND_MM`.
         """
         reach = radius + FCL_BEYOND_MM
         near = near_faces(self.blocks[structure], target_ct, outward_ct, length, (reach, reach))
         return len(near) > 0 and capsule_touches_any(near.triangles, target_ct, outward_ct, length, radius)
 
     def of(self, columns: Ints) -> FastEngine:
-        """The same engine for some of its structures; see `ClearanceEngine`."""
+        """This engine for some of its structures; see `ClearanceEngine`."""
         part = copy(self)
-        part._blocks = tuple(self._blocks[column] for column in columns)
-        part._seen, part._progress = None, None
+        part._meshes = tuple(self._meshes[column] for column in columns)
+        vars(part)["blocks"] = tuple(self.blocks[column] for column in columns)
+        part._placed, part._progress = None, None
         return part
 
 
 def _refuse_unsound(target: Floats, outward: Floats, lengths: Floats) -> None:
     sound = np.isfinite(target).all() and np.isfinite(outward).all()
     if not (sound and np.all((lengths >= 0.0) & (lengths <= LONGEST_MM))):
-        raise InputError("a needle axis is not finite", where="clearance", allowed="finite mm, unit directions")
+        refuse("a needle axis is not finite", "clearance", "finite mm, unit directions", "not_finite")
 
 
 def _packed(meshes: Sequence[TriangleMesh], threads: int, cache: Cache) -> tuple[Blocks, ...]:
-    """Surfaces as blocks of triangles, packed side by side, the largest first; they are the same for every target."""
-    found: dict[int, Blocks] = {}
+    """Each surface packed into blocks, on threads, the largest first; blocks do not depend on the target."""
+    packed: dict[int, Blocks] = {}
     order = sorted(range(len(meshes)), key=lambda row: -len(meshes[row].faces))
     threads = threads if sum(len(mesh.faces) for mesh in meshes) >= WORTH_THREADS else 1
     known = block_orders(meshes, cache, threads) if cache.folder is not None and len(meshes) else None
 
     def work(k: int) -> None:
         row = order[k]
-        found[row] = pack(meshes[row], None if known is None else known[row])
+        packed[row] = pack(meshes[row], None if known is None else known[row])
 
     for _ in on_threads(work, len(meshes), threads):
         pass
-    return tuple(found[row] for row in range(len(meshes)))
+    return tuple(packed[row] for row in range(len(meshes)))
 
 
 def _remembered(meshes: Sequence[TriangleMesh], memory: Memory) -> tuple[Blocks, ...]:
-    """The surfaces packed, those that an earlier case packed taken from memory."""
+    """Each surface packed into blocks, or taken from memory where an earlier case has packed it."""
     return tuple(
         memory.get((__name__, mesh.digest), partial(pack, mesh), lambda blocks: blocks.nbytes) for mesh in meshes
     )
@@ -188,62 +189,61 @@ def _remembered(meshes: Sequence[TriangleMesh], memory: Memory) -> tuple[Blocks,
 
 def measure_structure(
     target: Floats,
-    tiles: Tiles,
+    bundles: Bundles,
     blocks: Blocks,
     placed: PlacedSurface,
     lengths: Floats,
     answer: AxisDistances,
     counts: NDArray[np.int64],
 ) -> None:
-    """Fill one structure's distances from the axes of some directions.
+    """Fill the distances of some axes from one structure.
 
     Args:
         target: Shape (3,), mm: where every axis starts.
-        tiles: All or some of the n directions.
-        blocks: The structure.
-        placed: Itself as seen from the target.
+        bundles: All or some of the n directions.
+        blocks: The structure, packed.
+        placed: The same structure, placed about the target.
         lengths: Shape (n,), of the axes in the caller's order, mm.
-        answer: Arrays of shape (n,) in the caller's order; rows of ``tiles`` are filled.
-        counts: Shape (7,), added to: see `tile_search.COUNTED`.
+        answer: Arrays of shape (n,) in the caller's order; the rows that ``bundles`` holds are filled.
+        counts: Shape (7,), added to: see `surface_search.COUNTED`.
     """
-    distance, depth, nearest = answer.distance, answer.depth, answer.nearest
-    if placed.distance == 0.0:
-        distance[tiles.order], depth[tiles.order], nearest[tiles.order] = 0.0, 0.0, placed.nearest
+    distance, depth, nearest, rows = answer.distance, answer.depth, answer.nearest, bundles.order
+    if placed.distance == 0.0:  # the target lies on the surface, and every axis starts there
+        distance[rows], depth[rows], nearest[rows] = 0.0, 0.0, placed.nearest
         return
-    n = len(tiles.order)
-    found = Found(np.empty(n), np.empty(n), np.empty(n, np.int64), counts)
-    surface = (blocks.triangles, blocks.local, blocks.base)
-    bundles = (tiles.outward, tiles.starts, tiles.middle, tiles.chord)
-    search_tiles(
-        surface, placed.nodes, placed.slack, target, lengths[tiles.order], placed.distance, placed.nearest,
-        bundles, scratch_for(len(placed.nodes)), found, LANES,
+    n = len(rows)
+    output = SearchOutput(np.empty(n), np.empty(n), np.empty(n, np.int64), counts)
+    search_bundles(
+        (blocks.triangles, blocks.local, blocks.base), placed.nodes, placed.slack, target, lengths[rows],
+        placed.distance, placed.nearest, (bundles.outward, bundles.starts, bundles.middle, bundles.chord),
+        scratch_for(len(placed.nodes)), output, LANES,
     )  # fmt: skip
-    distance[tiles.order], depth[tiles.order], nearest[tiles.order] = np.sqrt(found.square), found.depth, found.triangle
+    distance[rows], depth[rows], nearest[rows] = np.sqrt(output.square), output.depth, output.triangle
 
 
-TILE = 12
-"""Directions of a bundle at most."""
+MOST_MEMBERS = 12
+"""Directions of a bundle at most: the bounds of up to 16 are found at once."""
 
 WIDEST = 0.12
-"""Chord from a bundle's axis to its members above which it is divided: about 7 degrees."""
+"""Longest chord |u - u'| from a bundle's first direction to another: about 7 degrees."""
 
 LEAST_BUNDLES = 256
 """A run of fewer bundles is not worth a piece of work of its own."""
 
 CHORD_SLACK = 1e-6
-"""More than float32 takes from a chord or a unit vector."""
+"""Added to a chord, and a fraction of it: more than the rounding of a chord or a unit vector to float32."""
 
 
 @dataclass(frozen=True, eq=False)
-class Tiles:
-    """Bundles of directions, ordered so that neighbours follow each other.
+class Bundles:
+    """Directions cut into bundles: cones of neighbouring directions, each about one of its members.
 
     Attributes:
         order: Shape (n,), row of each direction in the caller's order.
-        outward: Shape (n, 3), unit vectors in the new order.
-        starts: Shape (t + 1,), where each bundle starts.
-        middle: Shape (t,), row in ``outward`` of the member amid each bundle: its axis.
-        chord: Shape (t,), largest |u - axis| of its members, rounded up.
+        outward: Shape (n, 3), unit vectors in the order of the bundles.
+        starts: Shape (b + 1,), row in ``outward`` of each bundle's first member.
+        middle: Shape (b,), row in ``outward`` of the member that is each bundle's axis.
+        chord: Shape (b,), largest |u - axis| of its members, rounded up.
     """
 
     order: NDArray[np.int64]
@@ -252,37 +252,40 @@ class Tiles:
     middle: NDArray[np.int64]
     chord: Floats
 
-    def parts(self, most: int) -> list[Tiles]:
-        """The bundles in at most so many runs of about as many each, none below ``LEAST_BUNDLES``."""
+    def parts(self, most: int) -> list[Bundles]:
+        """The bundles divided into at most ``most`` runs of equal length, none shorter than ``LEAST_BUNDLES``."""
         count = max(1, min(most, len(self.middle) // LEAST_BUNDLES))
         edges = np.linspace(0, len(self.middle), count + 1).astype(int)
         return [self._run(low, high) for low, high in itertools.pairwise(edges)]
 
-    def _run(self, low: int, high: int) -> Tiles:
+    def _run(self, low: int, high: int) -> Bundles:
         """Bundles ``low`` to ``high``."""
         first = self.starts[low]
         members = slice(first, self.starts[high])
         starts, middle = self.starts[low : high + 1] - first, self.middle[low:high] - first
-        return Tiles(self.order[members], self.outward[members], starts, middle, self.chord[low:high])
+        return Bundles(self.order[members], self.outward[members], starts, middle, self.chord[low:high])
 
 
-def bundle(outward: Floats) -> Tiles:
+def bundle(outward: Floats) -> Bundles:
     """Bundle directions, in any order and number, shape (n, 3), unit vectors."""
-    order = kd_order(outward, TILE)
+    order = kd_order(outward, MOST_MEMBERS)
     sorted_outward = np.ascontiguousarray(outward[order], dtype=np.float64)
-    starts = _cut(sorted_outward, np.empty(len(outward) + 1, np.int64))
+    starts = _cut_into_bundles(sorted_outward, np.empty(len(outward) + 1, np.int64))
     middle, chord = np.empty(len(starts) - 1, np.int64), np.empty(len(starts) - 1)
-    _axes(sorted_outward, starts, middle, chord)
-    return Tiles(order, sorted_outward, starts, middle, chord)
+    _bundle_axes(sorted_outward, starts, middle, chord)
+    return Bundles(order, sorted_outward, starts, middle, chord)
 
 
 @nb.njit(cache=True)
-def _cut(outward, starts):  # type: ignore[no-untyped-def]  # numba infers
-    """Runs of TILE directions, ended early where the next one is too far from the run's first."""
+def _cut_into_bundles(outward, starts):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill the bundles' starts: runs of MOST_MEMBERS directions, ended early where the next is too far from the first.
+
+    ``outward`` is in k-d order, so neighbours on the sphere follow each other.
+    """
     count, first = 0, 0
     starts[0] = 0
     for i in range(1, len(outward)):
-        if i % TILE == 0 or _square_between(outward, i, first) > WIDEST * WIDEST:
+        if i % MOST_MEMBERS == 0 or _square_between(outward, i, first) > WIDEST * WIDEST:
             count += 1
             first = i
             starts[count] = i
@@ -292,21 +295,21 @@ def _cut(outward, starts):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @nb.njit(cache=True)
-def _axes(outward, starts, middle, chord):  # type: ignore[no-untyped-def]  # numba infers
-    """The member nearest to the mean of each bundle, and the widest chord from it."""
-    for tile in range(len(middle)):
+def _bundle_axes(outward, starts, middle, chord):  # type: ignore[no-untyped-def]  # numba infers
+    """Fill the member nearest to the mean of each bundle, and the widest chord from it."""
+    for bundle in range(len(middle)):
         x, y, z = 0.0, 0.0, 0.0
-        for i in range(starts[tile], starts[tile + 1]):
+        for i in range(starts[bundle], starts[bundle + 1]):
             x, y, z = x + outward[i, 0], y + outward[i, 1], z + outward[i, 2]
-        middle[tile], most = starts[tile], -np.inf
-        for i in range(starts[tile], starts[tile + 1]):
+        middle[bundle], most = starts[bundle], -np.inf
+        for i in range(starts[bundle], starts[bundle + 1]):
             along = outward[i, 0] * x + outward[i, 1] * y + outward[i, 2] * z
             if along > most:
-                middle[tile], most = i, along
+                middle[bundle], most = i, along
         widest = 0.0
-        for i in range(starts[tile], starts[tile + 1]):
-            widest = max(widest, _square_between(outward, i, middle[tile]))
-        chord[tile] = np.sqrt(widest) * (1 + CHORD_SLACK) + CHORD_SLACK
+        for i in range(starts[bundle], starts[bundle + 1]):
+            widest = max(widest, _square_between(outward, i, middle[bundle]))
+        chord[bundle] = np.sqrt(widest) * (1 + CHORD_SLACK) + CHORD_SLACK
 
 
 @nb.njit(cache=True)
@@ -320,21 +323,22 @@ Order = NDArray[np.int32]
 
 
 def block_orders(meshes: Sequence[TriangleMesh], cache: Cache, threads: int) -> tuple[Order, ...]:
-    """`block_order` of each surface, from the cache where all of them are there.
+    """`block_order` of each surface, from the cache where it holds them.
 
-    The blocks themselves are not kept: they are thirty times as large, and filled sooner than read.
+    An order takes half of the time of packing. The blocks themselves are not cached: they are thirty times as large,
+    and take less time to fill than to read.
 
     Args:
         meshes: The surfaces.
-        cache: Where the orders are kept, one entry for all.
-        threads: How many are found side by side.
+        cache: Holds the orders of all surfaces in one entry.
+        threads: How many are computed at once.
     """
     made_from = {"what": "block orders", "meshes": [mesh.digest for mesh in meshes]}
-    make = partial(_found, meshes, threads)
-    return cache.value(made_from, make, partial(_of_each, [len(mesh.faces) for mesh in meshes]), by=__name__)
+    make = partial(_computed_orders, meshes, threads)
+    return cache.value(made_from, make, partial(_orders_of, [len(mesh.faces) for mesh in meshes]), by=__name__)
 
 
-def _found(meshes: Sequence[TriangleMesh], threads: int) -> Arrays:
+def _computed_orders(meshes: Sequence[TriangleMesh], threads: int) -> Arrays:
     orders: dict[int, Order] = {}
 
     def work(k: int) -> None:
@@ -345,22 +349,22 @@ def _found(meshes: Sequence[TriangleMesh], threads: int) -> Arrays:
     return {"orders": np.concatenate([np.empty(0, np.int32), *(orders[k] for k in range(len(meshes)))])}
 
 
-def _of_each(counts: Sequence[int], stored: Arrays) -> tuple[Order, ...]:
-    """The block order of each surface.
+def _orders_of(counts: Sequence[int], stored: Arrays) -> tuple[Order, ...]:
+    """The block order of each surface, from a cached entry.
 
     Raises:
-        KeyError, TypeError, ValueError: One leaves out a triangle, which the search would never see then.
+        KeyError, TypeError, ValueError: An order leaves out a triangle: the search would never see it.
     """
     orders = stored["orders"]
     if orders.dtype != np.int32 or orders.shape != (sum(counts),):
         raise TypeError("orders of other surfaces")
     each = np.split(orders, np.cumsum(counts)[:-1])
     for order, count in zip(each, counts, strict=True):
-        found = np.zeros(count, np.bool_)
+        listed = np.zeros(count, np.bool_)
         if count and (order.min() < 0 or order.max() >= count):
             raise ValueError("no triangle of the surface")
-        found[order] = True
-        if not found.all():
+        listed[order] = True
+        if not listed.all():
             raise ValueError("a triangle is left out")
     return tuple(each)
 
@@ -371,7 +375,14 @@ COORDINATE_SLACK = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class PlacedSurface:
-    """One surface as seen from one target: the nodes of `bounds.disc_bounds`, and the target's own distance."""
+    """One surface in coordinates about one target.
+
+    Attributes:
+        nodes: Shape (groups, 10, 16), of the tree, as `bounds.disc_bounds` reads them.
+        slack: Rounding of a node's coordinate, mm.
+        distance: Of the target from the surface, mm: no axis is farther, for it starts there.
+        nearest: Row of the triangle nearest to the target.
+    """
 
     nodes: NDArray[np.float32]
     slack: float
@@ -380,15 +391,15 @@ class PlacedSurface:
 
 
 def placed_surface(blocks: Blocks, target: Floats) -> PlacedSurface:
-    """A surface as seen from a target."""
+    """Place a packed surface about a target (3,), mm."""
     nodes = np.empty((10, len(blocks.center)), np.float32)
     nodes[:3] = (blocks.center - target).T
-    nodes[3:8] = blocks.disc
-    nodes[8] = np.hypot(nodes[6], nodes[7]) * np.float32(1 + 1e-6)
+    nodes[3:8] = blocks.disc  # normal, rho, h
+    nodes[8] = np.hypot(nodes[6], nodes[7]) * np.float32(1 + 1e-6)  # R, of the sphere about the disc, rounded up
     away = np.sqrt(nodes[0] ** 2 + nodes[1] ** 2 + nodes[2] ** 2)
-    nodes[9] = (away + nodes[8]) * np.float32(1 + 1e-6)
+    nodes[9] = (away + nodes[8]) * np.float32(1 + 1e-6)  # |c| + R: no point of the disc is farther from the target
     slack = COORDINATE_SLACK * float(nodes[9][: len(blocks.local)].max())
-    grouped = np.ascontiguousarray(nodes.reshape(10, -1, LANES).transpose(1, 0, 2))
+    grouped = np.ascontiguousarray(nodes.reshape(10, -1, LANES).transpose(1, 0, 2))  # one group is contiguous
     distance, nearest = nearest_triangle(blocks.triangles, grouped, blocks.base, target, slack)
     return PlacedSurface(grouped, slack, distance, nearest)
 
@@ -412,23 +423,23 @@ class NearFaces:
 
     def distance(self, origins_ct: Floats, outward_ct: Floats, length: float) -> Floats:
         """Distances (n,), mm, of axes from ``origins_ct`` (n, 3) along ``outward_ct`` (n, 3) to these faces."""
-        found = np.empty(len(origins_ct))
+        distance = np.empty(len(origins_ct))
         origins, outward = (np.ascontiguousarray(rows, dtype=np.float64) for rows in (origins_ct, outward_ct))
-        displaced_distances(self.triangles, self.faces, self.blocks, origins, outward, float(length), found)
-        return found
+        displaced_distances(self.triangles, self.faces, self.blocks, origins, outward, float(length), distance)
+        return distance
 
 
 def near_faces(
     blocks: Blocks, origin_ct: Floats, outward_ct: Floats, length: float, reach: tuple[float, float]
 ) -> NearFaces:
-    """All faces within reach of an axis, and some beyond.
+    """Select all faces within reach of an axis, and the others of their blocks.
 
     Args:
         blocks: The packed surface.
-        origin_ct: Shape (3,), where the axis starts.
+        origin_ct: Shape (3,), where the axis starts, mm.
         outward_ct: Shape (3,), unit.
         length: Of the axis, mm.
-        reach: At its start and at its end, mm; linear in between.
+        reach: How far the axis may be displaced, at its start and at its end, mm; linear in between.
     """
     rows, bounds = blocks_near(blocks.center, blocks.disc, len(blocks.local), origin_ct, outward_ct, length, reach)
     order = rows[np.argsort(bounds, kind="stable")]

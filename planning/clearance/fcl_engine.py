@@ -97,7 +97,7 @@ class FclEngine:
         return _capsule_touches(self._objects[structure], target_ct, outward_ct, length, radius)
 
     def of(self, columns: Ints) -> FclEngine:
-        """The same engine for some of its structures; see `ClearanceEngine`."""
+        """This engine for some of its structures; see `ClearanceEngine`."""
         part = copy(self)
         part._meshes = tuple(self._meshes[column] for column in columns)
         part._objects = tuple(self._objects[column] for column in columns)

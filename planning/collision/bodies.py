@@ -186,7 +186,7 @@ def padded_links(links: Sequence[Link], padding_mm: float) -> tuple[Link, ...]:
 
 
 class Solid:
-    """A shape that moves. Spheres and planes answer most questions about it, and FCL takes longer to build it.
+    """A moving shape; its bounding spheres and planes answer most questions before FCL builds it.
 
     Args:
         make: Makes its geometry, mm.

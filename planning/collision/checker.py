@@ -23,7 +23,7 @@ from puncture_twin.planning.arm.links import Link, collision_links, model_urdf
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.collision.bodies import (
     NEVER_TESTED,
     NEVER_TOUCHING,
@@ -82,7 +82,7 @@ class CellChecker:
         padding_mm: float = 0.0,
     ) -> None:
         if not (np.isfinite(padding_mm) and padding_mm >= 0.0):
-            raise InputError(f"padding_mm = {padding_mm}", where="cell", allowed="0 or more")
+            refuse(f"padding_mm = {padding_mm}", "cell", "0 or more", "out_of_range")
         self.model = model
         self.tool = tool
         self._bodies = arm_bodies(model, tool, padding_mm)
@@ -183,7 +183,7 @@ class CellChecker:
         names = DISTANCE_PAIRS.get(pair, ())
         if not names or (body is not None and body not in names):
             where, allowed = f"distance {pair!r} of {body!r}", ", ".join(names or DISTANCE_PAIRS)
-            raise InputError("no such distance", where=where, allowed=allowed)
+            refuse("no such distance", where, allowed, "unknown_choice")
         self._place(q)
         bodies = [b for b in self._bodies if (b.name in names if body is None else b.name == body)]
         skin = {} if self._surface is None else {PATIENT: self._whole}
@@ -273,7 +273,7 @@ def _nearest(bodies: Sequence[Body], others: Mapping[str, Solid], bounds: Mappin
 def _boxes(boxes: Sequence[Box], taken: Set[str]) -> dict[str, Solid]:
     names = [box.name for box in boxes]
     if len(set(names)) < len(names) or set(names) & taken:
-        raise InputError(f"box names {names}", where="cell", allowed="each once, and none a body's or the patient's")
+        refuse(f"box names {names}", "cell", "each once, and none a body's or the patient's", "duplicate_name")
     return {
         box.name: Solid(partial(fcl.Box, *box.size_mm), fcl.Transform(box.T_base_box[:3, :3], box.T_base_box[:3, 3]))
         for box in boxes
@@ -326,7 +326,7 @@ def _joined(model: UrModel, links: Sequence[Link], solids: Solids, joint: int) -
             at = f"at {np.degrees(angle):g} degrees of their joint"
             what = f"the shapes of {links[joint].name} and {links[joint + 1].name} do not meet {at}"
             allowed = "links that hang together: see the unit, scale and origin of their meshes"
-            raise InputError(what, where=model_urdf(model).where, allowed=allowed)
+            refuse(what, model_urdf(model).where, allowed, "links_apart")
         always &= gaps <= APART_MM
     return always
 
@@ -352,7 +352,7 @@ def _check_hanging(model: UrModel, links: Sequence[Link], solids: Solids, joined
                 size = " x ".join(f"{edge:.4g}" for edge in high - low)
                 what = f"a shape of {body.name}, {size} mm, hangs on nothing"
                 allowed = f"shapes of one body that touch, to {APART_MM:g} mm: see unit, scale and origin; or one mesh"
-                raise InputError(what, where=model_urdf(model).where, allowed=allowed)
+                refuse(what, model_urdf(model).where, allowed, "shape_detached")
 
 
 def _place(solids: Sequence[fcl.CollisionObject], T: Floats) -> None:

@@ -52,11 +52,11 @@ class FastChecker(CellChecker):
 
     Args:
         model: See :class:`CellChecker`.
-        tool: Needle and holder, likewise.
-        boxes: Obstacles, likewise.
-        patient: The body's surface, likewise.
-        outside: A table, likewise.
-        padding_mm: Of contacts with patient and boxes, likewise.
+        tool: Needle and holder.
+        boxes: Obstacles, base frame.
+        patient: The body's surface, base frame.
+        outside: Surfaces outside of the body, such as a table, base frame.
+        padding_mm: Distance at which patient or boxes count as touched.
         cache: Where the enclosures of the arm's bodies are kept.
 
     Raises:
@@ -146,14 +146,6 @@ class FastChecker(CellChecker):
         contact = self._tested[check].contact
         return contact._replace(other=OUTSIDE_BODY) if answer == TOUCHES_OUTSIDE else contact
 
-    def segment_contact(self, start: Floats, end: Floats) -> Contact | None:
-        """A contact on the straight joint segment between states (6,), rad; None if free. See :class:`SegmentChecker`.
-
-        Raises:
-            InputError: If a state is not finite.
-        """
-        return self.segment_checker()(start, end)
-
     def segment_checker(self, clear_mm: float = 0.0) -> SegmentChecker:
         """A check of many segments, which remembers what touched last; with a clearance where their ends have it."""
         return SegmentChecker(self.model, self._tested, self._proofs, self._segment_scratch, clear_mm)
@@ -223,7 +215,7 @@ class SegmentChecker:
     Args:
         model: The arm.
         checks: The questions that may find a contact.
-        proofs: The same, packed.
+        proofs: These checks, packed.
         scratch: For them; several may share it, one after the other.
         clear_mm: What the padded arm is to keep from patient and boxes besides; of each body and obstacle that are
             nearer to one another at an end of the segment, most of their distance there. What is not proven to be kept

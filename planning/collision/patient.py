@@ -18,7 +18,7 @@ from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.collision.bodies import (
     FLANGE_FRAME,
     Body,
@@ -60,8 +60,7 @@ class FclSkin:
         count = len(mesh.vertices)
         usable = len(mesh.faces) > 0 and bool(np.isfinite(mesh.vertices).all())
         if not usable or mesh.faces.min() < 0 or mesh.faces.max() >= count:
-            what = "mesh is empty, not finite or has an index out of range"
-            raise InputError(what, where=name, allowed="a checked mesh")
+            refuse("mesh is empty, not finite or has an index out of range", name, "a checked mesh", "bad_mesh")
         self._mesh = mesh
 
     def touches(self, solid: Solid, box: Floats) -> bool:
@@ -184,10 +183,6 @@ class Check(NamedTuple):
         return None if part is None else self.contact._replace(other=part)
 
 
-class BaseInPatientError(InputError):
-    """The robot's base is where the patient is, or their table."""
-
-
 def refuse_base_in(
     model: UrModel, base: Body, placed: FclPatient, patient: TriangleMesh, surface: TriangleMesh
 ) -> None:
@@ -201,17 +196,16 @@ def refuse_base_in(
         surface: The skin, and behind it what the CT shows besides, likewise; the same where that is nothing.
 
     Raises:
-        BaseInPatientError: It does.
+        InputError: It does; its code begins with ``base_in``.
     """
     centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
     hit = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
     if hit or _encloses(patient, centre):
-        what = "the robot's base stands in the patient"
-        raise BaseInPatientError(what, where="workcell", allowed="a base outside the skin")
+        refuse("the robot's base stands in the patient", "workcell", "a base outside the skin", "base_in_patient")
     if surface is not patient and _encloses(surface, centre):
         what = "the robot's base stands in what is not known to be free: the table that a CT shows, or beyond its end"
         allowed = 'a base outside of it; where no body lies there, [ct] arms = "none" or beyond_mm'
-        raise BaseInPatientError(what, where="workcell", allowed=allowed, code="base_in_unseen")
+        refuse(what, "workcell", allowed, "base_in_unseen")
 
 
 def _encloses(mesh: TriangleMesh, point: Floats) -> bool:
@@ -255,4 +249,4 @@ def check_hanging(tool: ToolBody, bodies: Sequence[Body]) -> None:
         low, high = tool.mesh.bounds
         span = " by ".join(f"{a:.4g}..{b:.4g}" for a, b in zip(low, high, strict=True))
         what = f"the tool ({span} mm in the flange's frame) does not hang on wrist, holder or needle"
-        raise InputError(what, where=tool.key, allowed="a body that touches them: see unit, position_mm, rotation_deg")
+        refuse(what, tool.key, "a body that touches them: see unit, position_mm, rotation_deg", "tool_detached")

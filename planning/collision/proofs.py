@@ -18,7 +18,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.collision.bodies import finer_prism
 from puncture_twin.planning.collision.kernels import proofs as proof_kernels, settled as settled_kernels
-from puncture_twin.planning.collision.kernels.proofs import ProofScene, scratch
+from puncture_twin.planning.collision.kernels.proofs import ProofScene, proof_scratch
 from puncture_twin.planning.collision.kernels.surfaces import STACK
 from puncture_twin.planning.collision.packed import (
     ROUND,
@@ -104,10 +104,10 @@ class Proofs:
         packed = hulls.packed(cache)
         skin = packed_skin(patient, skin_triangles, cache)
         self.scene = ProofScene(np.array(rows, dtype=np.int64), skin, spheres, *packed)
-        self._beside = settled_kernels.triangle_scratch(self.scene.hulls, STACK)
+        self._on_triangle = settled_kernels.triangle_scratch(self.scene.hulls, STACK)
         self._levers = np.array([joint_levers(model, check) for check in checks])
         self.movers = packed_movers(checks)
-        self._work = scratch(len(rows), len(self.scene.hulls.radii))
+        self._work = proof_scratch(len(rows), len(self.scene.hulls.radii))
         self.joint_spans = np.array([(row[0] == proof_kernels.PAIR, row[3], row[4]) for row in rows], dtype=np.int64)
 
     def __len__(self) -> int:
@@ -119,12 +119,12 @@ class Proofs:
         self.scene = self.scene._replace(checks=self.scene.checks[kept])
         self.movers = self.movers._replace(of_check=self.movers.of_check[kept])
         self._levers, self.joint_spans = self._levers[kept], self.joint_spans[kept]
-        self._work = scratch(int(kept.sum()), len(self.scene.hulls.radii))
+        self._work = proof_scratch(int(kept.sum()), len(self.scene.hulls.radii))
 
     def unproven(
         self, motion: Motion, tested: Bools, clear_mm: float = proof_kernels.MIN_GAP_MM
     ) -> Iterator[tuple[int, int]]:
-        """The states of a path, in order, each with a check that is not proven clear there, likewise in order.
+        """The states of a path, in order, each with the checks, in order, that are not proven clear there.
 
         Args:
             motion: The states, in order.
@@ -146,23 +146,25 @@ class Proofs:
             of_state: Shape (m,): which of the choices.
         """
         found = NotClear(np.empty(len(frames), np.int64), np.empty(len(frames), np.int64))
-        settled_kernels.first_not_clear(self.scene, frames, self._work, self._beside, tested, of_state, begins, *found)
+        settled_kernels.first_not_clear(
+            self.scene, frames, self._work, self._on_triangle, tested, of_state, begins, *found
+        )
         return found
 
     def settled_at(self, check: int, frames: Floats) -> int:
         """Result of a check at frames (7, 4, 4), see :mod:`puncture_twin.planning.collision.kernels.settled`."""
-        return int(settled_kernels.settled_at(self.scene, self._work, self._beside, check, frames))
+        return int(settled_kernels.settled_at(self.scene, self._work, self._on_triangle, check, frames))
 
-    def clear_about(self, frames: Floats, turns: Floats, tested: Bools) -> Around:
+    def clear_about(self, frames: Floats, rotations: Floats, tested: Bools) -> Around:
         """Prove checks clear all about some states.
 
         Args:
             frames: Shape (m, 7, 4, 4), mm: the states.
-            turns: Shape (6,), rad: how far each joint may turn either way from each of them.
+            rotations: Shape (6,), rad: how far each joint may rotate either way from each of them.
             tested: Shape (m, k): what is to be proven.
         """
         unproven, gaps = tested.copy(), np.full(tested.shape, np.inf)
-        proof_kernels.clear_about(self.scene, self.movers, frames, turns, self._work, gaps, unproven)
+        proof_kernels.clear_about(self.scene, self.movers, frames, rotations, self._work, gaps, unproven)
         return Around(gaps <= 0.0, unproven)
 
 
@@ -184,7 +186,7 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
     Args:
         model: The arm.
         checks: Of a cell.
-        proofs: The same checks, packed.
+        proofs: These checks, packed.
         cache: Where the answer is kept: it depends on arm and tool alone.
     """
     between = proofs.joint_spans[:, 0] > 0
@@ -228,10 +230,10 @@ def _clear_all_over(model: UrModel, proofs: Proofs, touches: Touches, joint: int
     middles, half = np.zeros((1, 2)), np.pi
     unproven, touching = tested[None], np.zeros_like(tested)
     for _ in range(HALVINGS):
-        q, turns = np.zeros((len(middles), 6)), np.zeros(6)
-        q[:, joint : joint + 2], turns[joint : joint + 2] = middles, half  # other joints do not matter to the pair
+        q, rotations = np.zeros((len(middles), 6)), np.zeros(6)
+        q[:, joint : joint + 2], rotations[joint : joint + 2] = middles, half  # other joints do not matter to the pair
         frames = link_poses(model, q)
-        left = proofs.clear_about(frames, turns, unproven)
+        left = proofs.clear_about(frames, rotations, unproven)
         for square, check in np.argwhere(left.touching).tolist():
             touching[check] = touching[check] or touches(check, frames[square])  # FCL decides at the middle
         still = left.unproven & ~touching

@@ -20,7 +20,7 @@ from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.collision.bodies import BODY_NAMES
 
@@ -123,7 +123,7 @@ def require_finite(q: Floats) -> None:
         InputError: If one is not.
     """
     if not np.isfinite(q).all():
-        raise InputError(f"joint angles {q} are not finite", where="collision check", allowed="six angles in rad")
+        refuse(f"joint angles {q} are not finite", "collision check", "six angles in rad", "not_finite")
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,10 @@ from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.arm.tool import Box, Tool, gantry_boxes
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory, user_cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Gantry, Obstacle
 from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.patient import BaseInPatientError
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
 
@@ -70,9 +69,10 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
             return FastChecker(
                 model, tool, boxes, placed, outside=placed_outside, padding_mm=ARM_PADDING_MM, cache=user_cache()
             )
-        except BaseInPatientError as error:
-            where = f"{case.path}: {_placing_key(case)}"
-            raise BaseInPatientError(error.what, where=where, allowed=error.allowed, code=error.code) from error
+        except InputError as error:
+            if not error.code.startswith("base_in"):
+                raise
+            raise error.at(f"{case.path}: {_placing_key(case)}") from error
 
     if memory is NO_MEMORY:
         return make()
@@ -99,7 +99,7 @@ def home_configuration(case: Case) -> Floats:
     home = np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0]) if case.robot.home is None else case.robot.home
     if not case.robot.model.within_limits(home):
         what = f"robot.home_deg: home ({', '.join(f'{angle:g}' for angle in np.degrees(home))}) is beyond the limits"
-        raise InputError(what, where=case.path, allowed="home_deg within the arm's limits")
+        refuse(what, case.path, "home_deg within the arm's limits", "home_beyond_limits")
     return home
 
 
@@ -143,10 +143,6 @@ def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
 
     The checkers' boxes leave a bore up to 0.9 % narrower: a patient who fits the round one is not refused for that.
 
-    Args:
-        gantry: The wall.
-        skin: CT frame.
-
     Returns:
         mm, along the bore's radius.
     """
@@ -179,17 +175,13 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
     The skin alone is tested against it. What the CT shows outside of the skin is not: a bed goes through the bore, and
     beyond the image its surface goes on by assumption.
 
-    Args:
-        case: The case.
-        skin: CT frame.
-
     Raises:
         InputError: Its wall cuts the patient.
     """
     deep = 0.0 if case.gantry is None else gantry_in_patient_mm(case.gantry, skin)
     if deep > 0.0:
         what = f"the gantry's wall stands {np.ceil(10 * deep) / 10:g} mm in the patient"
-        raise InputError(what, where=f"{case.path}: gantry", allowed="a bore about the body: see center_mm, tilt_deg")
+        refuse(what, f"{case.path}: gantry", "a bore about the body: see center_mm, tilt_deg", "gantry_in_patient")
 
 
 def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) -> Anatomy:
@@ -204,7 +196,7 @@ def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) ->
     for solid in solids:
         if solid.name in taken:
             what = f"obstacle '{solid.name}' has the name of a structure"
-            raise InputError(what, where=case.path, allowed="a name of its own")
+            refuse(what, case.path, "a name of its own", "duplicate_name")
     nowhere = [obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"] if T_base_ct is None else []
     warnings = (*anatomy.warnings, *([NOWHERE.format(names=", ".join(nowhere))] if nowhere else []))
     return replace(anatomy, surroundings=anatomy.surroundings + solids, warnings=warnings)

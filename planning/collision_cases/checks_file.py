@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, StringConstraints, ValidationError, model_validator
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, SchemaError, refuse
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import parse_toml, read_toml_bytes
 from puncture_twin.planning.case.toml_types import (
@@ -112,7 +112,7 @@ class ChecksFile(Section):
     @model_validator(mode="after")
     def _refuse_nothing(self) -> ChecksFile:
         if not (self.check or self.window or self.plan):
-            raise ValueError(f"nothing is expected; there are no {ALLOWED}")
+            raise SchemaError(f"nothing is expected; there are no {ALLOWED}", "missing_key")
         return self
 
     def tables(self) -> dict[str, tuple[Expectation, ...]]:
@@ -144,12 +144,12 @@ def _parse(data: bytes, path: Path) -> ChecksFile:
         if not isinstance(error.__cause__, ValidationError):
             raise
         place = error.__cause__.errors(include_url=False)[0]["loc"]
-        raise InputError(error.what, where=_where(data, path, place), allowed=error.allowed) from error
+        raise error.at(_where(data, path, place)) from error
     for kind, tables in content.tables().items():
         for at, table in enumerate(tables):
             if (table.case or content.case) is None:
-                where = _where(data, path, (kind, at))
-                raise InputError("no case", where=where, allowed="case = FILE, for the file or for the table")
+                allowed = "case = FILE, for the file or for the table"
+                refuse("no case", _where(data, path, (kind, at)), allowed, "missing_case")
     return content
 
 

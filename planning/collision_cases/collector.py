@@ -104,7 +104,7 @@ def _touch(check: CheckSection, found: Explanation) -> Iterator[Difference]:
 
 
 def _number(new: NewNumber) -> NewNumber | None:
-    """None where there is no number to expect."""
+    """A new expected number; None where its value is not finite."""
     return new if np.isfinite(new.value) else None
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.errors import InputError, one_line, refuse
 from puncture_twin.planning.base.files import atomic
 
 if TYPE_CHECKING:
@@ -164,7 +164,7 @@ def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
     """
     path = path.resolve()
     if path.read_bytes() != data:
-        raise InputError("changed while the tests ran", where=path, allowed="the same file; run again")
+        refuse("changed while the tests ran", path, "the same file; run again", "input_changed")
     text, lines = _rewritten(data.decode("utf-8"), path, changes)
     with atomic(path) as draft:
         draft.write_bytes(text.encode("utf-8"))
@@ -186,7 +186,7 @@ def _rewritten(text: str, path: Path, changes: Sequence[Change]) -> tuple[str, l
         lines.append(f"{path.name}: {change.test}: {'.'.join(change.number.keys)} {old} -> {new}{weaker}")
     written = tomlkit.dumps(document)
     if tomllib.loads(written) != expected:
-        raise InputError("cannot be rewritten without changing more", where=path, allowed="the numbers by hand")
+        refuse("cannot be rewritten without changing more", path, "the numbers by hand", "not_rewritable")
     return written, lines
 
 

@@ -29,7 +29,7 @@ from puncture_twin.planning.evidence.target import (
     target_in_vessel,
     target_place,
 )
-from puncture_twin.planning.registration.checks.checked_placement import placement_findings
+from puncture_twin.planning.registration.checks.checked_placement import placement_findings, weak_points
 from puncture_twin.planning.registration.checks.markers import Surroundings
 from puncture_twin.planning.registration.placement import Placement
 
@@ -111,10 +111,10 @@ def markers(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Ca
     """
     if placement is None:
         return
-    weak = () if placement.registration is None else placement.registration.flags
+    if placement.registration is not None:
+        yield from weak_points(placement.registration)
     found = placement_findings(case, Surroundings(anatomy.skin, anatomy.couch), placement, cache)
-    for sentence in (*(f"registration: {flag}" for flag in weak), *found.warnings):
-        yield Finding("registration", Severity.WARNING, sentence)
+    yield from (one for one in found if one.severity is Severity.WARNING)
 
 
 def thick_slices(case: Case, anatomy: Anatomy) -> Iterator[Finding]:

@@ -210,7 +210,7 @@ class Sample:
 
 def sample_surfaces(meshes: Sequence[TriangleMesh], count: int = POINTS) -> Sample:
     """Points spread evenly over surfaces, at least `LEAST_POINTS` on each, the same in every run."""
-    areas = np.array([mesh.area for mesh in meshes])
+    areas = np.array([mesh.areas.sum() for mesh in meshes])
     least = min(LEAST_POINTS, count // len(meshes))
     counts = np.maximum(np.round(count * areas / areas.sum()), least).astype(int)
     points, normals = [], []

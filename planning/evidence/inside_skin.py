@@ -113,8 +113,9 @@ def near_surface(points: Floats, mesh: TriangleMesh, distance_mm: Floats) -> Boo
     near = np.zeros(len(points), bool)
     if len(points) == 0:
         return near
-    centres = mesh.triangles.mean(axis=1)
-    reach = np.linalg.norm(mesh.triangles - centres[:, None], axis=2).max(axis=1)
+    corners = mesh.triangles
+    centres = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3.0
+    reach = np.sqrt(np.max([((corners[:, k] - centres) ** 2) @ np.ones(3) for k in range(3)], axis=0))
     size = np.ceil(np.log2(np.maximum(reach, distance_mm.min())))
     around_mm = (reach + distance_mm.max())[:, None]
     seen = np.all((centres >= points.min(axis=0) - around_mm) & (centres <= points.max(axis=0) + around_mm), axis=1)
@@ -123,7 +124,7 @@ def near_surface(points: Floats, mesh: TriangleMesh, distance_mm: Floats) -> Boo
         found = scipy.spatial.cKDTree(centres[rows]).query_ball_point(points[left], distance_mm[left] + 2.0**one)
         point = np.repeat(left, [len(some) for some in found])
         triangle = rows[[row for some in found for row in some]]
-        squares = squared_distance(points[point], mesh.triangles[triangle])
+        squares = squared_distance(points[point], corners[triangle])
         near[point[squares <= distance_mm[point] ** 2]] = True
     return near
 

@@ -1,4 +1,7 @@
-"""Export: written, read back, compared with the plan and the arm's limits, and only then published."""
+"""Export: written, read back, compared with the plan and the arm's limits, and only then published.
+
+Other packages add formats by the entry point group `GROUP`; what they write is held to the same.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import io
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -15,7 +19,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.collision.state_checker import StateChecker
@@ -134,16 +138,17 @@ def read_csv(text: str, *, where: Path) -> SampledMotion:
     """
     rows = list(csv.reader(io.StringIO("\n".join(line for line in text.splitlines() if not line.startswith("#")))))
     if not rows or tuple(rows[0]) != COLUMNS:
-        raise InputError("the table's header is another", where=where, allowed=",".join(COLUMNS))
+        refuse("the table's header is another", where, ",".join(COLUMNS), "wrong_columns")
     phases: dict[str, list[list[float]]] = {phase: [] for phase in SampledMotion._fields}
     for number, row in enumerate(rows[1:], start=2):
         try:
             phases[row[0]].append([float(cell) for cell in row[1:]])
         except (KeyError, IndexError, ValueError) as error:
             allowed = f"{' or '.join(phases)} and seven numbers"
-            raise InputError(f"row {number} of the table: {error}", where=where, allowed=allowed) from error
+            what = f"row {number} of the table: {error}"
+            raise InputError(what, where=where, allowed=allowed, code="not_a_number") from error
         if len(row) != len(COLUMNS):
-            raise InputError(f"row {number} has {len(row)} cells", where=where, allowed=f"{len(COLUMNS)} cells")
+            refuse(f"row {number} has {len(row)} cells", where, f"{len(COLUMNS)} cells", "ragged_row")
     tables = [np.array(table).reshape(-1, 7) for table in phases.values()]
     return SampledMotion(*(Trajectory(table[:, 0], table[:, 1:]) for table in tables))
 
@@ -154,7 +159,7 @@ class Exported:
 
     Attributes:
         path: Where it lies.
-        format_name: One of ``FORMATS``.
+        format_name: One of `format_names`.
         notes: What whoever runs it should know, one sentence each.
         inputs: Every file that decided it.
         plan: What it holds.
@@ -181,7 +186,7 @@ def export_plan(
 
     Args:
         plan: A plan that has been read (and so checked), or made.
-        format_name: ``urscript``, ``ros2`` or ``csv``.
+        format_name: One of `format_names`.
         folder: Where the file goes, under the plan file's name.
         source: The plan's file, for its name and for errors.
         checker: Of the plan's own case, against which the plan has been checked (``plan_check``); without it nothing is
@@ -194,8 +199,8 @@ def export_plan(
     path = folder / export_name(source, format_name)
     check_geometry(plan, source)
     if len(plan.insertion.q) < 2:
-        raise InputError("the insertion is a single state", where=source, allowed="a motion")
-    checked = FORMATS[format_name][1](plan, source, checker)
+        refuse("the insertion is a single state", source, "a motion", "no_motion")
+    checked = format_of(format_name)[1](plan, source, checker)
     with atomic(path) as temporary:
         temporary.write_bytes(checked.text.encode("ascii"))
     return Exported(path, format_name, checked.notes, plan.inputs, plan)
@@ -205,11 +210,9 @@ def export_name(source: Path, format_name: str) -> str:
     """Name of an export: that of the plan's file, with the format's ending.
 
     Raises:
-        InputError: Another format.
+        InputError: See `format_of`.
     """
-    if format_name not in FORMATS:
-        raise InputError(f"format '{format_name}'", where="export", allowed=", ".join(FORMATS))
-    return f"{source.stem}{FORMATS[format_name][0]}"
+    return f"{source.stem}{format_of(format_name)[0]}"
 
 
 def _urscript(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
@@ -232,13 +235,66 @@ def _ros2(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
     return _Draft(text, ("two messages: send 'insertion' only when the operator says so",))
 
 
-def _csv(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
-    text = csv_text(plan, case_checked=checker is not None)
-    check_sampled(read_csv(text, where=source), plan, time_resolution_s=0.0, where=source)
-    return _Draft(text)
+class Exporter(NamedTuple):
+    """A format: how a plan is written, and how that is read back, to be held against the plan before it is published.
+
+    Attributes:
+        ending: Of the file's name, such as ``.csv``.
+        write: ``write(plan, case_checked=bool)``: an ASCII text.
+        read: ``read(text, where=path)``: the motion that the text holds, as a robot would take it.
+        time_resolution_s: To which times are written.
+        notes: What whoever runs it should know, one sentence each.
+    """
+
+    ending: str
+    write: Callable[..., str]
+    read: Callable[..., SampledMotion]
+    time_resolution_s: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    def draft(self, plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
+        """The text, read back and equal to the plan."""
+        text = self.write(plan, case_checked=checker is not None)
+        check_sampled(self.read(text, where=source), plan, time_resolution_s=self.time_resolution_s, where=source)
+        return _Draft(text, self.notes)
 
 
-FORMATS: Mapping[str, tuple[str, Callable[[Plan, Path, StateChecker | None], _Draft]]] = MappingProxyType(
-    {"urscript": (".script", _urscript), "ros2": (".ros2.yaml", _ros2), "csv": (".csv", _csv)}
+Drafting = Callable[[Plan, Path, StateChecker | None], _Draft]
+
+FORMATS: Mapping[str, tuple[str, Drafting]] = MappingProxyType(
+    {
+        "urscript": (".script", _urscript),
+        "ros2": (".ros2.yaml", _ros2),
+        "csv": (".csv", Exporter(".csv", csv_text, read_csv).draft),
+    }
 )
 """Format to the file name's end and who writes it."""
+
+GROUP = "puncture_twin.exporters"
+"""Of entry points: a format's name to an `Exporter`. None takes the place of a name in `FORMATS`."""
+
+
+def format_names() -> tuple[str, ...]:
+    """Those of `FORMATS`, and those that installed packages add."""
+    return (*FORMATS, *sorted(entry_points(group=GROUP).names - FORMATS.keys()))
+
+
+def format_of(name: str) -> tuple[str, Drafting]:
+    """The ending of a format's files, and who writes them.
+
+    Raises:
+        InputError: There is no such format, or its package has no `Exporter` under that name.
+    """
+    if name in FORMATS:
+        return FORMATS[name]
+    if name not in format_names():
+        raise InputError(f"format '{name}'", where="export", allowed=", ".join(format_names()), code="unknown_format")
+    entry = entry_points(group=GROUP)[name]
+    try:
+        found: object = entry.load()
+    except (ImportError, AttributeError) as error:
+        found = error
+    if isinstance(found, Exporter) and found.ending.startswith(".") and found.ending != ".json":
+        return found.ending, found.draft
+    where, allowed = f"{GROUP}: {entry.value}", "an Exporter whose files end otherwise than a plan's"
+    raise InputError(f"format '{name}': {found!r}", where=where, allowed=allowed, code="no_exporter")

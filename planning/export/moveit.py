@@ -17,7 +17,7 @@ from puncture_twin.planning.arm.tool import Box, Tool, ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool, patient_surface
 from puncture_twin.planning.export.program import SampledMotion, check_sampled, warning_lines
@@ -131,7 +131,7 @@ def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
     for phase in SampledMotion._fields:
         trajectory = goals[phase]["trajectory"]
         if trajectory["joint_names"] != list(plan.model.joint_names):
-            raise InputError(f"{phase} is of other joints", where=where, allowed=", ".join(plan.model.joint_names))
+            refuse(f"{phase} is of other joints", where, ", ".join(plan.model.joint_names), "other_joints")
         starts = [point["time_from_start"] for point in trajectory["points"]]
         times = np.array([one["sec"] + one["nanosec"] / NANOSECONDS for one in starts])
         parts[phase] = Trajectory(times, np.array([point["positions"] for point in trajectory["points"]]))
@@ -186,7 +186,7 @@ def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> M
     check_goals(json.loads(goals), plan, where=source)
     urdf = urdf_with_needle(plan.model, case_tool(case))
     if not ElementTree.fromstring(urdf).findall("link"):
-        raise InputError("the URDF does not read back", where=source, allowed="links and joints")
+        refuse("the URDF does not read back", source, "links and joints", "not_read_back")
     sender = SENDER_TEXT.format(sender=names[3], scene=names[0], goals=names[1])
     return dict(zip(names, (_json(scene_message(case, anatomy, plan)), goals, urdf, sender), strict=True))
 

@@ -27,7 +27,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, wrap_to_pi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import POSE_TOLERANCE_MM
@@ -107,8 +107,8 @@ def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
     )
     steps = math.ceil(plan.approach.duration_s / STREAM_S) if len(rows) == 0 else 0
     if steps > MOST_SAMPLES:
-        allowed = f"at most {MOST_SAMPLES * STREAM_S:.0f} s"
-        raise InputError(f"a smooth approach of {plan.approach.duration_s:.0f} s", where="plan", allowed=allowed)
+        what = f"a smooth approach of {plan.approach.duration_s:.0f} s"
+        refuse(what, "plan", f"at most {MOST_SAMPLES * STREAM_S:.0f} s", "too_long")
     tips = tip_poses(plan)
     insertion = _insertion_ramp(plan, tips)
     return Program(
@@ -152,10 +152,10 @@ def straight_move(model: UrModel, program: Program) -> Trajectory:
     branches = inverse(model, poses)
     off = np.abs(wrap_to_pi(branches[0] - program.standoff_q)).max(axis=1)  # by the joint farthest off
     if np.isnan(off).all():
-        raise InputError("the arm does not reach its standoff", where="insertion", allowed="a pose within reach")
+        refuse("the arm does not reach its standoff", "insertion", "a pose within reach", "out_of_reach")
     q = branches[:, int(np.nanargmin(off))]
     if np.isnan(q).any():
-        raise InputError("the arm does not reach all of the straight way", where="insertion", allowed="one branch")
+        refuse("the arm does not reach all of the straight way", "insertion", "one branch", "out_of_reach")
     first = program.standoff_q + wrap_to_pi(q[0] - program.standoff_q)
     return Trajectory(times, np.concatenate([first[None], first + np.cumsum(wrap_to_pi(np.diff(q, axis=0)), axis=0)]))
 
@@ -204,7 +204,7 @@ def _insertion_ramp(plan: Plan, tips: Floats) -> _Ramp:
     points, times = tips[:, :3, 3], plan.insertion.times_s
     length = float(np.linalg.norm(points[-1] - points[0]))
     if length <= POSE_TOLERANCE_MM or len(points) < 2:
-        raise InputError("the insertion does not move the tip", where="plan", allowed="an insertion")
+        refuse("the insertion does not move the tip", "plan", "an insertion", "no_motion")
     return _ramp((points - points[0]) @ (points[-1] - points[0]) / length, times)
 
 
@@ -254,7 +254,7 @@ def check_sampled(motion: SampledMotion, plan: Plan, *, time_resolution_s: float
             and np.abs(read.times_s - planned.times_s).max() <= TIME_TOLERANCE_S
         )
         if not same:
-            raise InputError(f"the {name} does not read back as the plan's", where=where, allowed="the plan's samples")
+            refuse(f"the {name} does not read back as the plan's", where, "the plan's samples", "not_read_back")
         check_trajectory(plan.model, read, time_resolution_s=time_resolution_s, what=name, where=where)
 
 
@@ -284,10 +284,11 @@ def check_positions(model: UrModel, q: Floats, *, what: str, where: Path) -> Non
     if not inside.all():
         row, joint = np.argwhere(~inside)[0]
         low, high = np.degrees(model.joint_limits[joint])
-        raise InputError(
+        refuse(
             f"{what}: {model.joint_names[joint]} at {np.degrees(q[row, joint]):.3f} deg",
-            where=where,
-            allowed=f"{low:.0f} to {high:.0f} deg",
+            where,
+            f"{low:.0f} to {high:.0f} deg",
+            "joint_beyond_limits",
         )
 
 
@@ -311,10 +312,11 @@ def check_rates(model: UrModel, speeds: Floats, accelerations: Floats, *, what: 
         kept = np.abs(rates) <= limits * (1.0 + RELATIVE_SLACK)
         if not kept.all():
             row, joint = np.argwhere(~kept)[0]
-            raise InputError(
+            refuse(
                 f"{what}: {model.joint_names[joint]} at {abs(rates[row, joint]):.6g} {unit}",
-                where=where,
-                allowed=f"at most {limits[joint]:.6g} {unit}",
+                where,
+                f"at most {limits[joint]:.6g} {unit}",
+                "joint_too_fast",
             )
 
 

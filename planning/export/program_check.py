@@ -11,7 +11,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import flange_pose, tip_rates
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.export.program import (
     ANGLE_TOLERANCE_RAD,
     Program,
@@ -63,15 +63,14 @@ def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None,
         len(program.moves) == len(wanted.moves)
         and np.allclose(_rates(program), _rates(wanted), rtol=SAME_RATE, atol=0.0)
     ):
-        raise InputError(
-            "a speed, an acceleration or a radius does not read back", where=where, allowed="the plan's, above 1e-6"
-        )
+        what = "a speed, an acceleration or a radius does not read back"
+        refuse(what, where, "the plan's, above 1e-6", "not_read_back")
     _check_approach(program, plan, model, where)
     _check_insertion(program, plan, model, where)
 
 
 def _rates(program: Program) -> Floats:
-    """All numbers that a program prints besides angles and poses; 1 + mm for radii, which may be 0."""
+    """All numbers that a program prints except angles and poses; 1 + mm for radii, which may be 0."""
     moves = [(move.speed, move.acceleration, 1.0 + move.blend_mm) for move in program.moves]
     return np.array([program.tcp_mm, program.insertion_mm_s, program.insertion_mm_s2, *np.ravel(moves)])
 
@@ -92,7 +91,7 @@ def _check_approach(program: Program, plan: Plan, model: UrModel, where: Path) -
         check_rates(model, *rates, what="approach", where=where)
         _check_tip(model, start, end, fraction * move.speed * np.sign(end - start), plan, where)
     if program.moves and program.moves[-1].blend_mm != 0.0:
-        raise InputError("the approach does not stop at its end", where=where, allowed="a last blend of 0")
+        refuse("the approach does not stop at its end", where, "a last blend of 0", "not_read_back")
 
 
 def _check_tip(model: UrModel, start: Floats, end: Floats, speeds: Floats, plan: Plan, where: Path) -> None:
@@ -101,8 +100,8 @@ def _check_tip(model: UrModel, start: Floats, end: Floats, speeds: Floats, plan:
     q = start + np.linspace(0.0, 1.0, steps + 1)[:, None] * (end - start)
     fastest = float(tip_rates(model, q, speeds, plan.needle_length_mm).max())
     if not fastest <= plan.speeds.tip_speed_mm_s * (1.0 + SPEED_ROUNDING):
-        allowed = f"at most {plan.speeds.tip_speed_mm_s:g} mm/s"
-        raise InputError(f"a joint move takes the tip to {fastest:.4g} mm/s", where=where, allowed=allowed)
+        what = f"a joint move takes the tip to {fastest:.4g} mm/s"
+        refuse(what, where, f"at most {plan.speeds.tip_speed_mm_s:g} mm/s", "tip_too_fast")
 
 
 def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) -> None:
@@ -113,20 +112,20 @@ def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) 
     ):
         off, angle = _pose_difference(read, planned)
         if not (off <= POSE_TOLERANCE_MM and angle <= TURN_TOLERANCE_RAD):
-            raise InputError(f"the {name} pose is {off:.3g} mm off", where=where, allowed=f"{POSE_TOLERANCE_MM} mm")
+            refuse(f"the {name} pose is {off:.3g} mm off", where, f"{POSE_TOLERANCE_MM} mm", "not_read_back")
     if not program.insertion_mm_s <= plan.speeds.insertion_speed_mm_s * (1.0 + SPEED_ROUNDING):
-        allowed = f"at most {plan.speeds.insertion_speed_mm_s:g} mm/s"
-        raise InputError(f"the insertion at {program.insertion_mm_s:.4g} mm/s", where=where, allowed=allowed)
+        what = f"the insertion at {program.insertion_mm_s:.4g} mm/s"
+        refuse(what, where, f"at most {plan.speeds.insertion_speed_mm_s:g} mm/s", "tip_too_fast")
     angle = _pose_difference(program.T_base_standoff, program.T_base_target)[1]
     if not angle <= TURN_TOLERANCE_RAD:
-        raise InputError(f"the needle turns by {angle:.3g} rad on its way", where=where, allowed="a straight way")
+        refuse(f"the needle turns by {angle:.3g} rad on its way", where, "a straight way", "not_straight")
     moved = straight_move(model, program)
     ends = np.abs(moved.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
     if not ends <= SAME_BRANCH_RAD:
-        raise InputError(f"the straight move ends {ends:.3g} rad off", where=where, allowed="the plan's own branch")
+        refuse(f"the straight move ends {ends:.3g} rad off", where, "the plan's own branch", "not_read_back")
     worst = _farthest_mm(flange_pose(model, moved.q)[:, :3, 3], flange_pose(model, plan.insertion.q)[:, :3, 3])
     if not worst <= STRAIGHT_TOLERANCE_MM:
-        raise InputError(f"the straight move is {worst:.3g} mm off the plan's way", where=where, allowed="the plan")
+        refuse(f"the straight move is {worst:.3g} mm off the plan's way", where, "the plan", "not_straight")
     check_trajectory(model, moved, time_resolution_s=0.0, what="insertion", where=where)
 
 
@@ -147,4 +146,4 @@ def _pose_difference(T_a: Floats, T_b: Floats) -> tuple[float, float]:
 
 def _check_same(read: Floats, planned: Floats, what: str, where: Path) -> None:
     if read.shape != planned.shape or not np.abs(read - planned).max() <= ANGLE_TOLERANCE_RAD:
-        raise InputError(f"{what} does not read back as the plan's", where=where, allowed="the plan's angles")
+        refuse(f"{what} does not read back as the plan's", where, "the plan's angles", "not_read_back")

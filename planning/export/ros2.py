@@ -9,7 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.export.program import SampledMotion, check_rates, corner_rows, heading, rests_at
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
@@ -73,10 +73,6 @@ def velocities(model: UrModel, trajectory: Trajectory) -> Floats:
     the motion's own slope when its acceleration changes at samples only, and not at two in a row: the middle one of the
     three slopes is taken. It is kept within what keeps a cubic through the samples between its neighbours.
 
-    Args:
-        model: The arm.
-        trajectory: The samples.
-
     Returns:
         Shape (m, 6), rad/s.
     """
@@ -125,7 +121,7 @@ def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
             f"  joint_names: [{', '.join(model.joint_names)}]",
             "  points:",
         ]:
-            raise InputError(f"no message '{phase}' of the six joints", where=where, allowed="approach, insertion")
+            refuse(f"no message '{phase}' of the six joints", where, "approach, insertion", "missing_message")
         lines = lines[4:]
         points = []
         while lines and (match := _POINT.fullmatch(lines[0])):
@@ -133,7 +129,7 @@ def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
             lines = lines[1:]
         parts[phase] = _trajectory(points, model, phase, where)
     if lines:
-        raise InputError(f"line {lines[0]!r:.80}", where=where, allowed="points of two messages")
+        refuse(f"line {lines[0]!r:.80}", where, "points of two messages", "wrong_format")
     return SampledMotion(**parts)
 
 
@@ -141,16 +137,17 @@ def _trajectory(points: list[tuple[str, ...]], model: UrModel, phase: str, where
     try:
         return _parsed(points, model, phase, where)
     except ValueError as error:
-        raise InputError(f"{phase}: {error}", where=where, allowed="six positions and velocities a point") from error
+        what = f"{phase}: {error}"
+        raise InputError(what, where=where, allowed="six positions and velocities a point", code="bad_value") from error
 
 
 def _parsed(points: list[tuple[str, ...]], model: UrModel, phase: str, where: Path) -> Trajectory:
     times = np.array([int(sec) + int(nanosec) / NANOSECONDS for _, _, sec, nanosec in points])
     if len(times) and times[-1] > LONGEST_S:
-        raise InputError(f"{phase} of {times[-1]:.3g} s", where=where, allowed=f"at most {LONGEST_S} s")
+        refuse(f"{phase} of {times[-1]:.3g} s", where, f"at most {LONGEST_S} s", "too_long")
     if len(times) == 0 or times[0] != 0.0 or (np.diff(times) <= 0.0).any():
-        what = f"{phase}: two samples within a nanosecond, or none at time 0"
-        raise InputError(what, where=where, allowed="times that rise from 0 by whole nanoseconds")
+        allowed = "times that rise from 0 by whole nanoseconds"
+        refuse(f"{phase}: two samples within a nanosecond, or none at time 0", where, allowed, "times_not_rising")
     q, speeds = (np.array([[float(x) for x in point[k].split(",")] for point in points]).reshape(-1, 6) for k in (0, 1))
     check_rates(model, speeds, np.zeros((1, 6)), what=f"{phase} velocities", where=where)
     return Trajectory(times, q)

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import AngleGrid
 from puncture_twin.planning.formats.itk_transform import parse_transform, transform_text
@@ -145,7 +145,7 @@ def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
         InputError: A case in a frame of its own, which Slicer has no name for.
     """
     if case.space is Space.LOCAL:
-        raise InputError('space "local": Slicer knows LPS and RAS', where=case.path, allowed="a case of a patient")
+        refuse('space "local": Slicer knows LPS and RAS', case.path, "a case of a patient", "local_space")
     ends = np.stack([drawn.entry_ct, case.target_ct])
     texts = {PATH: markups_text("Line", drawn.name, ("entry", "target"), ends)}
     nodes, notes = [SceneNode("MarkupsLine", drawn.name, PATH)], []

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.export.program import STREAM_S, JointMove, Program, counted, heading, plain_sentence
 from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, pose
 from puncture_twin.planning.plan.plan import Plan
@@ -210,14 +210,14 @@ def read_urscript(text: str, *, where: Path) -> Program:
     waits = [at for at, line in enumerate(lines) if _WAITS.fullmatch(line)]
     back = [match for line in lines if (match := _RETRACTION.fullmatch(line))]
     if len(values) != 6 or len(insertions) != 1 or others != len(moves) + len(streamed) + 3 + settles:
-        raise InputError("the program does not read back", where=where, allowed="known moves and one insertion")
+        refuse("the program does not read back", where, "known moves and one insertion", "not_read_back")
     at, insertion = insertions[0]
     if len(back) != 1 or back[0].groups() != insertion.groups() or lines.count(_RUN) != 1 or _GUARD not in lines:
-        allowed = "a guard, and a way back at the same speed"
-        raise InputError("the insertion is not guarded, or does not retract", where=where, allowed=allowed)
+        what = "the insertion is not guarded, or does not retract"
+        refuse(what, where, "a guard, and a way back at the same speed", "insertion_unguarded")
     last = max((n for n, line in enumerate(lines) if line.startswith(("  movej", "  servoj"))), default=-1)
     if len(waits) != 1 or not last < waits[0] < at:
-        raise InputError("the insertion does not wait for the operator", where=where, allowed="a wait before it")
+        refuse("the insertion does not wait for the operator", where, "a wait before it", "insertion_unguarded")
     return Program(
         tcp_mm=float(values["tcp_m"][2]) / M_PER_MM,
         start_q=values["start_q"],

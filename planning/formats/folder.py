@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import absence
 from puncture_twin.planning.base.output.manifest import is_output_folder
 
@@ -87,8 +87,7 @@ def entries(folder: Path, *, most: int, allowed: str = "a readable folder") -> t
         why = getattr(error, "strerror", None) or error
         raise InputError(f"cannot be read ({why})", where=folder, allowed=allowed, code="folder_not_listed") from error
     if len(found) > most:
-        what = f"holds {len(found)} files, more than {most}"
-        raise InputError(what, where=folder, allowed=allowed, code="folder_too_large")
+        refuse(f"holds {len(found)} files, more than {most}", folder, allowed, "folder_too_large")
     return tuple(found)
 
 

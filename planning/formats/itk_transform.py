@@ -19,10 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, require_extra
+from puncture_twin.planning.base.errors import InputError, refuse, require_extra
 from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.guard import guard_transform
-from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.rigid import pose
 
 TEXT_ENDINGS, HDF5_ENDINGS = (".tfm", ".txt"), (".h5", ".hdf5")
@@ -46,10 +45,6 @@ def most_bytes(name: str) -> int:
 def parse_transform(data: bytes, path: Path) -> Floats:
     """The rigid motion of points that a file states, shape (4, 4), mm.
 
-    Args:
-        data: The whole file.
-        path: Its name.
-
     Raises:
         InputError: Another format or kind of transform, several of them, or one that is not rigid.
     """
@@ -59,7 +54,7 @@ def parse_transform(data: bytes, path: Path) -> Floats:
     elif name.lower().endswith(TEXT_ENDINGS):
         stated = _text_transforms(data, name)
     else:
-        raise InputError(f"transform file of the kind {path.suffix!r}", where=path, allowed=ALLOWED)
+        refuse(f"transform file of the kind {path.suffix!r}", path, ALLOWED, "unknown_format")
     return guard_transform(linear_motion(stated, name), where=path)
 
 
@@ -67,7 +62,7 @@ def _text_transforms(data: bytes, where: str) -> list[StatedTransform]:
     """The transforms of a text, in its order."""
     lines = [line.strip() for line in _LINE_END.split(decode_text(data, where)) if line.strip()]
     if not lines or lines[0] != _HEADER:
-        refuse("no ITK transform file", where, ALLOWED)
+        refuse("no ITK transform file", where, ALLOWED, "wrong_format")
     return [StatedTransform(kind, *(_numbers(one, key, where) for key in _KEYS)) for kind, one in _blocks(lines, where)]
 
 
@@ -81,7 +76,7 @@ def _blocks(lines: list[str], where: str) -> list[tuple[str, dict[str, str]]]:
         if key == "Transform":
             blocks.append((value, {}))
         elif not blocks or key not in _KEYS or not mark or key in blocks[-1][1]:
-            refuse(f"line {line[:60]!r}", where, ALLOWED)
+            refuse(f"line {line[:60]!r}", where, ALLOWED, "unknown_line")
         else:
             blocks[-1][1][key] = value
     return blocks
@@ -92,7 +87,8 @@ def _numbers(stated: dict[str, str], key: str, where: str) -> Floats:
     try:
         return np.array([float(word if _NUMBER.fullmatch(word) else f"no number {word}") for word in words])
     except ValueError as error:
-        raise InputError(f"{key} are no numbers ({str(error)[:80]})", where=where, allowed=ALLOWED) from error
+        what = f"{key} are no numbers ({str(error)[:80]})"
+        raise InputError(what, where=where, allowed=ALLOWED, code="not_a_number") from error
 
 
 def transform_text(T: Floats) -> str:
@@ -148,15 +144,15 @@ def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
         InputError: None, several that are no composite, or one of another kind or with other parameters.
     """
     if len(stated) > MAX_PARTS + 1:
-        refuse(f"{len(stated)} transforms", where, f"at most {MAX_PARTS} parts of a CompositeTransform")
+        refuse(f"{len(stated)} transforms", where, f"at most {MAX_PARTS} parts of a CompositeTransform", "too_many")
     parts = stated[1:] if stated and _COMPOSITE.fullmatch(stated[0].kind) else stated
     if not parts:
-        refuse("no linear transform", where, ALLOWED)
+        refuse("no linear transform", where, ALLOWED, "no_linear_transform")
     T = np.eye(4)
     for part in parts:
         _check_kind(part.kind, where)
     if len(parts) > 1 and parts is stated:
-        refuse("several transforms: harden them into one", where, ALLOWED)
+        refuse("several transforms: harden them into one", where, ALLOWED, "several_transforms")
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by the guard
         for part in parts:
             T = T @ _motion(part, where)
@@ -165,7 +161,7 @@ def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
 
 def _check_kind(kind: str, where: str) -> None:
     if _LINEAR.fullmatch(kind) is None:
-        refuse(f"transform of type {kind[:60]!r}", where, ALLOWED)
+        refuse(f"transform of type {kind[:60]!r}", where, ALLOWED, "unknown_type")
 
 
 def _motion(stated: StatedTransform, where: str) -> Floats:
@@ -186,7 +182,7 @@ def _motion(stated: StatedTransform, where: str) -> Floats:
 
 def _check_count(numbers: Floats, counts: tuple[int, ...], key: str, where: str) -> None:
     if len(numbers) not in counts:
-        refuse(f"{len(numbers)} {key}", where, " or ".join(f"{count}" for count in counts) + " numbers")
+        refuse(f"{len(numbers)} {key}", where, " or ".join(f"{count}" for count in counts) + " numbers", "wrong_count")
 
 
 def _euler(angles: Floats, *, zyx: bool) -> Floats:
@@ -208,7 +204,7 @@ def _versor(v: Floats, where: str) -> Floats:
     """Rotation of the vector part (x, y, z) of a unit quaternion whose scalar part is not negative."""
     length = float(np.linalg.norm(v))
     if not length <= 1.0 + _VERSOR_SLACK:
-        refuse(f"a versor of length {length:.9g}", where, "the vector part of a unit quaternion: at most 1")
+        refuse(f"a versor of length {length:.9g}", where, "the vector part of a unit quaternion: at most 1", "not_unit")
     if length >= 1.0 - _VERSOR_EDGE:
         v = v / (length * (1.0 + _VERSOR_EDGE))
     (x, y, z), w = v, np.sqrt(1.0 - v @ v)
@@ -244,10 +240,6 @@ def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
     that points elsewhere is followed. The texts are found by `heap_text`: HDF5's own library never ends on some damaged
     heaps. Needs the extra ``hdf5`` (h5py), which is imported only here.
 
-    Args:
-        data: The whole file.
-        where: Its name, for errors.
-
     Raises:
         InputError: Without h5py; or no whole HDF5 file of ITK's transforms.
     """
@@ -258,26 +250,29 @@ def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
         with h5py.File(BytesIO(data), "r") as file:
             return [_transform(_Members(h5py, group, data, where), where) for group in _groups(h5py, file, where)]
     except _DAMAGED as error:
-        raise InputError(f"no whole HDF5 file ({str(error)[:120]})", where=where, allowed=ALLOWED) from error
+        what = f"no whole HDF5 file ({str(error)[:120]})"
+        raise InputError(what, where=where, allowed=ALLOWED, code="file_damaged") from error
 
 
 def _groups(h5py: Any, file: Any, where: str) -> list[Any]:
     """The groups of the transforms by their numbers."""
     if _GROUP not in file:
-        refuse(f"HDF5 without {_GROUP}", where, ALLOWED)
+        refuse(f"HDF5 without {_GROUP}", where, ALLOWED, "wrong_format")
     parent = _own(h5py, file, _GROUP, h5py.Group, where)
     if not 0 < len(parent) <= MAX_PARTS + 1:
-        refuse(f"{len(parent)} transforms", where, f"1, or at most {MAX_PARTS} parts of a CompositeTransform")
+        what = f"{len(parent)} transforms"
+        refuse(what, where, f"1, or at most {MAX_PARTS} parts of a CompositeTransform", "wrong_count")
     names = [str(number) for number in range(len(parent))]
     if set(parent) != set(names):
-        refuse(f"{_GROUP} with {', '.join(sorted(parent))[:60]}", where, f"transforms numbered {', '.join(names)}")
+        what = f"{_GROUP} with {', '.join(sorted(parent))[:60]}"
+        refuse(what, where, f"transforms numbered {', '.join(names)}", "wrong_format")
     return [_own(h5py, parent, name, h5py.Group, where) for name in names]
 
 
 def _own(h5py: Any, parent: Any, name: str, kind: type, where: str) -> Any:
-    """A member that is in the file itself; links could name any file of the host."""
+    """A member of the file itself; a link could name any file of the host, and is refused."""
     if not isinstance(parent.get(name, getlink=True), h5py.HardLink) or not isinstance(parent[name], kind):
-        refuse(f"{parent.name}/{name} is a link or of another sort", where, ALLOWED)
+        refuse(f"{parent.name}/{name} is a link or of another sort", where, ALLOWED, "wrong_format")
     return parent[name]
 
 
@@ -290,11 +285,11 @@ class _Members:
     def text(self, name: str) -> str:
         """The one text of a dataset."""
         if name not in self._group:
-            refuse(f"{self._group.name} without {name}", self._where, ALLOWED)
+            refuse(f"{self._group.name} without {name}", self._where, ALLOWED, "missing_key")
         data = self._dataset(name)
         info = self._h5py.check_string_dtype(data.dtype)
         if data.size != 1 or info is None:
-            refuse(f"{data.name} is no text", self._where, ALLOWED)
+            refuse(f"{data.name} is no text", self._where, ALLOWED, "wrong_type")
         if info.length is None:
             return heap_text(self._content, data.id.get_offset())
         return str(np.ravel(data.asstr()[()])[0])
@@ -303,20 +298,21 @@ class _Members:
         """The numbers of a dataset by either of its names; none where there is none or it is too large."""
         there = [name for name in names if name in self._group]
         if len(there) > 1:
-            refuse(f"{self._group.name} with {' and '.join(there)}", self._where, ALLOWED)
+            refuse(f"{self._group.name} with {' and '.join(there)}", self._where, ALLOWED, "stated_twice")
         data = self._dataset(there[0]) if there else None
         if data is None or data.size > MAX_NUMBERS:
             return np.empty(0)
         if data.dtype not in (np.float64, np.float32) or data.ndim != 1:
-            refuse(f"{data.name} of {data.dtype} with shape {data.shape}", self._where, "a list of floats or doubles")
+            what = f"{data.name} of {data.dtype} with shape {data.shape}"
+            refuse(what, self._where, "a list of floats or doubles", "wrong_type")
         return np.asarray(data[()], dtype=np.float64)
 
     def _dataset(self, name: str) -> Any:
         data = _own(self._h5py, self._group, name, self._h5py.Dataset, self._where)
         if data.is_virtual or data.external:
-            refuse(f"{data.name} lies in another file", self._where, ALLOWED)
+            refuse(f"{data.name} lies in another file", self._where, ALLOWED, "data_elsewhere")
         if data.size <= MAX_NUMBERS and data.id.get_storage_size() > MAX_STORED_BYTES:
-            refuse(f"{data.name} takes {data.id.get_storage_size()} bytes", self._where, ALLOWED)
+            refuse(f"{data.name} takes {data.id.get_storage_size()} bytes", self._where, ALLOWED, "file_size")
         return data
 
 

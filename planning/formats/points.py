@@ -15,9 +15,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 import re
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +26,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.base.files import decode_text, read_input
+from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.files import atomic, decode_text, read_input
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.formats.guard import guard_points
-from puncture_twin.planning.formats.raw_mesh import refuse
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit, to_lps
 
 
@@ -103,7 +100,7 @@ def parse_points(
     default_space: Space | None = None,
     default_unit: Unit | None = None,
 ) -> NamedPoints:
-    """As `read_points`, of a file that has been read; it is not opened again.
+    """Parse a points file that has been read, like `read_points`; it is not opened again.
 
     Args:
         data: The whole file.
@@ -118,10 +115,10 @@ def parse_points(
     raw = _reader(path, name)(data, name)
     unit = raw.unit or default_unit
     if unit is None:
-        raise InputError("no unit of length", where=name, allowed="x_mm,y_mm,z_mm in the header")
+        refuse("no unit of length", name, "x_mm,y_mm,z_mm in the header", "unit_not_stated")
     if raw.space is not None and default_space is Space.LOCAL:
         message = f"points in {raw.space}, but the case has a local frame"
-        raise InputError(message, where=name, allowed="points in the case's own space, as CSV")
+        refuse(message, name, "points in the case's own space, as CSV", "local_space")
     space = raw.space or default_space
     points = np.array(raw.points, dtype=np.float64).reshape(-1, 3)
     with np.errstate(over="ignore"):  # beyond the range of floats is infinite, which the guard refuses
@@ -136,7 +133,7 @@ def parse_points(
 def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
     reader = next((read for suffix, read in _READERS.items() if path.name.lower().endswith(suffix)), None)
     if reader is None:
-        raise InputError(f"unknown point file {path.name!r}", where=where, allowed=", ".join(_READERS))
+        refuse(f"unknown point file {path.name!r}", where, ", ".join(_READERS), "unknown_format")
     return reader
 
 
@@ -154,19 +151,20 @@ def write_points(path: Path, points: NamedPoints) -> None:
     labels = zip(points.names, points.kinds, strict=True) if points.kinds else ((name,) for name in points.names)
     numbers = points.points if points.joints is None else np.hstack([points.points, np.degrees(points.joints)])
     rows = [[*label, *map(repr, row)] for label, row in zip(labels, numbers.tolist(), strict=True)]
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    except OSError as error:
-        raise InputError(f"cannot be written ({error})", where=path, allowed="a folder to write to") from error
-    part = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([header, *rows])
-        part.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot be written ({error})", where=path, allowed="a file name of a folder") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with atomic(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([header, *rows])
+
+
+def parse_triple(text: str, where: str, allowed: str = "X,Y,Z in mm") -> tuple[float, float, float]:
+    """Three numbers as they are typed, with commas between them.
+
+    Raises:
+        InputError: More or fewer, or one that is no finite number.
+    """
+    numbers = [parse_coordinate(part.strip(), where) for part in text.split(",")]
+    if len(numbers) != 3:
+        refuse(f"{len(numbers)} numbers", where, allowed, "wrong_count")
+    return numbers[0], numbers[1], numbers[2]
 
 
 class RawPoints(NamedTuple):
@@ -197,13 +195,13 @@ def parse_coordinate(text: str, where: str) -> float:
     """
     allowed = "a finite number with a decimal point"
     if "_" in text:  # Python would read 1_0 as 10
-        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed)
+        refuse(f"{text[:40]!r} is not a number", where, allowed, "not_a_number")
     try:
         number = float(text)
     except ValueError as error:
-        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed) from error
+        raise InputError(f"{text[:40]!r} is not a number", where=where, allowed=allowed, code="not_a_number") from error
     if not math.isfinite(number):
-        raise InputError(f"{text[:40]!r} is not finite", where=where, allowed=allowed)
+        refuse(f"{text[:40]!r} is not finite", where, allowed, "not_finite")
     return number
 
 
@@ -213,7 +211,9 @@ _ALLOWED = (
 )
 
 
-class _Row(NamedTuple):
+class CsvLine(NamedTuple):
+    """A line of a CSV: its number in the file, from 1, and its fields."""
+
     line: int
     fields: list[str]
 
@@ -221,24 +221,20 @@ class _Row(NamedTuple):
 def read_csv_points(data: bytes, where: str) -> RawPoints:
     """The points of a CSV file, in the order of its lines; empty lines are passed over.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If the header or a line is not understood; the error names the line.
     """
-    rows = list(_rows(data, where))
+    rows = list(csv_lines(data, where, _ALLOWED))
     if not rows:
-        refuse("no line", where, _ALLOWED)
+        refuse("no line", where, _ALLOWED, "empty")
     header = [field.strip() for field in rows[0].fields]
     unit = _unit(header, where)
     columns = {name.partition("_")[0]: index for index, name in enumerate(header)}
     for line, fields in rows[1:]:
         if len(fields) != len(header):
-            refuse(f"{len(fields)} fields instead of {len(header)}", f"{where}, line {line}", _ALLOWED)
+            refuse(f"{len(fields)} fields instead of {len(header)}", f"{where}, line {line}", _ALLOWED, "ragged_row")
         if not fields[columns["name"]].strip():
-            refuse("empty name", f"{where}, line {line}", _ALLOWED)
+            refuse("empty name", f"{where}, line {line}", _ALLOWED, "bad_name")
     points = [
         tuple(parse_coordinate(fields[columns[axis]], f"{where}, line {line}") for axis in "xyz")
         for line, fields in rows[1:]
@@ -257,14 +253,20 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
     )
 
 
-def _rows(data: bytes, where: str) -> Iterator[_Row]:
+def csv_lines(data: bytes, where: str, allowed: str) -> Iterator[CsvLine]:
+    """The lines of a CSV that are not empty.
+
+    Raises:
+        InputError: It is no CSV; names the line, and what is ``allowed``.
+    """
     reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
     try:
         for fields in reader:
             if any(field.strip() for field in fields):
-                yield _Row(reader.line_num, fields)
+                yield CsvLine(reader.line_num, fields)
     except csv.Error as error:
-        raise InputError(f"{error}", where=f"{where}, line {reader.line_num}", allowed=_ALLOWED) from error
+        place = f"{where}, line {reader.line_num}"
+        raise InputError(f"is no CSV ({error})", where=place, allowed=allowed, code="not_csv") from error
 
 
 def _unit(header: list[str], where: str) -> Unit | None:
@@ -275,14 +277,14 @@ def _unit(header: list[str], where: str) -> Unit | None:
         if axis:
             units[axis[1]] = axis[2] or ""
         elif name not in ("name", "kind", *JOINTS_DEG):
-            refuse(f"column {name[:40]!r}", f"{where}, header", _ALLOWED)
+            refuse(f"column {name[:40]!r}", f"{where}, header", _ALLOWED, "unknown_column")
     if len(set(header)) != len(header) or sorted(units) != ["x", "y", "z"] or "name" not in header:
-        refuse(f"columns {header}", f"{where}, header", _ALLOWED)
+        refuse(f"columns {header}", f"{where}, header", _ALLOWED, "wrong_columns")
     joints = sum(name in JOINTS_DEG for name in header)
     if joints not in (0, 6) or len(header) != 4 + ("kind" in header) + joints:  # such as x_mm beside x_m
-        refuse(f"columns {header}", f"{where}, header", _ALLOWED)
+        refuse(f"columns {header}", f"{where}, header", _ALLOWED, "wrong_columns")
     if len(set(units.values())) != 1:
-        refuse(f"mixed units {sorted(set(units.values()))}", f"{where}, header", _ALLOWED)
+        refuse(f"mixed units {sorted(set(units.values()))}", f"{where}, header", _ALLOWED, "mixed_units")
     text = units["x"]
     return parse_unit(text, where=f"{where}, header") if text else None
 
@@ -308,17 +310,13 @@ def read_markups_points(data: bytes, where: str) -> RawPoints:
 
     Which end of a line is the target no file says: the case names it by its label.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If it is no such file, states no known space, or a point has no label or defined position.
     """
     tree = parse_json(data, where=where, allowed=_MARKUPS_ALLOWED)
     markups = tree.get("markups") if isinstance(tree, dict) else None
     if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
-        refuse("not exactly one entry in 'markups'", where, _MARKUPS_ALLOWED)
+        refuse("not exactly one entry in 'markups'", where, _MARKUPS_ALLOWED, "wrong_count")
     markup = markups[0]
     points = _control_points(markup, where)
     places = [f"{where}, control point {number}" for number in range(1, len(points) + 1)]
@@ -333,20 +331,16 @@ def read_markups_points(data: bytes, where: str) -> RawPoints:
 def _control_points(markup: dict[str, Any], where: str) -> list[Any]:
     kind, points = markup.get("type", "Fiducial"), markup.get("controlPoints")
     if kind not in ("Fiducial", "Line"):
-        refuse(f"markup of type {str(kind)[:40]!r}", where, _MARKUPS_ALLOWED)
+        refuse(f"markup of type {str(kind)[:40]!r}", where, _MARKUPS_ALLOWED, "unknown_type")
     if not isinstance(points, list) or not points:
-        refuse("no control point", where, _MARKUPS_ALLOWED)
+        refuse("no control point", where, _MARKUPS_ALLOWED, "empty")
     if kind == "Line" and len(points) != _LINE_POINTS:
-        refuse(f"a line of {len(points)} control points", where, "both ends of a line: 2 control points")
+        refuse(f"a line of {len(points)} control points", where, "both ends of a line: 2 control points", "wrong_count")
     return points
 
 
 def read_fcsv_points(data: bytes, where: str) -> RawPoints:
     """The points of an older Slicer fiducial list, which is in mm by its definition.
-
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
 
     Raises:
         InputError: If it states no known space or columns, or a line is not understood.
@@ -355,7 +349,7 @@ def read_fcsv_points(data: bytes, where: str) -> RawPoints:
     system, header = _fcsv_value(lines, _FCSV_SYSTEM), _fcsv_value(lines, _FCSV_COLUMNS)
     columns = [] if header is None else [name.strip() for name in header.split(",")]
     if any(columns.count(name) != 1 for name in ("x", "y", "z", "label")):
-        refuse(f"columns {columns}", where, _FCSV_ALLOWED)
+        refuse(f"columns {columns}", where, _FCSV_ALLOWED, "wrong_columns")
     names, points = [], []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.startswith("#"):
@@ -363,9 +357,9 @@ def read_fcsv_points(data: bytes, where: str) -> RawPoints:
         place = f"{where}, line {number}"
         fields = _fcsv_fields(line, place)
         if len(fields) - len(columns) not in (0, 2):
-            refuse(f"{len(fields)} fields instead of {len(columns)}", place, _FCSV_ALLOWED)
+            refuse(f"{len(fields)} fields instead of {len(columns)}", place, _FCSV_ALLOWED, "ragged_row")
         if (status := (*fields, _FCSV_DEFINED)[len(columns)]) != _FCSV_DEFINED:
-            refuse(f"position status {status[:40]!r}", place, f"{_FCSV_DEFINED} (defined)")
+            refuse(f"position status {status[:40]!r}", place, f"{_FCSV_DEFINED} (defined)", "point_undefined")
         names.append(fields[columns.index("label")].strip())
         x, y, z = (parse_coordinate(fields[columns.index(axis)], place) for axis in "xyz")
         points.append((x, y, z))
@@ -375,7 +369,7 @@ def read_fcsv_points(data: bytes, where: str) -> RawPoints:
 def _space(value: object, where: str) -> Space:
     key = str(value).strip() if isinstance(value, (str, int)) and not isinstance(value, bool) else ""
     if key not in _SPACES:
-        refuse(f"coordinate system {str(value)[:40]!r}", where, "LPS or RAS (in older files 1 or 0)")
+        refuse(f"coordinate system {str(value)[:40]!r}", where, "LPS or RAS (in older files 1 or 0)", "unknown_space")
     return _SPACES[key]
 
 
@@ -385,27 +379,28 @@ def _slicer_unit(value: object, where: str) -> Unit:
         return Unit.MM
     text = value[0] if isinstance(value, list) and value else value
     if not isinstance(text, str):
-        refuse(f"coordinateUnits {str(value)[:40]!r}", where, 'such as "mm" or ["mm", "UCUM", "millimeter"]')
+        what = f"coordinateUnits {str(value)[:40]!r}"
+        refuse(what, where, 'such as "mm" or ["mm", "UCUM", "millimeter"]', "unknown_unit")
     return parse_unit(text, where=where)
 
 
 def _label(point: object, where: str) -> str:
     label = point.get("label") if isinstance(point, dict) else None
     if not isinstance(label, str) or not label.strip():
-        refuse(f"label {str(label)[:40]!r}", where, "a label that is not empty")
+        refuse(f"label {str(label)[:40]!r}", where, "a label that is not empty", "bad_name")
     return label.strip()
 
 
 def _position(point: dict[str, Any], where: str) -> tuple[float, float, float]:
     status = point.get("positionStatus", "defined")
     if status != "defined":
-        refuse(f"positionStatus is {str(status)[:40]!r}", where, '"defined"')
+        refuse(f"positionStatus is {str(status)[:40]!r}", where, '"defined"', "point_undefined")
     position = point.get("position")
     if not isinstance(position, list) or len(position) != 3:
-        refuse(f"position {str(position)[:60]!r}", where, "three numbers")
+        refuse(f"position {str(position)[:60]!r}", where, "three numbers", "not_a_number")
     for value in position:
         if not isinstance(value, (int, float)) or isinstance(value, bool):
-            refuse(f"position {str(position)[:60]!r}", where, "three numbers")
+            refuse(f"position {str(position)[:60]!r}", where, "three numbers", "not_a_number")
     x, y, z = (parse_coordinate(str(value), where) for value in position)
     return x, y, z
 
@@ -419,7 +414,7 @@ def _fcsv_fields(line: str, where: str) -> list[str]:
     try:
         return next(csv.reader([line], strict=True))
     except csv.Error as error:
-        raise InputError(f"{error}", where=where, allowed=_FCSV_ALLOWED) from error
+        raise InputError(f"{error}", where=where, allowed=_FCSV_ALLOWED, code="not_csv") from error
 
 
 _READERS: Mapping[str, Callable[[bytes, str], RawPoints]] = MappingProxyType(
@@ -476,7 +471,7 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
     given = np.asarray(values)
     if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != 6 or not np.isfinite(given).all():
         what = f"joint angles {str(np.array(values, dtype=object).tolist())[:80]}"
-        raise InputError(what, where=where, allowed="six finite angles", code="joints")
+        refuse(what, where, "six finite angles", "joints")
     q = np.array(np.radians(given) if unit == "deg" else given, dtype=np.float64)
     beyond = np.abs(q) > MOST_RAD
     if beyond.any():
@@ -488,10 +483,10 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
         guess = ": degrees?" if likely else ""
         what = f"joint {joint + 1} of {name} at {given[row, joint]:g} {unit}, beyond what it can read{guess}"
         limits = "363 degrees (6.34 rad) to either side, wrist 3 two turns"
-        raise InputError(what, where=where, allowed=limits, code="joints_beyond")
+        refuse(what, where, limits, "joints_beyond")
     if unit == "deg" and plainly_radians(given):
         what = f"every joint within {np.abs(given).max():.3g} degrees of zero: radians?"
-        raise InputError(what, where=where, allowed="degrees, as the names of the columns say", code="joints_unit")
+        refuse(what, where, "degrees, as the names of the columns say", "joints_unit")
     return q
 
 
@@ -511,7 +506,7 @@ def check_times(time_s: Floats, *, where: str | Path) -> None:
     if len(back):
         row = int(back[0])
         what = f"row {row + 2}: the time runs backwards, from {time_s[row]:g} to {time_s[row + 1]:g} s"
-        raise InputError(what, where=where, allowed="rows in the order of their times", code="times_backwards")
+        refuse(what, where, "rows in the order of their times", "times_not_rising")
 
 
 def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecording:
@@ -532,14 +527,14 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     try:
         rows = list(csv.reader(lines, strict=True)) if comma else [line.split() for line in lines]
     except csv.Error as error:
-        raise InputError(f"is no CSV ({error})", where=path, allowed=_ALLOWED_JOINTS) from error
+        raise InputError(f"is no CSV ({error})", where=path, allowed=_ALLOWED_JOINTS, code="not_csv") from error
     header = [cell.strip().strip('"') for cell in rows[0]] if rows else []
     joints, unit = _joint_columns(header, path)
     time = next((name for name in TIMES if name in header), None)
     if timed and time is None:
-        raise InputError(f"lacks {' or '.join(TIMES)}", where=path, allowed=_ALLOWED_JOINTS, code="column_missing")
+        refuse(f"lacks {' or '.join(TIMES)}", path, _ALLOWED_JOINTS, "missing_column")
     if len(rows) < 2:
-        raise InputError("holds no row", where=path, allowed=_ALLOWED_JOINTS)
+        refuse("holds no row", path, _ALLOWED_JOINTS, "empty")
     tool = RTDE_TOOL if set(RTDE_TOOL) <= set(header) else ()
     wanted = [*joints, *([time] if time else []), *tool]
     table = np.array([row_numbers(row, header, wanted, f"{path}: row {i}") for i, row in enumerate(rows[1:], start=1)])
@@ -563,7 +558,7 @@ def _joint_columns(header: Sequence[str], path: Path) -> tuple[tuple[str, ...], 
     missing = [name for name in columns if name not in header]
     if missing:
         what = "no joints" if len(missing) == len(columns) else f"lacks {', '.join(missing)}"
-        raise InputError(what, where=path, allowed=_ALLOWED_JOINTS, code="column_missing")
+        refuse(what, path, _ALLOWED_JOINTS, "missing_column")
     return columns, unit
 
 
@@ -574,5 +569,5 @@ def row_numbers(row: Sequence[str], header: Sequence[str], wanted: Sequence[str]
         InputError: More or fewer fields than the header has, or one that is no finite number.
     """
     if len(row) != len(header):
-        raise InputError(f"{len(row)} fields", where=where, allowed=f"{len(header)} fields, as in the header")
+        refuse(f"{len(row)} fields", where, f"{len(header)} fields, as in the header", "ragged_row")
     return [parse_coordinate(row[header.index(name)].strip(), f"{where}, {name}") for name in wanted]

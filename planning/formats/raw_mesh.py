@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
 from puncture_twin.planning.geometry.spaces import Space
 
@@ -31,11 +31,6 @@ class RawMesh(NamedTuple):
     space: Space | None = None
 
 
-def refuse(what: str, where: str, allowed: str) -> NoReturn:
-    """Raise a reader's InputError."""
-    raise InputError(what, where=where, allowed=allowed)
-
-
 def token_array(tokens: list[str], where: str) -> NDArray[np.str_]:
     """Tokens as an array of their widest one's width, shape (n,), which one endless token must not blow up.
 
@@ -44,7 +39,7 @@ def token_array(tokens: list[str], where: str) -> NDArray[np.str_]:
     """
     longest = max(tokens, key=len, default="")
     if len(longest) > MAX_TOKEN_LENGTH:
-        refuse(f"a word of {len(longest)} characters", where, f"numbers of at most {MAX_TOKEN_LENGTH}")
+        refuse(f"a word of {len(longest)} characters", where, f"numbers of at most {MAX_TOKEN_LENGTH}", "word_too_long")
     return np.array(tokens, dtype=np.str_)
 
 
@@ -63,14 +58,15 @@ def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: st
         InputError: If a polygon has fewer than three corners, or the triangles are too many.
     """
     if len(counts) == 0:
-        refuse("no face", where, "at least one triangle")
+        refuse("no face", where, "at least one triangle", "empty")
     if counts.min() < 3:
-        refuse(f"face {int(np.argmin(counts))} has {counts.min()} corners", where, "3 or more corners per face")
+        what = f"face {int(np.argmin(counts))} has {counts.min()} corners"
+        refuse(what, where, "3 or more corners per face", "wrong_count")
     if (counts == 3).all():
         return corners.reshape(-1, 3)
     total = int(counts.sum() - 2 * len(counts))
     if total > MAX_TRIANGLES:
-        refuse(f"{total} triangles", where, f"at most {MAX_TRIANGLES}")
+        refuse(f"{total} triangles", where, f"at most {MAX_TRIANGLES}", "too_many")
     first = np.cumsum(counts) - counts
     triangle_first = np.cumsum(counts - 2) - (counts - 2)
     polygon = np.repeat(np.arange(len(counts)), counts - 2)

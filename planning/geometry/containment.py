@@ -85,9 +85,9 @@ def _leaves_oddly(mesh: TriangleMesh, point: NDArray[np.float64]) -> bool:
     """Whether most of the rays from a point cross an odd number of the surface's distinct triangles."""
     a, b, c = np.moveaxis(mesh.triangles[mesh.distinct] - point, 1, 0)
     rays = np.random.default_rng(SEED).normal(size=(3, RAYS))
-    weights = np.stack([np.cross(b, c) @ rays, np.cross(c, a) @ rays, np.cross(a, b) @ rays])
+    weights = np.stack([np.cross(b, c) @ rays, np.cross(c, a) @ rays, np.cross(a, b) @ rays])  # edge functions
     ahead = (weights * np.stack([a @ rays, b @ rays, c @ rays])).sum(axis=0) * weights.sum(axis=0) > 0
-    around = np.abs(np.sign(weights).sum(axis=0)) == len(weights)
+    around = np.abs(np.sign(weights).sum(axis=0)) == len(weights)  # all of one sign: the line passes through
     odd = (around & ahead).sum(axis=0) % 2 == 1
     return bool(odd.mean() > 0.5)
 
@@ -97,10 +97,13 @@ SUM_RAYS = 1000
 
 
 def winding_number(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
-    """0 outside a closed surface, 1 or -1 (by orientation) inside, in between for an open one.
+    """Winding number of a surface about a point: 0 outside a closed one, 1 or -1 (by orientation) inside.
 
-    The sum of the triangles' signed solid angles over 4 pi, each by Van Oosterom and Strackee, "The solid angle of a
-    plane triangle", IEEE Trans. Biomed. Eng. 30(2), 1983, Eq. 8.
+    The sum of the triangles' signed solid angles over 4 pi; of an open surface any number between. With corners a, b, c
+    seen from the point (Van Oosterom and Strackee, "The solid angle of a plane triangle", IEEE Trans. Biomed. Eng.
+    30(2), 1983, Eq. 8):
+
+        tan(angle / 2) = a.(b x c) / (|a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b|)
 
     Args:
         mesh: The surface, mm.
@@ -118,7 +121,7 @@ def winding_numbers(mesh: TriangleMesh, points: NDArray[np.float64]) -> NDArray[
 
 @nb.njit(cache=True, error_model="numpy")
 def _solid_angles(vertices, faces, points, found):  # type: ignore[no-untyped-def]  # numba infers
-    """The sum over all triangles (m, 3) of vertices (n, 3), as in `winding_number`, of each point."""
+    """Fill the sum of the signed solid angles of all triangles (m, 3) for each point, by the equation above."""
     for row in range(len(points)):
         x, y, z = points[row]
         total = 0.0
@@ -132,7 +135,7 @@ def _solid_angles(vertices, faces, points, found):  # type: ignore[no-untyped-de
             triple = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
             below = na * nb_ * nc + (ax * bx + ay * by + az * bz) * nc
             below += (bx * cx + by * cy + bz * cz) * na + (cx * ax + cy * ay + cz * az) * nb_
-            total += 2.0 * np.arctan2(triple, below)
+            total += 2.0 * np.arctan2(triple, below)  # below is negative where the angle exceeds pi
         found[row] = total
 
 
@@ -202,7 +205,7 @@ class Crossings:
         ray: Shape (c,), row of the ray.
         depth: Shape (c,), mm from the origin.
         face: Shape (c,), triangle that is crossed.
-        way: Shape (c,), 1 where the ray comes out through the triangle's front (its corners run counterclockwise seen
+        sense: Shape (c,), 1 where the ray comes out through the triangle's front (its corners run counterclockwise seen
             from there), -1 where it goes in, 0 where it does both at once (two surfaces touch there, or one is folded)
             or the triangle is seen edge-on.
         count: Shape (n,), crossings of each ray.
@@ -212,7 +215,7 @@ class Crossings:
     ray: Ints
     depth: Floats
     face: Ints
-    way: Ints
+    sense: Ints
     count: Ints
     first: Ints
 
@@ -231,29 +234,29 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     lengths = np.sqrt(np.einsum("ij,ij->i", rays, rays))
     origin = np.array(origin, dtype=np.float64)
     space, total = -1, USUAL_CROSSINGS * len(directions)  # of no ray there are none
-    while total > space:  # space was too small: once more, with as much as was counted
+    while total > space:  # the arrays were too short: once more, as long as was counted
         space = total
         ray, depth, face = np.empty(space, np.int64), np.empty(space), np.empty(space, np.int64)
-        way = np.empty(space, np.int64)
+        sense = np.empty(space, np.int64)
         binned = rays, lengths, order, starts, bins
-        total = _visit(mesh.vertices, mesh.faces, origin, binned, length, ray, depth, face, way)
-    ray, depth, face, way = ray[:total], depth[:total], face[:total], way[:total]
+        total = _visit(mesh.vertices, mesh.faces, origin, binned, length, ray, depth, face, sense)
+    ray, depth, face, sense = ray[:total], depth[:total], face[:total], sense[:total]
     rows = np.lexsort((depth, ray))  # by ray, then by depth
-    ray, depth, face, way = ray[rows], depth[rows], face[rows], way[rows]
-    fresh = np.ones(total, bool)
+    ray, depth, face, sense = ray[rows], depth[rows], face[rows], sense[rows]
+    fresh = np.ones(total, bool)  # false for the second of two triangles about an edge or corner that is hit
     fresh[1:] = (ray[1:] != ray[:-1]) | (depth[1:] - depth[:-1] > SAME_CROSSING_MM)
-    way = _ways(way, fresh)
+    sense = _merged_senses(sense, fresh)
     ray, depth, face = ray[fresh], depth[fresh], face[fresh]
     count = np.bincount(ray, minlength=len(directions))
-    return Crossings(ray, depth, face, way, count, np.cumsum(count) - count)
+    return Crossings(ray, depth, face, sense, count, np.cumsum(count) - count)
 
 
-def _ways(way: Ints, fresh: Bools) -> Ints:
-    """Direction in which merged crossings pass the surface, 0 if they differ, from each first one to the next."""
+def _merged_senses(sense: Ints, fresh: Bools) -> Ints:
+    """Sense of each merged crossing, 0 where those that it merges differ; ``fresh`` marks the first of each."""
     starts = np.flatnonzero(fresh)
     if len(starts) == 0:
-        return way
-    most, least = np.maximum.reduceat(way, starts), np.minimum.reduceat(way, starts)
+        return sense
+    most, least = np.maximum.reduceat(sense, starts), np.minimum.reduceat(sense, starts)
     return np.where(most == least, most, 0)
 
 
@@ -283,8 +286,8 @@ def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
 
 
 @allocation_free()
-def _visit(vertices, faces, origin, binned, length, ray, depth, face, way):  # type: ignore[no-untyped-def]  # numba infers
-    """Count the crossings; write them too where the output arrays have space."""
+def _visit(vertices, faces, origin, binned, length, ray, depth, face, sense):  # type: ignore[no-untyped-def]  # numba infers
+    """Count the crossings, and write them as far as the output arrays are long."""
     rays, lengths, order, starts, bins = binned
     found, per_radian = 0, bins / np.pi
     for f in range(len(faces)):
@@ -297,6 +300,7 @@ def _visit(vertices, faces, origin, binned, length, ray, depth, face, way):  # t
             continue
         center, radius = _cone(a, b, c)
         polar = np.arccos(min(1.0, max(-1.0, center[2])))
+        # The window of bins that the triangle's cone touches: rows over the polar angle, columns over the azimuth.
         first_row = max(0, int((polar - radius) * per_radian))
         last_row = min(bins - 1, int((polar + radius) * per_radian))
         low, high = _azimuths(center, polar, radius, bins)
@@ -312,7 +316,7 @@ def _visit(vertices, faces, origin, binned, length, ray, depth, face, way):  # t
                     t, out = _cross(a, b, c, rays[k]) if inside else (-1.0, 0)
                     if 0.0 <= t <= length:
                         if found < len(ray):
-                            ray[found], depth[found], face[found], way[found] = order[k], t, f, out
+                            ray[found], depth[found], face[found], sense[found] = order[k], t, f, out
                         found += 1
     return found
 
@@ -337,7 +341,10 @@ def _beyond(a, b, c, length):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
-    """Axis and half-angle of a cone about the origin that holds a triangle; half-angle pi where none is narrow."""
+    """Axis and half-angle, rad, of a cone at the origin that holds a triangle; pi where no narrow cone does.
+
+    A cone narrower than a half-space is convex: it holds the triangle where it holds its corners.
+    """
     na, nb_, nc = _length(a[0], a[1], a[2]), _length(b[0], b[1], b[2]), _length(c[0], c[1], c[2])
     if min(na, nb_, nc) == 0.0:
         return (0.0, 0.0, 1.0), np.pi
@@ -357,13 +364,15 @@ def _cone(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _length(x, y, z):  # type: ignore[no-untyped-def]  # numba infers
-    """Length of a vector."""
     return np.sqrt(x * x + y * y + z * z)
 
 
 @allocation_free()
 def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # numba infers
-    """First and last azimuth bin that a cone touches (the last may run past the full circle)."""
+    """First and last azimuth bin that a cone touches (the last may run past the full circle).
+
+    A circle of angular radius r about a point of polar angle p spans azimuths of +- asin(sin r / sin p), all at a pole.
+    """
     if radius >= 1.5 or polar - radius <= 0.0 or polar + radius >= np.pi:
         return 0, 2 * bins - 1
     half = np.arcsin(min(1.0, np.sin(radius) / np.sin(polar)))
@@ -375,9 +384,9 @@ def _azimuths(center, polar, radius, bins):  # type: ignore[no-untyped-def]  # n
 
 @allocation_free()
 def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
-    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; and its direction."""
-    p, q, r = _beside(a, u), _beside(b, u), _beside(c, u)
-    wa, wb, wc = _turn(q, r), _turn(r, p), _turn(p, q)
+    """Depth at which the ray from the origin along u crosses the triangle, -1 where it does not; and its sense."""
+    p, q, r = _projected(a, u), _projected(b, u), _projected(c, u)
+    wa, wb, wc = _edge_function(q, r), _edge_function(r, p), _edge_function(p, q)
     if not ((wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)):
         return -1.0, 0
     total = wa + wb + wc
@@ -402,8 +411,11 @@ def _span(p):  # type: ignore[no-untyped-def]  # numba infers
 
 
 @allocation_free()
-def _beside(p, u):  # type: ignore[no-untyped-def]  # numba infers
-    """A point moved along the ray into the plane of the two axes that the ray follows least."""
+def _projected(p, u):  # type: ignore[no-untyped-def]  # numba infers
+    """A point moved along the ray into the plane of the two axes that the ray follows least.
+
+    It depends on the point alone, so triangles that share a corner share its projection.
+    """
     if abs(u[2]) >= max(abs(u[0]), abs(u[1])):
         return p[0] - u[0] / u[2] * p[2], p[1] - u[1] / u[2] * p[2]
     if abs(u[1]) >= abs(u[0]):
@@ -413,14 +425,14 @@ def _beside(p, u):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _most(u):  # type: ignore[no-untyped-def]  # numba infers
-    """The component of a ray along the axis that it follows most: where it is negative, `_beside` mirrors."""
+    """The component of a ray along the axis that it follows most: where it is negative, `_projected` mirrors."""
     if abs(u[2]) >= max(abs(u[0]), abs(u[1])):
         return u[2]
     return u[1] if abs(u[1]) >= abs(u[0]) else u[0]
 
 
 @allocation_free()
-def _turn(p, q):  # type: ignore[no-untyped-def]  # numba infers
+def _edge_function(p, q):  # type: ignore[no-untyped-def]  # numba infers
     """On which side of the edge p-q the ray passes: the right sign or 0, for rounding keeps two products' order."""
     return p[0] * q[1] - p[1] * q[0]
 
@@ -432,10 +444,10 @@ def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
 
 
 def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
-    """Crossings, and which rays they are consistent for: as those of a ray from inside a closed surface.
+    """Crossings of rays from inside a closed surface, and for which rays, shape (n,), they are consistent.
 
-    Such a ray leaves an odd number of times. Where triangles are wound alike it comes out and goes in by turns: if not,
-    one shell lies within another, or two share a wall, and the first crossing need not be the exit.
+    Such a ray has an odd number of crossings. Where triangles are wound alike it comes out and goes in alternately: if
+    not, one shell lies within another, or two share a wall, and the first crossing need not be the exit.
 
     A ray through an edge or corner may count twice or touch without crossing; it is rotated by `NUDGE` and tried again.
     """
@@ -454,8 +466,8 @@ def _adds_up(mesh: TriangleMesh, found: Crossings) -> Bools:
     odd = found.count % 2 == 1
     if not (mesh.closed and mesh.wound_alike):
         return odd
-    wrong = found.way == 0
-    wrong[1:] |= (found.ray[1:] == found.ray[:-1]) & (found.way[1:] == found.way[:-1])
+    wrong = found.sense == 0
+    wrong[1:] |= (found.ray[1:] == found.ray[:-1]) & (found.sense[1:] == found.sense[:-1])
     return np.asarray(odd & (np.bincount(found.ray[wrong], minlength=len(odd)) == 0))
 
 

@@ -71,7 +71,7 @@ def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) 
     marked = np.zeros(len(mesh.vertices), bool)
     marked[mesh.faces[face]] = True
     around = np.flatnonzero(marked[mesh.faces].any(axis=1))
-    a, b, c = np.moveaxis(mesh.triangles[around], 1, 0)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[around]], 1, 0)
     areas = np.cross(b - a, c - a)
     corners, at_vertex = mesh.faces[around].T.reshape(-1), np.empty_like(mesh.vertices)
 
@@ -81,8 +81,8 @@ def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) 
     for axis, part in enumerate(areas.T):
         at_vertex[:, axis] = about_vertices(part)
     kept, whole = np.linalg.norm(at_vertex, axis=1), about_vertices(np.linalg.norm(areas, axis=1))
-    weights = _corner_weights(mesh.triangles[face], points)
-    own = _normals(TriangleMesh(mesh.vertices, mesh.faces[face]))
+    crossed = TriangleMesh(mesh.vertices, mesh.faces[face])
+    weights, own = _corner_weights(crossed.triangles, points), _normals(crossed)
     normals = _unit(at_vertex)[mesh.faces[face]]
     signs = np.where(np.einsum("ijk,ik->ij", normals, own) < 0.0, -1.0, 1.0)
     blended = _unit(np.einsum("ij,ij,ijk->ik", weights, signs, normals))

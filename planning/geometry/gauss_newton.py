@@ -130,7 +130,7 @@ class _Normal(NamedTuple):
 def _descend(
     normal: _Normal, system: System[X], estimate: X, moved: Callable[[X, Floats], X], damping: float
 ) -> tuple[Floats, X, float]:
-    """A step that lowers the cost, the estimate after it, and the damping for the next; a step of 0 where none does."""
+    """A step that lowers the cost, the estimate after it, and the next damping; a step of 0 where none lowers it."""
     if system.cost is None:
         step = normal.step(damping)
         return step, moved(estimate, step), damping

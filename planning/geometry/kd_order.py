@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.numba_kernels import nb
 
 STACK = 128
-"""Ranges that wait while a part is split: one per level, and 2^64 points have 64 levels."""
+"""Ranges still to split: one per level, and 2^64 points have 64 levels."""
 
 SAMPLED = 128
-"""One point of so many, and three more, is looked at to guess a pivot."""
+"""Points of a range for each one in the sample that a pivot is chosen from; the sample has three more."""
 
 MOST_SAMPLED = 63
-"""More bring the guess no nearer than sorting them costs."""
+"""Largest sample: to sort more costs as much as the better pivot saves."""
 
 
 def kd_order(points: NDArray[np.float64], leaf: int) -> NDArray[np.int64]:
@@ -51,7 +51,7 @@ def _sort(records, rows, leaf):  # type: ignore[no-untyped-def]  # numba infers
         if count <= leaf:
             continue
         left = leaf
-        while 2 * left < count:
+        while 2 * left < count:  # the left part is full, so its runs stay aligned
             left *= 2
         _select(records, rows, sample, low, high, low + left, _longest_side(records, low, high))
         stack[waiting, 0], stack[waiting, 1] = low, low + left
@@ -114,8 +114,9 @@ def _expected(records, sample, low, high, middle, axis):  # type: ignore[no-unty
 def _part(records, rows, low, high, axis, pivot, equal):  # type: ignore[no-untyped-def]  # numba infers
     """Move what lies below a pivot, or equals it, to the front of a range; returns where the rest begins.
 
-    Every record changes its place with the first of the rest, and only the border's step depends on it: no branch is
-    guessed wrong. Rows are the records as integers, whose bits a copy keeps; unsigned numbers count from the front.
+    Every record is swapped with the first of the rest, and only the border's step depends on its value: there is no
+    branch to mispredict. ``rows`` are the records as integers, so that copies keep their bits; unsigned indices need no
+    test for negative ones.
     """
     border = np.uint64(low)
     for i in range(np.uint64(low), np.uint64(high)):

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, is_frozen
+from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.geometry.rigid import apply
 
@@ -51,7 +52,7 @@ class TriangleMesh:
     def __post_init__(self) -> None:
         for name, dtype in (("vertices", np.float64), ("faces", np.int32)):
             array = getattr(self, name)
-            if not _read_only(array, dtype):
+            if not is_frozen(array, dtype):
                 array = np.array(array, dtype=dtype, order="C")
                 array.setflags(write=False)
                 object.__setattr__(self, name, array)
@@ -61,12 +62,10 @@ class TriangleMesh:
         vars(self).update(closed=closed, wound_alike=wound_alike)
         return self
 
-    @cached_property
+    @property
     def triangles(self) -> NDArray[np.float64]:
-        """Corner coordinates, shape (m, 3, 3), mm."""
-        triangles = self.vertices[self.faces]
-        triangles.setflags(write=False)
-        return triangles
+        """Corner coordinates, shape (m, 3, 3), mm; made anew each time: they take six times what the mesh holds."""
+        return np.take(self.vertices, self.faces, axis=0)
 
     @cached_property
     def closed(self) -> bool:
@@ -129,17 +128,17 @@ class TriangleMesh:
         bounds.setflags(write=False)
         return bounds
 
-    @cached_property
-    def area(self) -> float:
-        """Area of all triangles, mm^2."""
-        a, b, c = np.moveaxis(self.triangles, 1, 0)
-        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
+    @property
+    def areas(self) -> Floats:
+        """Of each triangle, shape (m,), mm^2."""
+        areas = np.empty(len(self.faces))
+        _areas(self.vertices, self.faces, areas)
+        return areas
 
     @property
     def volume(self) -> float:
         """Enclosed volume where the mesh is closed, mm^3; negative where its triangles face inward."""
-        a, b, c = np.moveaxis(self.triangles - self.bounds.mean(axis=0), 1, 0)
-        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+        return float(_volume(self.vertices, self.faces, self.bounds.mean(axis=0)))
 
     def transformed(self, T_b_a: NDArray[np.float64]) -> TriangleMesh:
         """The surface in frame b.
@@ -158,20 +157,49 @@ class Spread(NamedTuple):
 
 
 def spread_on(mesh: TriangleMesh, count: int) -> Spread:
-    """So many points spread evenly over a surface's area, the same in every run.
+    """Points spread evenly over a surface's area, ``count`` of them, the same in every run.
 
     Along the triangles by cumulative area, within a triangle by the R2 sequence (Roberts 2018), folded at its diagonal.
     """
-    a, b, c = np.moveaxis(mesh.triangles, 1, 0)
-    normal = np.cross(b - a, c - a)
-    area = np.cumsum(np.linalg.norm(normal, axis=1))
+    area = np.cumsum(mesh.areas)
     number = np.arange(count)
     at = np.minimum(np.searchsorted(area, (number + 0.5) / count * area[-1]), len(area) - 1)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[at]], 1, 0)
+    normal = np.cross(b - a, c - a)
     u, v = (0.5 + 0.7548776662466927 * number) % 1.0, (0.5 + 0.5698402909980532 * number) % 1.0
     folded = u + v > 1.0
     u, v = np.where(folded, 1.0 - u, u)[:, None], np.where(folded, 1.0 - v, v)[:, None]
-    normals = normal[at] / np.maximum(np.linalg.norm(normal[at], axis=1, keepdims=True), np.finfo(float).tiny)
-    return Spread(np.asarray(a[at] + u * (b[at] - a[at]) + v * (c[at] - a[at])), normals)
+    normals = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+    return Spread(np.asarray(a + u * (b - a) + v * (c - a)), normals)
+
+
+@nb.njit(cache=True)
+def _areas(vertices: Any, faces: Any, areas: Any) -> None:
+    for f in range(len(faces)):
+        i, j, k = faces[f]
+        x, y, z = _cross(_from(vertices, j, vertices[i]), _from(vertices, k, vertices[i]))
+        areas[f] = np.sqrt(x * x + y * y + z * z) / 2.0
+
+
+@nb.njit(cache=True)
+def _volume(vertices: Any, faces: Any, middle: Any) -> Any:
+    total = 0.0
+    for f in range(len(faces)):
+        i, j, k = faces[f]
+        a = _from(vertices, i, middle)
+        x, y, z = _cross(_from(vertices, j, middle), _from(vertices, k, middle))
+        total += a[0] * x + a[1] * y + a[2] * z
+    return total / 6.0
+
+
+@nb.njit(cache=True)
+def _from(vertices: Any, row: Any, point: Any) -> Any:
+    return vertices[row, 0] - point[0], vertices[row, 1] - point[1], vertices[row, 2] - point[2]
+
+
+@nb.njit(cache=True)
+def _cross(a: Any, b: Any) -> Any:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
@@ -184,15 +212,6 @@ def joined(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     for array in (vertices, faces):
         array.setflags(write=False)  # nobody else has it: it is taken as it is
     return TriangleMesh(vertices, faces)
-
-
-def _read_only(array: Any, dtype: type) -> bool:
-    """Whether this is an array of a kind that nobody writes to, down to the memory that it looks at."""
-    if type(array) is not np.ndarray or array.dtype != dtype or not (array.flags.c_contiguous and array.flags.aligned):
-        return False
-    while type(array) is np.ndarray and not array.flags.writeable:
-        array = array.base
-    return array is None or type(array) is bytes
 
 
 def box(T: Floats, size: Floats | Sequence[float]) -> TriangleMesh:
@@ -227,7 +246,7 @@ def _first_of_equals(a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.i
 
 
 def packed_meshes(meshes: Sequence[TriangleMesh]) -> dict[str, NDArray[Any]]:
-    """All vertices and faces, one mesh after the other, and how many each has, shape (k, 2)."""
+    """All vertices and faces of some meshes, one after the other, and how many each has, shape (k, 2)."""
     return {
         "sizes": np.array([(len(mesh.vertices), len(mesh.faces)) for mesh in meshes], np.int64).reshape(-1, 2),
         "vertices": np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes)]),

@@ -1,4 +1,4 @@
-"""What of a mask holds together, by runs of voxels along its last axis: no grid of numbers is made, nor gone through.
+"""Connected parts of a mask, by runs of voxels along its last axis: no grid of numbers is made or read.
 
 A large scan has a hundred million voxels and a few hundred thousand runs. Two runs of neighbouring lines that touch
 are of one part (union-find, the older run is the root, so that one pass forward numbers them all).
@@ -43,7 +43,7 @@ class Parts:
         return np.bincount(self.part, held, len(self.sizes)).astype(np.int64)
 
     def painted(self, values: NDArray[Any]) -> NDArray[Any]:
-        """A grid that holds a value of its own in each part, and zero outside of all.
+        """A grid with a value of its own in each part, and zero outside of all.
 
         Args:
             values: Shape (parts,), whole numbers or flags.
@@ -78,7 +78,7 @@ def middle_of(mask: Bools) -> Floats:
 
 
 def ends_of(mask: Bools) -> tuple[Ints32, Ints32, Ints32, Ints32]:
-    """Where lines along axes 0 and 1 first and last meet a mask.
+    """First and last voxel of a mask along each line of axes 0 and 1.
 
     Returns:
         The first along axis 0, shape (ny, nz), the last, and both along axis 1, shape (nx, nz); -1 of a line that does
@@ -91,7 +91,7 @@ def ends_of(mask: Bools) -> tuple[Ints32, Ints32, Ints32, Ints32]:
 
 
 def _plain(mask: Bools) -> Bools:
-    """As kernels take it: in one piece, writable."""
+    """The array as kernels take it: contiguous and writable."""
     return np.require(mask, requirements=["C", "W"])
 
 
@@ -107,8 +107,8 @@ def _find_ends(mask: Any, first_i: Any, last_i: Any, first_j: Any, last_j: Any) 
 
 
 @nb.njit(cache=True)
-def _runs_and_parts(mask: Any, beside: Any) -> Any:
-    """Runs (n, 4), and the part (n,) of each; ``beside`` is 1 where edges and corners count."""
+def _runs_and_parts(mask: Any, diagonal: Any) -> Any:
+    """Runs (n, 4), and the part (n,) of each; ``diagonal`` is 1 where edges and corners count."""
     nx, ny, nz = mask.shape
     count = 0
     for i in range(nx):
@@ -135,10 +135,10 @@ def _runs_and_parts(mask: Any, beside: Any) -> Any:
                 n += 1
             line = i * ny + j
             first[line + 1] = n
-            for y in range(max(0, j - beside), min(ny, j + beside + 1) if i > 0 else 0):
-                _join(runs, root, first, line - ny + y - j, line, beside)
+            for y in range(max(0, j - diagonal), min(ny, j + diagonal + 1) if i > 0 else 0):
+                _join(runs, root, first, line - ny + y - j, line, diagonal)
             if j > 0:
-                _join(runs, root, first, line - 1, line, beside)
+                _join(runs, root, first, line - 1, line, diagonal)
     parts = 0
     for r in range(count):
         if root[r] == r:
@@ -150,11 +150,11 @@ def _runs_and_parts(mask: Any, beside: Any) -> Any:
 
 
 @nb.njit(cache=True)
-def _join(runs: Any, root: Any, first: Any, line: Any, other: Any, beside: Any) -> None:
+def _join(runs: Any, root: Any, first: Any, line: Any, other: Any, diagonal: Any) -> None:
     """Make one part of the runs of two lines that overlap, or are so many voxels apart."""
     a, b = first[line], first[other]
     while a < first[line + 1] and b < first[other + 1]:
-        if runs[a, 2] < runs[b, 3] + beside and runs[b, 2] < runs[a, 3] + beside:
+        if runs[a, 2] < runs[b, 3] + diagonal and runs[b, 2] < runs[a, 3] + diagonal:
             p, q = _root(root, a), _root(root, b)
             root[max(p, q)] = min(p, q)
         if runs[a, 3] < runs[b, 3]:

@@ -61,7 +61,7 @@ def parse_space(text: str, *, where: str) -> Space:
     for space in Space:
         if text.strip().lower() == space.lower():
             return space
-    raise InputError(f"unknown space {text!r}", where=where, allowed=", ".join(Space))
+    raise InputError(f"unknown space {text!r}", where=where, allowed=", ".join(Space), code="unknown_space")
 
 
 class Unit(StrEnum):
@@ -85,4 +85,4 @@ def parse_unit(text: str, *, where: str) -> Unit:
     """
     if text.strip() in tuple(Unit):
         return Unit(text.strip())
-    raise InputError(f"unknown unit of length {text!r}", where=where, allowed=", ".join(Unit))
+    raise InputError(f"unknown unit of length {text!r}", where=where, allowed=", ".join(Unit), code="unknown_unit")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import counts_of
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.dicom.recognise import list_folder
 from puncture_twin.planning.formats.dicom.storage import Kind
 from puncture_twin.planning.formats.folder import (
@@ -258,10 +258,8 @@ class _Looker:
             yield
         except InputError as error:
             way = f"; or --ignore {name}, so that what it shows counts as free" if name else ""
-            code, numbers = error.code, error.numbers
-            self._found.problems.append(
-                type(error)(error.what, where=error.where, allowed=error.allowed + way, code=code, numbers=numbers)
-            )
+            error.allowed += way
+            self._found.problems.append(error)
 
     def _volumes(self, names: Sequence[str]) -> None:
         """CTs and label maps one by one; masks together, as a folder of masks where it holds nothing else."""
@@ -321,7 +319,7 @@ class _Looker:
         low, high = float(volume.values.min()), float(volume.values.max())
         if low >= -1 and high <= 1 and self._wanted.takes("labels", name):
             what = f"values from {low:.3g} to {high:.3g} are neither a mask nor a CT"
-            raise InputError(what, where=self._place.folder / name, allowed="0 and one other whole number in a mask")
+            refuse(what, self._place.folder / name, "0 and one other whole number in a mask", "not_a_mask")
 
     def _label_file(self, name: str, surfaces: VolumeSurfaces) -> None:
         self._found.segmentations.append(label_file(self._place, name, surfaces, self._wanted.naming))

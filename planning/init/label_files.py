@@ -24,7 +24,7 @@ from puncture_twin.planning.anatomy.default_roles import default_role
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.tables import StructuresSection
@@ -195,11 +195,8 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
     missing = [label for label in present if label not in named]
     if missing:
         shown = ", ".join(map(str, missing[:10]))
-        raise InputError(
-            f"labels without a name: {shown}",
-            where=place.folder / source,
-            allowed="--naming with a name for each label",
-        )
+        allowed = "--naming with a name for each label"
+        refuse(f"labels without a name: {shown}", place.folder / source, allowed, "labels_without_names")
     return LabelFile(source, naming, {label: named[label] for label in present}, notes, surfaces)
 
 
@@ -211,12 +208,8 @@ def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence
     if naming is None:
         passed = f"no table beside it names all of its labels: {first_few(others)}"
         tables = passed if others else "no table of names is beside it"
-        raise InputError(
-            NUMBERING_UNSURE.format(tables=tables),
-            where=place.folder / source,
-            allowed=f"--naming with {', '.join(BUILT_IN)} or a table (CSV, JSON) that names every label",
-            code="labels_without_names",
-        )
+        allowed = f"--naming with {', '.join(BUILT_IN)} or a table (CSV, JSON) that names every label"
+        refuse(NUMBERING_UNSURE.format(tables=tables), place.folder / source, allowed, "labels_without_names")
     return naming, (NUMBERING_FOUND.format(source=source, naming=naming), *(f"{source}: {one}" for one in others))
 
 
@@ -241,7 +234,7 @@ def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool
     if own not in (None, told) and not _is_named_like(table[0], source):
         what = f"is '{name}' by its own name, and '{table[1][label]}' by {table[0]}"
         allowed = "--naming with that table where it is right; else the table in another folder"
-        raise InputError(what, where=place.folder / source, allowed=allowed, code="label_named_twice")
+        refuse(what, place.folder / source, allowed, "label_named_twice")
     return True
 
 
@@ -271,7 +264,7 @@ def _one_table(
         return (found[0] if found else None), others
     if any([other[label] for label in present] != [found[0][1][label] for label in present] for _, other in found[1:]):
         what = f"several tables name its labels in other ways: {', '.join(table for table, _ in found)}"
-        raise InputError(what, where=place.folder / source, allowed="--naming with the table that is right")
+        refuse(what, place.folder / source, "--naming with the table that is right", "several_namings")
     return found[0], others
 
 
@@ -341,7 +334,7 @@ class FileMasks:
             InputError: Always.
         """
         what = f"'{self.names[label]}' cannot be the skin, as one of the overlapping structures of a file"
-        raise InputError(what, where=self.source, allowed="a CT, a mesh, or a label of a label map", code="no_skin")
+        refuse(what, self.source, "a CT, a mesh, or a label of a label map", "no_skin")
 
     def section(self, rows: Sequence[Assigned]) -> str:
         """A ``[[structures]]`` of the file."""

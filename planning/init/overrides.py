@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case_file import CaseFile
 
@@ -68,7 +68,7 @@ class Overrides:
         for name, kind in (*self.roles.items(), *((one, "skin") for one in (self.skin,) if one is not None)):
             if name not in structures and not (kind == "ignore" and name in left_out):
                 what = f"no structure is named '{name}'{did_you_mean(name, structures)}"
-                raise InputError(what, where=f"--{kind}", allowed=", ".join(sorted(structures)), code="no_such_name")
+                refuse(what, f"--{kind}", ", ".join(sorted(structures)), "unknown_structure")
 
 
 def overrides_of(skin: str | None, ignore: Iterable[str], unknown: Iterable[str], settings: Iterable[str]) -> Overrides:
@@ -81,17 +81,16 @@ def overrides_of(skin: str | None, ignore: Iterable[str], unknown: Iterable[str]
     for text in settings:
         key, sign, value = (part.strip() for part in text.partition("="))
         if not sign or not re.fullmatch(r"[A-Za-z_]+(\.[A-Za-z_]+)*", key):
-            raise InputError(f"'{text[:80]}'", where="--set", allowed="KEY=VALUE, such as ct.arms=none", code="no_key")
+            refuse(f"'{text[:80]}'", "--set", "KEY=VALUE, such as ct.arms=none", "unknown_key")
         table = key.partition(".")[0]
         tables = {one.alias or name for name, one in CaseFile.model_fields.items()} - LISTS
         if key in OWN_OPTION or (table not in tables and key != f"{SKIN}.cut"):
             allowed = OWN_OPTION.get(key, "a key of the case's tables (docs/reference/case.md), such as ct.arms=none")
-            raise InputError(f"key '{key}'", where="--set", allowed=allowed, code="no_key")
+            refuse(f"key '{key}'", "--set", allowed, "unknown_key")
         keys[key] = value if _is_toml(value) else json.dumps(value)
     roles = dict.fromkeys(ignore, "ignore")
     if both := sorted(set(unknown) & set(roles)):
-        what = f"'{both[0]}' is to be ignored too"
-        raise InputError(what, where="--unknown", allowed="one of the two", code="two_roles")
+        refuse(f"'{both[0]}' is to be ignored too", "--unknown", "one of the two", "two_roles")
     return Overrides(skin, roles | dict.fromkeys(unknown, "unknown"), keys)
 
 

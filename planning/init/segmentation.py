@@ -20,7 +20,7 @@ from puncture_twin.planning.anatomy.skin import Skin, flat_ends, skin_from_mesh
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.named_files import CaseVolumes
@@ -277,16 +277,16 @@ def mesh_folder(
         InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
     """
     if len({mesh_name(one) for one in names}) < len(names):
-        raise InputError("two meshes have one name", where=place.folder / source, allowed="one mesh a structure")
+        refuse("two meshes have one name", place.folder / source, "one mesh a structure", "duplicate_name")
     if up is None and any(name.lower().endswith(".glb") for name in names):
         what = f"GLB: {UP_NOT_STATED} (--up y turns them to z up, --up z keeps them)"
-        raise InputError(what, where=place.folder / source, allowed="--up y or --up z", code="up_not_stated")
+        refuse(what, place.folder / source, "--up y or --up z", "up_not_stated")
     extents = [mesh_extent(place.folder / name) for name in names]
     boxes = np.stack([one.box for one in extents])
     diagonal = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
     if stated is None and BOTH_MM_AND_CM[0] <= diagonal < BOTH_MM_AND_CM[1]:
         what = f"{diagonal:.0f} units from corner to corner: a small body in mm, or a large one in cm"
-        raise InputError(what, where=place.folder / source, allowed="--unit mm or --unit cm")
+        refuse(what, place.folder / source, "--unit mm or --unit cm", "unit_not_stated")
     unit = stated or next(one for one, least in LEAST_EXTENT if diagonal >= least)
     guess = "as stated" if stated else "guessed by their extent (--unit says otherwise)"
     said = (

@@ -13,7 +13,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.errors import InputError, InputListError
+from puncture_twin.planning.base.errors import InputListError, refuse
 from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.evidence.target import readings_inside
@@ -265,7 +265,7 @@ def _refuse_outside(point: Floats, ct: Ct, skin: Skin, space: Space) -> None:
         place = "the body in" if _contains(grid, point) else "the CT"
         hint = readings_inside(point, space, in_body)
         what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
-        raise InputError(what, where="--target", allowed=OUTSIDE_WAYS)
+        refuse(what, "--target", OUTSIDE_WAYS, "target_outside_body")
 
 
 def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:

@@ -10,10 +10,10 @@ import scipy
 
 from puncture_twin.planning.anatomy.default_roles import BODY, NOT_ANNOTATED, DefaultRole, default_role, never_crossed
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.evidence.target import Likely, likely_target
-from puncture_twin.planning.formats.points import parse_coordinate
+from puncture_twin.planning.formats.points import parse_triple
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -54,10 +54,7 @@ def parse_point(text: str, space: Space) -> Floats:
     Raises:
         InputError: Not three numbers.
     """
-    numbers = [parse_coordinate(part.strip(), "--target") for part in text.split(",")]
-    if len(numbers) != 3:
-        raise InputError(f"{len(numbers)} numbers", where="--target", allowed="X,Y,Z in mm")
-    return np.asarray(to_lps(np.array([numbers]), space)[0])
+    return np.asarray(to_lps(np.array([parse_triple(text, "--target")]), space)[0])
 
 
 def typed_target(
@@ -97,23 +94,20 @@ def _refuse_likelier(point_ct: Floats, outlines: Outlines, space: Space, names: 
     """A point that is a likelier target in the other space, where nobody said in which it was typed."""
     if other := _other_reading(point_ct, outlines, space, names):
         place = f"in '{chosen_target(names)}'" if names else "in no structure"
-        raise InputError(
-            f"target ({point_text(point_ct, space)}) lies {place}{other}",
-            where="--target",
-            allowed="--space LPS or --space RAS, whichever is meant",
-        )
+        what = f"target ({point_text(point_ct, space)}) lies {place}{other}"
+        refuse(what, "--target", "--space LPS or --space RAS, whichever is meant", "target_in_other_space")
 
 
 def _refuse_lesion_elsewhere(point_ct: Floats, outlines: Outlines, space: Space) -> None:
     """A point in no structure is a slip, whatever space was stated, where the other space puts it into a lesion."""
     holders = _other_holders(point_ct, outlines)
     if space is not Space.LOCAL and likely_target(holders) is Likely.LESION:
-        raise InputError(
+        what = (
             f"target ({point_text(point_ct, space)}) lies in no structure"
-            f"{_other_reading(point_ct, outlines, space, ())}",
-            where="--target",
-            allowed="the other --space; or --hit-radius MM, where a target in no structure is meant",
+            f"{_other_reading(point_ct, outlines, space, ())}"
         )
+        allowed = "the other --space; or --hit-radius MM, where a target in no structure is meant"
+        refuse(what, "--target", allowed, "target_in_no_structure")
 
 
 def _own_target(point_ct: Floats, outlines: Outlines, holders: Sequence[str], radius_mm: float) -> Target:
@@ -128,7 +122,7 @@ def _refuse_in_danger(point_ct: Floats, chosen: str, space: Space, other: str) -
     if line is not None:
         what = f"target ({point_text(point_ct, space)}) lies in '{chosen}'{other}: {_danger(line)}"
         allowed = f"a point outside of it, or --target-label '{chosen}' where it is itself the target"
-        raise InputError(what, where="--target", allowed=allowed)
+        refuse(what, "--target", allowed, "target_in_danger")
 
 
 def _danger(line: DefaultRole) -> str:
@@ -145,7 +139,7 @@ def label_target(name: str, outlines: Outlines, space: Space) -> Target:
     known = {one: (seg, label) for seg in segmentations for label, one in seg.names.items()}
     if name not in known:
         what = f"no structure is named '{name}'{did_you_mean(name, known)}"
-        raise InputError(what, where="--target-label", allowed=", ".join(sorted(known)) or "none is there")
+        refuse(what, "--target-label", ", ".join(sorted(known)) or "none is there", "unknown_structure")
     segmentation, label = known[name]
     point, parts = deepest_point(segmentation.surface(label))
     notes = [f"the target is the deepest point of '{name}': {point_text(point, space)}"]

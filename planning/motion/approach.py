@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker, halving_order
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
@@ -37,7 +37,7 @@ from puncture_twin.planning.motion.shortest import (
 from puncture_twin.planning.motion.trajectory import Trajectory
 
 ATTEMPTS = 6
-"""Ways that the finer check may refuse; for FCL alone each next one is planned at half the resolution."""
+"""Paths that the finer check may refuse; for FCL alone each next one is planned at half the resolution."""
 
 CUT_FRACTION = 0.5
 """A corner is rounded from the middle of its shorter segment on: the farther, the faster."""
@@ -46,7 +46,7 @@ HALVINGS = 5
 """Halvings of a rounding that is not free; then the arm stops at the corner."""
 
 CURVE_PIECES = 8
-"""Straight pieces that stand for a rounding when it is chosen; the finished trajectory is checked sample by sample."""
+"""Straight pieces as which a rounding is checked when it is chosen; the finished trajectory is checked at samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ def plan_approach(
     max_samples: int = MAX_SAMPLES,
     speeds: SpeedLimits = DEFAULT_SPEEDS,
 ) -> Approach:
-    """Plan from home to the goal that the shortest path found leads to.
+    """Plan the shortest path that is found from home to any of the goals, and its motion in time.
 
     Args:
         checker: Checks contacts.
@@ -98,8 +98,7 @@ def plan_approach(
 
     Raises:
         InputError: If home or a goal is not six finite angles within the limits, or the scale makes no sense.
-        NoAnswerError: If home or every goal is in collision, or no path was found; says what touches what, and what was
-            in the way.
+        NoAnswerError: If home or every goal is in collision, or no path was found; it names the contacts that blocked.
     """
     home = _within_limits(checker, q_home, "home")[0]
     goals = _within_limits(checker, q_goals, "goal")
@@ -108,29 +107,29 @@ def plan_approach(
     for attempt in range(ATTEMPTS):
         contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
         path = _path(ends, contact_of, seed + RUNS * attempt, max_samples)
-        if isinstance(path, Connected):
-            raise NoAnswerError(_why_none(path, ends, seed) + refused)
+        if isinstance(path, Connected):  # two trees that were not joined
+            raise NoAnswerError(_why_none(path, ends, seed) + refused, code="no_approach")
         cuts = _cuts(contact_of, path.waypoints)
-        for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):
+        for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):  # rounded, else with stops at corners
             trajectory = _timed(checker, path.waypoints, rounding, speeds)
             checked = dense_states(checker, trajectory.q, RESOLUTION_RAD / FINER)
-            contact = first_contact(checker, checked)
+            contact = first_contact(checker, checked)  # FCL's, along the finished motion
             if contact is None:
                 return Approach(path.waypoints, rounding, trajectory, path.goal_index, checked, seed, attempt + 1)
         assert contact is not None
         refused = f"; before that, on a closer look {contact.body} touched {contact.other} on the way"
-    raise NoAnswerError(f"approach unknown: {ATTEMPTS} paths were refused (seed {seed}){refused}")
+    raise NoAnswerError(f"approach unknown: {ATTEMPTS} paths were refused (seed {seed}){refused}", code="no_approach")
 
 
 class _Ends:
-    """Home and goals; which goals are free or cut off is found when first needed."""
+    """Home and goals of an approach; which goals are free or cut off from home is computed when first needed."""
 
     def __init__(self, checker: StateChecker, home: Floats, goals: Floats) -> None:
         self.checker, self.home, self.goals = checker, home, goals
 
     @cached_property
     def open_goals(self) -> NDArray[np.int64]:
-        """Which goals are free."""
+        """Rows of the goals that are free of contact."""
         return _free_goals(self.checker, self.goals)
 
     @cached_property
@@ -143,12 +142,12 @@ class _Ends:
 
 
 def _path(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> Path | Connected:
-    """The direct path, else what a search finds."""
+    """The direct path from home to a goal where it is free, else the shortest of a search."""
     return direct_path(contact_of, ends.home, ends.goals) or _searched(ends, contact_of, seed, max_samples)
 
 
 def _searched(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> Path | Connected:
-    """The shortest path that a search finds, its goal counted among all of them."""
+    """The shortest path that a search to the free goals finds; its ``goal_index`` is a row of all goals."""
     limits, clear_of = ends.checker.model.joint_limits, _shortcut_check(ends.checker)
     task = Task(limits, contact_of, ends.home, ends.goals[ends.open_goals], ends.cut, clear_of)
     path = shortest_path(task, seed=seed, max_samples=max_samples)
@@ -156,7 +155,7 @@ def _searched(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: i
 
 
 def _timed(checker: StateChecker, waypoints: Floats, cuts: Floats, speeds: SpeedLimits) -> Trajectory:
-    """The motion in time, as fast as the limits allow."""
+    """Time the motion along waypoints, as fast as the limits allow."""
     tip = TipLimit(checker.tool.needle_length_mm, speeds.tip_speed_mm_s)
     return follow(slowed(checker.model, speeds), waypoints, cuts, tip=tip)
 
@@ -204,7 +203,7 @@ def _within_limits(checker: StateChecker, q: Floats, name: str) -> Floats:
     rows = np.atleast_2d(np.asarray(q, dtype=np.float64))
     if rows.ndim != 2 or rows.shape[1] != 6 or not checker.model.within_limits(rows).all() or len(rows) == 0:
         limits = np.round(np.degrees(checker.model.joint_limits[:, 1])).astype(int).tolist()
-        raise InputError(f"{name} = {rows.round(4).tolist()}", where="approach", allowed=f"six angles, +-{limits} deg")
+        refuse(f"{name} = {rows.round(4).tolist()}", "approach", f"six angles, +-{limits} deg", "joint_beyond_limits")
     return rows
 
 
@@ -212,20 +211,20 @@ def _require_free(checker: StateChecker, home: Floats) -> None:
     """Refuse a home in collision: no segment's check looks at where it begins."""
     contact = checker.contact(home, needle_may_touch_patient=False)
     if contact is not None:
-        raise NoAnswerError(f"home is in collision: {contact.body} touches {contact.other}")
+        raise NoAnswerError(f"home is in collision: {contact.body} touches {contact.other}", code="home_in_collision")
 
 
 def _free_goals(checker: StateChecker, goals: Floats) -> NDArray[np.int64]:
-    """Which goals are free."""
+    """Rows of the goals that are free of contact; an error where none is."""
     contacts = checker.contacts(goals, needle_may_touch_patient=False)
     if all(contacts):
         named = sorted({f"{contact.body} touches {contact.other}" for contact in contacts if contact})
-        raise NoAnswerError(f"every goal is in collision: {', '.join(named)}")
+        raise NoAnswerError(f"every goal is in collision: {', '.join(named)}", code="goals_in_collision")
     return np.array([row for row, contact in enumerate(contacts) if contact is None], dtype=np.int64)
 
 
 def _why_none(found: Connected, ends: _Ends, seed: int) -> str:
-    """Why there is no path, where that is proven; else how far the search came, and what blocked it."""
+    """Sentence on why there is no path: a proof, else what the search reached and what blocked it."""
     cut, n_goals, n_free = ends.cut, len(ends.goals), len(ends.open_goals)
     busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
     n_off = 0 if cut is None else int(cut.off.sum())

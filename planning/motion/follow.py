@@ -23,7 +23,7 @@ from ruckig import InputParameter, Result, Ruckig, Trajectory as Profile
 from puncture_twin.planning.arm.kinematics import TipLimit, tip_rates
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 
 MAX_JERK = 14.0
@@ -143,7 +143,7 @@ def follow(
     """
     waypoints = _checked_rows(waypoints)
     if not 0.0 < speed_scale <= 1.0:
-        raise InputError(f"speed_scale = {speed_scale}", where="trajectory", allowed="above 0, at most 1")
+        refuse(f"speed_scale = {speed_scale}", "trajectory", "above 0, at most 1", "out_of_range")
     cuts = np.zeros(max(0, len(waypoints) - 2)) if cuts is None else np.asarray(cuts, dtype=np.float64)  # one a corner
     if not cuts.any():  # every waypoint is a stop: those without motion between go
         waypoints = waypoints[np.append(True, np.abs(np.diff(waypoints, axis=0)).max(axis=1) > STANDSTILL_RAD)]
@@ -160,8 +160,8 @@ def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
     fits = cuts.shape == (len(lengths) - 1,) and bool((cuts >= 0.0).all() and (lengths > 0.0).all())
     straight = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts) if fits else lengths
     if not (fits and (straight >= -STANDSTILL_RAD).all()):
-        allowed = "one a corner, two of them no longer than the segment between"
-        raise InputError(f"cuts {cuts.tolist()} of {len(lengths)} segments", where="trajectory", allowed=allowed)
+        what = f"cuts {cuts.tolist()} of {len(lengths)} segments"
+        refuse(what, "trajectory", "one a corner, two of them no longer than the segment between", "wrong_count")
     return np.asarray(straight.clip(0.0))  # two cuts may use a segment up, but for rounding
 
 
@@ -225,7 +225,7 @@ def _corner_speeds(round_speeds: list[float], straight: Floats, rates: list[Rate
 
 
 def _sampled(waypoints: Floats, runs: Iterable[list[_Stretch]]) -> Trajectory:
-    """All runs one after the other, each slowed down by less than one sample, so that it ends on one."""
+    """All runs sampled one after the other, each slowed by less than one sample so that it ends on one."""
     rows, count = [waypoints[:1]], 0
     for run in runs:
         ends = np.cumsum([stretch.duration_s for stretch in run])
@@ -273,9 +273,9 @@ def follow_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_spe
     """
     q, depths = _checked_rows(q), np.asarray(depths_mm, dtype=np.float64)
     if len(q) < 2 or depths.shape != (len(q),) or not (np.diff(depths) > 0.0).all():
-        raise InputError("depths do not rise row by row", where="trajectory", allowed="one rising depth a row")
+        refuse("depths do not rise row by row", "trajectory", "one rising depth a row", "not_rising")
     if not (math.isfinite(max_tip_speed_mm_s) and max_tip_speed_mm_s > 0.0):
-        raise InputError(f"max_tip_speed_mm_s = {max_tip_speed_mm_s}", where="trajectory", allowed="above 0")
+        refuse(f"max_tip_speed_mm_s = {max_tip_speed_mm_s}", "trajectory", "above 0", "not_positive")
     spline = scipy.interpolate.CubicSpline(depths, q)
     law = time_law(float(depths[-1] - depths[0]), _tip_rates(model, spline, max_tip_speed_mm_s))
     steps = _steps(law.duration_s)
@@ -290,7 +290,7 @@ def _tip_rates(model: UrModel, spline: scipy.interpolate.CubicSpline, max_tip_sp
     slope = np.abs(spline(dense, 1)).max(axis=0)
     bend, twist = (float(np.abs(spline(depths, order)).max()) for order in (2, 3))  # linear and constant between rows
     if not slope.any():
-        raise InputError("no joint moves", where="trajectory", allowed="a motion")
+        refuse("no joint moves", "trajectory", "a motion", "no_motion")
     speed = min(max_tip_speed_mm_s, float((model.max_speeds / np.maximum(slope, TINY)).min()))
     speed = min(speed, math.sqrt(model.max_acceleration / 2.0 / max(bend, TINY)))  # half the limit to q2 v^2
     speed = min(speed, (MAX_JERK / 3.0 / max(twist, TINY)) ** (1.0 / 3.0))  # a third to q3 v^3
@@ -302,7 +302,7 @@ def _tip_rates(model: UrModel, spline: scipy.interpolate.CubicSpline, max_tip_sp
 def _checked_rows(q: Floats) -> Floats:
     rows = np.asarray(q, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[0] == 0 or rows.shape[1] != 6 or not np.isfinite(rows).all():
-        raise InputError(f"joint rows of shape {rows.shape}", where="trajectory", allowed="(k, 6), finite")
+        refuse(f"joint rows of shape {rows.shape}", "trajectory", "(k, 6), finite", "wrong_shape")
     return rows
 
 
@@ -359,7 +359,7 @@ def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: f
         length: Above 0.
         rates: The limits.
         start_speed: At most the speed limit.
-        end_speed: The same, and reachable (:func:`reachable_speed`).
+        end_speed: Speed at the end, reachable (:func:`reachable_speed`).
 
     Raises:
         InputError: If ruckig finds no such motion.
@@ -371,7 +371,7 @@ def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: f
     profile = Profile(1)
     if Ruckig(1).calculate(task, profile) not in (Result.Working, Result.Finished):
         what = f"no motion over {length:.6g} from speed {start_speed:.6g} to {end_speed:.6g}"
-        raise InputError(what, where="trajectory", allowed=f"within {rates}")
+        refuse(what, "trajectory", f"within {rates}", "no_time_law")
     return TimeLaw(length, profile.duration, profile)
 
 

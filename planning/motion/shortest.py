@@ -207,7 +207,6 @@ class Cut:
 
     @cached_property
     def _edges(self) -> list[Floats]:
-        """Edges of the cells, by joint."""
         limits = self._model.joint_limits[:2]
         return [np.linspace(low, high, int(np.ceil((high - low) / CELL_RAD)) + 1) for low, high in limits]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 
 SAMPLE_S = 0.008
 """Spacing of the samples: the 125 Hz at which a UR3 takes joint targets."""
@@ -43,11 +43,11 @@ class Trajectory:
     def __post_init__(self) -> None:
         times, q = np.array(self.times_s, dtype=np.float64), np.array(self.q, dtype=np.float64)
         if times.ndim != 1 or q.shape != (len(times), 6) or len(times) == 0:
-            raise InputError(f"shapes {times.shape} and {q.shape}", where="trajectory", allowed="(m,) and (m, 6)")
+            refuse(f"shapes {times.shape} and {q.shape}", "trajectory", "(m,) and (m, 6)", "wrong_shape")
         if not (np.isfinite(times).all() and np.isfinite(q).all()):
-            raise InputError("a time or an angle is not finite", where="trajectory", allowed="finite numbers")
+            refuse("a time or an angle is not finite", "trajectory", "finite numbers", "not_finite")
         if times[0] != 0.0 or (np.diff(times) <= 0.0).any():
-            raise InputError("times do not rise from 0", where="trajectory", allowed="0, then strictly rising")
+            refuse("times do not rise from 0", "trajectory", "0, then strictly rising", "times_not_rising")
         for name, array in (("times_s", times), ("q", q)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)

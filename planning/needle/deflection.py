@@ -362,11 +362,6 @@ class Shaft:
         return self.modulus_gpa * 1e3 * np.pi * (self.outer_mm**4 - self.inner_mm**4) / 64
 
     @property
-    def tip_stiffness_n_mm(self) -> float:
-        """Lateral force at the free tip over its deflection: 3 EI / L^3."""
-        return 3 * self.bending_stiffness / self.length_mm**3
-
-    @property
     def sag_mm(self) -> float:
         """Sag of the free tip of a horizontal steel shaft, mm: q L^4 / 8 EI, q its weight by length."""
         weight = STEEL_N_MM3 * np.pi * (self.outer_mm**2 - self.inner_mm**2) / 4

@@ -27,7 +27,7 @@ ROUNDING_MM = 1e-9
 
 
 class Push(NamedTuple):
-    """A capsule that is pushed in, from one depth to its rupture at another, with a force there."""
+    """A capsule that is pushed in from one depth, and ruptures at another at a force."""
 
     start_mm: float
     end_mm: float
@@ -61,11 +61,6 @@ class InsertionForce:
     def peak_n(self) -> float:
         """The greatest force, N."""
         return float(self.total_n.max(initial=0.0))
-
-    @property
-    def work_n_mm(self) -> float:
-        """Work of the arm, N mm: the force integrated over the samples."""
-        return float(np.trapezoid(self.total_n, self.depth_mm))
 
 
 def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> InsertionForce:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.case.tables import MountBounds, MountName, MountSection
@@ -34,7 +34,7 @@ ABOVE_MM = 200.0
 """A floor mount may stand so much higher than the target, a ceiling or side mount so much lower, by default."""
 
 RAIL_MM = 100.0
-"""A base at the rail stands at most so much higher or lower than the table's top, by default."""
+"""Height of a base at the rail above or below the table's top, at most, by default."""
 
 ROUNDS_MM = 50.0
 """Default bounds are multiples of this."""
@@ -48,7 +48,7 @@ FACINGS: Mapping[str, tuple[int, int, int]] = MappingProxyType(
 """A side mount's base axis, toward the target, in the bed frame."""
 
 POSITION_DIGITS = 1
-"""Positions are written to 0.1 mm: nobody stands a base more exactly."""
+"""Decimals of positions, 0.1 mm: no base is set up more exactly."""
 
 AXIS_DIGITS = 6
 """Axes are written to six digits: 1e-3 mm at a metre."""
@@ -129,11 +129,8 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
     table = next((o for o in case.obstacles if o.name == settings.table and o.frame == "ct"), None)
     mounts = settings.mounts or ("floor", "rail", "ceiling", "side")
     if table is None and settings.mounts is not None and "rail" in mounts:
-        raise InputError(
-            f"place.mounts has a rail, and no obstacle '{settings.table}' of frame ct is the table",
-            where=case.path,
-            allowed="an [[obstacle]] of that name, or place.table",
-        )
+        what = f"place.mounts has a rail, and no obstacle '{settings.table}' of frame ct is the table"
+        refuse(what, case.path, "an [[obstacle]] of that name, or place.table", "no_table")
     reach = default_reach_mm(model, case.needle.length_mm)
     found: list[Region] = []
     for mount in mounts:
@@ -238,7 +235,7 @@ class WantedDirections:
         return WantedDirections(self.outward_ct[rows], self.standoff_mm[rows], self.weight[rows])
 
     def spread(self, count: int) -> WantedDirections:
-        """At most ``count`` of them, each as far as can be from those before, with the weight of all nearest to it."""
+        """At most ``count`` directions, each as far as can be from those before, weighted by all nearest to it."""
         if count >= len(self):
             return self
         chosen = [int(np.argmax(self.weight))]

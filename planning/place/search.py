@@ -80,7 +80,7 @@ SEEDS = 10
 """Sites that are refined; each mount's best is among them."""
 
 HALVINGS = 3
-"""The step is halved so often: 150 mm to 19 mm, about what a base is stood to."""
+"""How often the step is halved: from 150 mm to 19 mm, about as exactly as a base is set up."""
 
 FINALISTS = 6
 """Sites that are checked exactly; each mount's best is among them."""
@@ -97,10 +97,10 @@ class RatedPlacement:
     """A placement, checked and rated.
 
     Attributes:
-        site: Where the base stands; None for where the case itself has it.
+        site: Position of the base; None for the case's own placement.
         mount: The base's pose as a case states it.
-        estimate: What it was chosen by; None for the case's own.
-        verdict: The exact answer.
+        estimate: The estimate that it was chosen by; None for the case's own.
+        verdict: The result of the exact check.
         expected_mm: Expected (rms) error of the tip over its insertions, the markers touched anew from there; None
             where the case declares no errors, or has no markers.
     """
@@ -124,8 +124,8 @@ class PlaceSearch:
     Attributes:
         T_ct_bed: Shape (4, 4), mm: the frame of the sites.
         coarse: Every site of the first lattice with its estimate.
-        refined: How many more were estimated.
-        possible: Fraction of directions, 0..1, in which the needle itself may stand at standoff; none can hold more.
+        refined: How many more sites were estimated.
+        possible: Fraction of directions, 0..1, in which the needle may wait at its standoff: no placement reaches more.
         rated: Best first; the case's own placement is not among them.
         own: The case's own placement, checked; None where it has none.
     """
@@ -147,7 +147,7 @@ def search_placements(
     jobs: int = 1,
     progress: Progress = lambda stage, done, total: None,
 ) -> PlaceSearch:
-    """Look for the placements from which the arm can reach most of the organ-safe directions.
+    """Search for the placements from which the arm can reach most of the organ-safe directions.
 
     The answer does not depend on ``jobs``.
 
@@ -164,7 +164,9 @@ def search_placements(
         NoAnswerError: No direction is safe for the organs, or in none the needle could start.
     """
     if not candidates.safe.any():
-        raise NoAnswerError("no direction is safe for the organs, so no placement can help", counts=candidates.counts())
+        what = "no direction is safe for the organs, so no placement can help"
+        raise NoAnswerError(what, counts=candidates.counts(), code="no_safe_direction")
+    # 1. The workcell, and the directions in which the needle itself is clear at its standoff.
     T_ct_bed = bed_frame(case)
     check = _placement_check(case, anatomy, candidates)
     CellChecker(check.model, check.tool)  # refuses shapes that hang on nothing before minutes are spent
@@ -176,7 +178,9 @@ def search_placements(
         needle_can_start(check.tool, check.patient, case.target_ct, check.wanted, ARM_PADDING_MM)
     )
     if not len(startable):
-        raise NoAnswerError("in every organ-safe direction the needle would start too near the skin")
+        what = "in every organ-safe direction the needle would start too near the skin"
+        raise NoAnswerError(what, code="standoff_in_skin")
+    # 2. All sites of a lattice, by bounding spheres (an estimate).
     coarse = Estimator(
         check.model, check.tool, surroundings, T_ct_bed, startable.spread(COARSE_DIRECTIONS), itself=False
     )
@@ -188,6 +192,7 @@ def search_placements(
     ]
     estimates = map_all(coarse.estimate, sites, jobs=jobs, progress=partial(progress, "placements estimated"))
     first = tuple(zip(sites, estimates, strict=True))
+    # 3. The best of them refined, by ever shorter steps; 4. the best of those checked exactly.
     seeds = [site for site, _ in _best_apart(first, 1.5 * case.place.step_mm, SEEDS)]
     refiner = _Refiner(fine, partial(progress, "placements refined"))
     finalists = _best_apart(refiner.refine(seeds, case.place.step_mm), case.place.step_mm / 2, FINALISTS)
@@ -204,7 +209,7 @@ def _checked(
     jobs: int,
     progress: Count,
 ) -> tuple[tuple[RatedPlacement, ...], RatedPlacement | None]:
-    """The finalists as they would be written, best first, and the case's own placement."""
+    """The finalists checked exactly, best first, and the case's own placement, which is checked too."""
     mounts = [mount_section(T_ct_bed @ site.T_bed_base(), case.space) for site, _ in finalists]
     poses = [mount_pose(mount, case.space, case.path) for mount in mounts]
     if placement is not None:  # first: nobody chose it, and the directions that are not reached take longest
@@ -217,8 +222,8 @@ def _checked(
         expected = expected_tip_error_mm(case, placement, pose, verdict.q_insertion)
         own = RatedPlacement(None, mount_section(T_ct_base, case.space), None, verdict, expected)
     rated = [
-        RatedPlacement(site, mount, hoped, verdict, expected_tip_error_mm(case, placement, pose, verdict.q_insertion))
-        for (site, hoped), mount, pose, verdict in zip(finalists, mounts, poses, verdicts, strict=True)
+        RatedPlacement(site, mount, guess, verdict, expected_tip_error_mm(case, placement, pose, verdict.q_insertion))
+        for (site, guess), mount, pose, verdict in zip(finalists, mounts, poses, verdicts, strict=True)
     ]
     return tuple(sorted(rated, key=_worth)), own
 
@@ -230,7 +235,7 @@ def _worth(one: RatedPlacement) -> tuple[float, float, float]:
 
 
 def _parted(anatomy: Anatomy) -> tuple[Anatomy, list[Box]]:
-    """The anatomy near the image, and boxes about what goes on beyond it for metres, CT frame."""
+    """The anatomy inside the image, and boxes, CT frame, about the body assumed beyond it, which is metres long."""
     view, solids = anatomy.skin.field_of_view, anatomy.surroundings
     T = np.eye(4) if view is None else view.T_ct_box
     parts = [part for one in solids if one.name == BEYOND_IMAGE for part in connected_parts(one.mesh)]
@@ -242,7 +247,7 @@ def _parted(anatomy: Anatomy) -> tuple[Anatomy, list[Box]]:
 
 
 def _placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> PlacementCheck:
-    """The case's workcell, patient-fixed and arm-fixed apart, and its directions."""
+    """The case's workcell, with what moves with the patient apart from what moves with the arm, and its directions."""
     carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
     boxes = case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
     return PlacementCheck(
@@ -260,39 +265,41 @@ def _placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> Pl
 
 
 class _Refiner:
-    """Walks from sites to better ones with ever shorter steps; estimates no site twice.
+    """Local search: from sites to better neighbours with ever shorter steps; no site is estimated twice.
 
-    Whether the arm touches itself takes longest and can only lower a fraction: that is computed for the leading
-    site alone, until the leading site is one for which it is known.
+    Whether the arm touches itself takes longest to compute, and can only lower a fraction. So it is computed for the
+    leading site alone, until the leading site is one for which it is known.
     """
 
     def __init__(self, estimator: Estimator, progress: Count) -> None:
         self._quick = replace(estimator, itself=False)
         self._full = replace(estimator, itself=True)
         self._progress = progress
-        self._hoped: dict[Site, ReachEstimate] = {}
-        self._sure: dict[Site, ReachEstimate] = {}
+        self._upper: dict[Site, ReachEstimate] = {}  # without contacts of the arm with itself
+        self._whole: dict[Site, ReachEstimate] = {}
 
     @property
     def estimated(self) -> int:
         """Number of estimated sites."""
-        return len(self._hoped)
+        return len(self._upper)
 
     def refine(self, seeds: Sequence[Site], step_mm: float) -> list[tuple[Site, ReachEstimate]]:
         """End of each seed's walk, with its estimate; each end once."""
         ends = list(seeds)
         for halving in range(1, HALVINGS + 1):
             ends = self._leaders([[end, *_neighbours(end, step_mm / 2**halving)] for end in ends])
-        return [(end, self._sure[end]) for end in dict.fromkeys(ends)]
+        return [(end, self._whole[end]) for end in dict.fromkeys(ends)]
 
     def _leaders(self, groups: Sequence[Sequence[Site]]) -> list[Site]:
         """The best site of each group."""
-        self._estimate(self._quick, self._hoped, [site for group in groups for site in group])
+        self._estimate(self._quick, self._upper, [site for group in groups for site in group])
         while True:
-            leaders = [max(group, key=lambda site: _score(self._sure.get(site, self._hoped[site]))) for group in groups]
-            if all(leader in self._sure for leader in leaders):
+            leaders = [
+                max(group, key=lambda site: _score(self._whole.get(site, self._upper[site]))) for group in groups
+            ]
+            if all(leader in self._whole for leader in leaders):
                 return leaders
-            self._estimate(self._full, self._sure, leaders)
+            self._estimate(self._full, self._whole, leaders)
 
     def _estimate(self, estimator: Estimator, known: dict[Site, ReachEstimate], sites: Sequence[Site]) -> None:
         new = [site for site in dict.fromkeys(sites) if site not in known]

@@ -136,7 +136,7 @@ def phase_clearances(plan: Plan, checker: StateChecker) -> dict[str, float]:
 
 
 def motion_contact(plan: Plan, checker: CellChecker) -> str | None:
-    """What a plan's motion touches, in words, or None: FCL at ten times the planner's resolution."""
+    """The contact of a plan's motion, in words, or None: by FCL at ten times the planner's resolution."""
     for phase, q, needle_free in (("approach", plan.approach.q, False), ("insertion", plan.insertion.q, True)):
         contact = _contact(checker, q, needle_free)
         if contact is not None:
@@ -145,7 +145,7 @@ def motion_contact(plan: Plan, checker: CellChecker) -> str | None:
 
 
 def _contact(checker: CellChecker, q_path: Floats, needle_free: bool) -> str | None:
-    """What touches what along a motion, checked as densely as when it was planned; None if nothing does."""
+    """The first contact along a motion, sampled as densely as when it was planned; None if there is none."""
     for q in dense_states(checker, q_path, RESOLUTION_RAD / FINER):
         contact = CellChecker.contact(checker, q, needle_may_touch_patient=needle_free)  # FCL alone, no bounds
         if contact is not None:

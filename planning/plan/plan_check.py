@@ -15,7 +15,7 @@ from puncture_twin.planning.arm.insertion import needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose, slowed, tip_speeds
 from puncture_twin.planning.arm.ur import UR_MODELS, UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.base.strict_json import array, number, text
 from puncture_twin.planning.case.case import Case
@@ -57,7 +57,7 @@ def rate_limits(model: UrModel) -> Peaks:
 
 
 def with_case_arm(plan: Plan, case: Case) -> Plan:
-    """A plan that was read, with its case's arm: a plan's file states the arm's numbers, and not its shapes."""
+    """A plan from a file with its case's arm: the file states the arm's numbers, but not its shapes."""
     return replace(plan, model=case.robot.model) if same_arm(plan.model, case.robot.model) else plan
 
 
@@ -69,7 +69,7 @@ def check_inputs(plan: Plan, case: Case, path: Path) -> None:
     """
     name = differing_input(plan.inputs, case.inputs)
     if name is not None:
-        raise InputError(f"input '{name}' is not the one that the plan was made from", where=path, allowed="plan again")
+        refuse(f"input '{name}' is not the one that the plan was made from", path, "plan again", "input_changed")
 
 
 def check_geometry(plan: Plan, path: Path) -> None:
@@ -79,7 +79,7 @@ def check_geometry(plan: Plan, path: Path) -> None:
         InputError: Says which end is off, and by how much.
     """
     if not np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=JOIN_TOLERANCE_RAD):
-        raise InputError("the insertion does not start where the approach ends", where=path, allowed="joined phases")
+        refuse("the insertion does not start where the approach ends", path, "joined phases", "phases_not_joined")
     _check_straight(plan, path)
     _check_speeds(plan, path)
     model = plan.model
@@ -93,10 +93,11 @@ def check_geometry(plan: Plan, path: Path) -> None:
         for what, point, wanted in (("tip", tip, pose.tip_ct), ("flange", T_base_flange[:3, 3], pose.top_ct)):
             error = float(np.linalg.norm(point - plan.T_base_ct[:3, :3] @ wanted - plan.T_base_ct[:3, 3]))
             if not error <= POSE_TOLERANCE_MM:
-                raise InputError(
+                refuse(
                     f"the {what} at {name} is {error:.3g} mm off the stored pose",
-                    where=path,
-                    allowed=f"at most {POSE_TOLERANCE_MM} mm: {AGREE}",
+                    path,
+                    f"at most {POSE_TOLERANCE_MM} mm: {AGREE}",
+                    "plan_contradicted",
                 )
 
 
@@ -108,16 +109,16 @@ def check_angles(plan: Plan, path: Path) -> None:
     """
     for name, angle, turn in (("theta_deg", plan.theta, np.pi), ("beta_deg", plan.beta, 2 * np.pi)):
         if not 0.0 <= angle <= turn * (1 + ANGLE_ROUNDING):
-            raise InputError(f"{name} = {np.degrees(angle):g}", where=path, allowed=f"0 to {np.degrees(turn):g}")
+            refuse(f"{name} = {np.degrees(angle):g}", path, f"0 to {np.degrees(turn):g}", "out_of_range")
     roll = roll_of(plan)
     off = abs((plan.roll - roll + np.pi) % (2 * np.pi) - np.pi)
     if off > ROLL_TOLERANCE_RAD or not 0.0 <= plan.roll < 2 * np.pi:
         what = f"roll_deg is {np.degrees(plan.roll):g}, the joint angles at standoff give {np.degrees(roll):.4g}"
-        raise InputError(what, where=path, allowed="plan again")
+        refuse(what, path, "plan again", "plan_contradicted")
 
 
 def roll_of(plan: Plan) -> float:
-    """About the needle, rad, 0 to 2 pi: what the joint angles at standoff give, whatever the plan states."""
+    """Rotation about the needle, rad, 0 to 2 pi, by the joints at standoff, whatever the plan states."""
     R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
     line = needle_lines((R @ plan.target_ct + t)[None], (R @ plan.outward_ct)[None])[0]
     x_axis = line.R_base_flange.T @ flange_pose(plan.model, plan.insertion.q[0])[:3, 0]
@@ -148,14 +149,14 @@ def _check_straight(plan: Plan, path: Path) -> None:
     ):
         if not amount <= STRAIGHT_TOLERANCE_MM:
             allowed = f"at most {STRAIGHT_TOLERANCE_MM} mm: {AGREE}"
-            raise InputError(f"the {what} by {amount:.3g} mm", where=f"{path}: insertion", allowed=allowed)
+            refuse(f"the {what} by {amount:.3g} mm", f"{path}: insertion", allowed, "not_straight")
 
 
 def _between(q: Floats, path: Path) -> Floats:
     """The rows of a joint path and points between them, no more than `BETWEEN_RAD` apart in any joint."""
     counts = np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) / BETWEEN_RAD).clip(min=1)
     if counts.sum() > MOST_STATES:
-        raise InputError("the insertion turns its joints over and over", where=path, allowed="a straight insertion")
+        refuse("the insertion turns its joints over and over", path, "a straight insertion", "not_straight")
     segment = np.repeat(np.arange(len(counts)), counts.astype(np.int64))
     starts = np.cumsum(counts) - counts
     fraction = (np.arange(len(segment)) - starts[segment]) / counts[segment]
@@ -172,17 +173,16 @@ def _check_speeds(plan: Plan, path: Path) -> None:
         speed = float(tip_speeds(model, part.q, part.times_s, plan.needle_length_mm).max(initial=0.0))
         if not speed <= limit * (1 + SPEED_ROUNDING):
             what = f"the {phase} drives the tip at {speed:.3g} mm/s"
-            raise InputError(what, where=path, allowed=f"at most {limit:g} mm/s; plan again")
+            refuse(what, path, f"at most {limit:g} mm/s; plan again", "tip_too_fast")
         if not model.within_limits(part.q).all():
-            raise InputError(
-                f"the {phase} leaves the joint limits", where=path, allowed="angles within the arm's limits"
-            )
+            what = f"the {phase} leaves the joint limits"
+            refuse(what, path, "angles within the arm's limits", "joint_beyond_limits")
         peaks, limits = part.peaks(), rate_limits(slowed(model, plan.speeds))
         for rate in ("speed", "acceleration"):  # a jerk wears the arm, and does not stop it
             most = float((getattr(peaks, rate) / getattr(limits, rate)).max())
             if not most <= 1 + SPEED_ROUNDING:
                 what = f"the {phase} has {most:.3g} times the {rate} that a joint may have"
-                raise InputError(what, where=path, allowed="the limits of the arm and of [robot]; plan again")
+                refuse(what, path, "the limits of the arm and of [robot]; plan again", "joint_too_fast")
 
 
 ARM_NAMES = (
@@ -193,7 +193,7 @@ ARM_NAMES = (
 
 
 def arm_document(model: UrModel) -> dict[str, Any] | None:
-    """The numbers of an arm; None for one of the table, whose name says them."""
+    """The numbers of an arm; None for one of the table, whose name gives them."""
     if UR_MODELS.get(model.name) == model:
         return None
     return {

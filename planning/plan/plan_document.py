@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import HIGHEST, SpeedLimits
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import inputs_document, read_inputs
@@ -34,7 +34,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import arm_document, check_geometry, rate_limits, read_arm
 
 PLAN_VERSION = 3
-"""Version of the file's layout. `arm` is absent for an arm of the table, whose name says its numbers."""
+"""Version of the file's layout. `arm` is absent for an arm of the table: its name gives its numbers."""
 
 PLAN_ALLOWED = f"a plan.json of version {PLAN_VERSION}; plan again"
 
@@ -111,10 +111,6 @@ def read_plan(path: Path) -> Plan:
 def parse_plan(data: bytes, path: Path) -> Plan:
     """Check that a plan's bytes are whole and agree with themselves.
 
-    Args:
-        data: The file's bytes.
-        path: The file, for errors.
-
     Raises:
         InputError: Not a plan, another version, missing keys, numbers that do not fit, or a pose that the stored
             joint angles do not reach.
@@ -137,11 +133,11 @@ def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
     )
     for name, said, known in stated:
         if not _same_rates(said, known):
-            raise InputError(f"the {name} are not those of its numbers", where=path, allowed="plan again")
+            refuse(f"the {name} are not those of its numbers", path, "plan again", "plan_contradicted")
     for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
         even = SAMPLE_S * np.arange(len(part.times_s))
         if not np.allclose(part.times_s, even, rtol=0, atol=SAME_TIME_S):
-            raise InputError(f"the times of the {phase} are not even", where=path, allowed=f"a row every {SAMPLE_S} s")
+            refuse(f"the times of the {phase} are not even", path, f"a row every {SAMPLE_S} s", "times_uneven")
 
 
 def _same_rates(said: Any, known: dict[str, list[float]]) -> bool:
@@ -154,7 +150,7 @@ def _same_rates(said: Any, known: dict[str, list[float]]) -> bool:
 
 
 def _check_names(document: dict[str, Any], path: Path) -> None:
-    """Refuse keys that no plan has: nothing says whether what they state is so."""
+    """Refuse keys that no plan has: nothing checks what they state."""
     for where, part, known in (
         ("", document, NAMES),
         ("approach.", document["approach"], PHASE_NAMES),
@@ -166,7 +162,7 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         optional = set(known) if part is document["clearance_mm"] else {"arm"}
         for name in sorted(set(part) ^ set(known) - (optional - set(part))):
             what = "is not known" if name in part else "is missing"
-            raise InputError(f"key '{where}{name}' {what}", where=path, allowed=", ".join(known))
+            refuse(f"key '{where}{name}' {what}", path, ", ".join(known), "unknown_key")
 
 
 def _rates_document(rates: Peaks) -> dict[str, list[float]]:
@@ -199,7 +195,7 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
 
 
 def _speed_limits(value: Any) -> SpeedLimits:
-    """What a plan says that it keeps."""
+    """Limits of speed that a plan says it keeps."""
     if set(value) != set(SpeedLimits._fields):
         raise ValueError(f"speed_limits are {', '.join(SpeedLimits._fields)}")
     speeds = SpeedLimits(*(number(value[name]) for name in SpeedLimits._fields))

@@ -1,4 +1,8 @@
-"""From ranked candidates to a plan: the best one that the arm can come to."""
+"""From ranked candidates to a plan: the best candidate that the arm can approach.
+
+A plan is a pose, an approach from home to the standoff and an insertion, both timed. What `_plan` returns has been
+checked as it will be when it is loaded.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import slowed
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.motion.approach import plan_approach
@@ -20,17 +24,17 @@ from puncture_twin.planning.reach.survey import ReachAnswer
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.constraints import reach_request
-from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chance_model import satisfies_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 MAX_TRIES = 20
-"""Candidates to which an approach is sought; what none of the best twenty allows is a matter of the workcell."""
+"""Candidates to which an approach is sought: where none of the best twenty allows one, the workcell is the cause."""
 
 
 class Planned(NamedTuple):
-    """A plan, the candidates with those that no approach was found for marked, and the row of the planned one."""
+    """A plan, the row that it is for, and the candidates, those without an approach now rejected."""
 
     plan: Plan
     candidates: Candidates
@@ -44,32 +48,28 @@ def make_plan(context: CaseContext, candidates: Candidates, *, seed: int, rows: 
         context: The case.
         candidates: Its search result, with reach.
         seed: Of the approach's planner.
-        rows: Those that are wanted, the most wanted first; None takes all in the order of their ranks.
+        rows: Candidates to plan to, the preferred first; None takes all in the order of their ranks.
 
     Raises:
-        InputError: The case does not say where the arm stands.
-        NoAnswerError: No candidate is safe, or none of the best can be come to.
+        InputError: The case does not say where the arm's base is.
+        NoAnswerError: No candidate is safe, or none of the best can be approached.
     """
     if context.reach is None:
-        raise InputError(
-            "the case does not say where the robot stands",
-            where=context.case.path,
-            allowed="[registration] with markers, or [robot.mount]",
-        )
+        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
     last = "no candidate is safe"
     for row in (candidates.ranked if rows is None else rows)[:MAX_TRIES]:
         try:
             plan = _plan(context, candidates, int(row), seed)
         except NoAnswerError as error:
             last = str(error)
-            candidates = _without(context, candidates, int(row), last)
+            candidates = _without_approach(context, candidates, int(row), last)
             continue
         return Planned(plan, candidates, int(row))
-    raise NoAnswerError(f"no plan: {last}", counts=candidates.counts())
+    raise NoAnswerError(f"no plan: {last}", counts=candidates.counts(), code="no_plan")
 
 
-def _without(context: CaseContext, candidates: Candidates, row: int, why: str) -> Candidates:
-    """These candidates with one marked ``approach_not_found``, ranked anew."""
+def _without_approach(context: CaseContext, candidates: Candidates, row: int, why: str) -> Candidates:
+    """The candidates with one rejected as ``approach_not_found``, ranked again."""
     reason, detail = candidates.verdict.reason.copy(), candidates.verdict.detail.copy()
     reason[row], detail[row] = Reason.APPROACH_NOT_FOUND.value, why
     verdict = replace(candidates.verdict, reason=reason, detail=detail)
@@ -77,18 +77,20 @@ def _without(context: CaseContext, candidates: Candidates, row: int, why: str) -
 
 
 def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> Plan:
-    """The plan for one candidate; what it returns has been checked as it would be when it is loaded.
+    """Plan to one candidate, and check the plan.
 
     Raises:
         NoAnswerError: No approach, or the timed motion touches something after all.
     """
     assert context.reach is not None and context.placement is not None  # the caller has refused this
     case, checker = context.case, context.reach.checker
+    # 1. The approach: from home to the standoff, in any of the arm's configurations that keep the limits of chances.
     request = reach_request(case, candidates, row, context.reach.T_base_ct)
     home, speeds = home_configuration(case), case.robot.speeds
     goals = _within_limits(context, candidates, row, approach_goals(checker, request, home))
     approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed, speeds=speeds)
     answer = goals[approach.goal_index]
+    # 2. The plan, with the insertion from that configuration in time.
     plan = Plan(
         case_name=case.name,
         inputs=case.inputs,
@@ -115,30 +117,32 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
         speeds=speeds,
         warnings=context.anatomy.warnings,
     )
+    # 3. The check of the timed motions, whole, and their least clearances.
     touched = motion_contact(plan, checker)
     if touched is not None:
-        raise NoAnswerError(touched)
+        raise NoAnswerError(touched, code="motion_touches")
     return replace(plan, clearance_mm={**phase_clearances(plan, checker), **plan.clearance_mm})
 
 
 def _target_error_mm(context: CaseContext, placement: Placement, q: Floats) -> float:
-    """Expected (rms) at the target in one configuration (6,), rad: by what is declared, else by the markers alone."""
+    """Expected (rms) tip error in configuration q (6,), rad: by all declared errors, else by the markers alone."""
     return placement.target_error_mm if context.chance is None else expected_error_mm(context.chance.error, q)
 
 
 def _within_limits(
     context: CaseContext, candidates: Candidates, row: int, goals: list[ReachAnswer]
 ) -> list[ReachAnswer]:
-    """Of the configurations, those in which the case's limits of chances are kept: the search asked of one alone.
+    """The configurations of a candidate that keep the case's limits of chances; the search has checked one alone.
 
     Raises:
-        NoAnswerError: None of them.
+        NoAnswerError: No configuration keeps them.
     """
     if context.chance is None or not goals:
         return goals
     q = np.array([goal.insertion_q[-1] for goal in goals])
     outward = np.tile(candidates.outward_ct[row], (len(goals), 1))
-    kept = satisfies_limits(context.chance, outward, q)
-    if not kept.any():
-        raise NoAnswerError("no configuration that an approach may end in keeps search.min_hit and max_touch")
-    return [goal for goal, keeps in zip(goals, kept, strict=True) if keeps]
+    satisfied = satisfies_limits(context.chance, outward, q)
+    if not satisfied.any():
+        what = "no configuration that an approach may end in keeps search.min_hit and max_touch"
+        raise NoAnswerError(what, code="limits_not_kept")
+    return [goal for goal, keeps in zip(goals, satisfied, strict=True) if keeps]

@@ -19,7 +19,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, pan_angle, wr
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, away_from_singularities, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
@@ -153,10 +153,10 @@ def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: 
     """Kinematics of the requests, which are checked first."""
     for request in requests:
         if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
-            allowed = f"the tool's {checker.tool.needle_length_mm}"
-            raise InputError(f"needle_length_mm = {request.needle_length_mm}", where="reach request", allowed=allowed)
+            what = f"needle_length_mm = {request.needle_length_mm}"
+            refuse(what, "reach request", f"the tool's {checker.tool.needle_length_mm}", "out_of_range")
     if n_rolls < 1:
-        raise InputError(f"n_rolls = {n_rolls}", where="reach", allowed="above 0")
+        refuse(f"n_rolls = {n_rolls}", "reach", "above 0", "not_positive")
     targets = np.array([request.target_base for request in requests])
     outwards = np.array([request.outward_base for request in requests])
     rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls

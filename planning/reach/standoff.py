@@ -1,6 +1,9 @@
 """Standoff: where tip and flange wait before the insertion, and how far out the needle's axis is checked.
 
-A case may state it; else the tip waits so far from the skin that the needle clears it (`skin_gaps`).
+Along a path, from the target outward, mm:
+
+    standoff = path length + gap to the skin          (or what the case states)
+    waiting flange = needle length + standoff
 """
 
 from __future__ import annotations
@@ -19,12 +22,12 @@ from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
 
 
 def standoffs(needle: Needle, path_length: Floats | float, skin_angle: Floats | float) -> Floats:
-    """Distance tip to target before the insertion: the case's, or just so that the needle clears the skin; mm.
+    """Distance of the waiting tip from the target, mm: what the case states, or the skin's distance and `skin_gaps`.
 
     Args:
         needle: The needle.
         path_length: Target to skin, mm; NaN without a skin entry.
-        skin_angle: The same shape, rad.
+        skin_angle: Shape of ``path_length``, rad.
     """
     path_length = np.asarray(path_length, dtype=float)
     if needle.standoff_mm is None:
@@ -33,17 +36,17 @@ def standoffs(needle: Needle, path_length: Floats | float, skin_angle: Floats | 
 
 
 def waiting_flange(needle: Needle, path_length: Floats | float, skin_angle: Floats | float) -> Floats:
-    """Distance of the waiting flange from the target along the needle, mm; see `standoffs`."""
+    """Distance of the waiting flange from the target, mm; arguments as of `standoffs`."""
     return np.asarray(needle.length_mm + standoffs(needle, path_length, skin_angle))
 
 
 def farthest_flange(needle: Needle, max_skin_angle: float) -> float:
-    """Largest distance of the waiting flange: on the longest path at the steepest angle (rad), mm."""
+    """Largest distance of a waiting flange from the target, mm: on the longest path at the largest skin angle, rad."""
     return float(waiting_flange(needle, needle.shaft_mm, max_skin_angle))
 
 
-def own_paths(case: Case, skin: Skin, outward_ct: Floats, shift_ct: Floats | float = 0.0) -> SkinPaths:
-    """Skin paths of directions ``outward_ct`` (n, 3), unit, to the case's target, or to a shifted one, mm."""
+def case_paths(case: Case, skin: Skin, outward_ct: Floats, shift_ct: Floats | float = 0.0) -> SkinPaths:
+    """Skin along n paths from the case's target, displaced by ``shift_ct``, mm; ``outward_ct`` (n, 3), unit vectors."""
     farthest = farthest_flange(case.needle, case.search.max_skin_angle)
     return skin_paths(skin, case.target_ct + shift_ct, outward_ct, farthest)
 
@@ -51,17 +54,17 @@ def own_paths(case: Case, skin: Skin, outward_ct: Floats, shift_ct: Floats | flo
 def axis_lengths(case: Case, structures: Sequence[Structure], paths: SkinPaths) -> Floats:
     """Lengths to which n needle axes are checked against k structures, shape (n, k), mm.
 
-    Against the body's structures up to where the flange ends; against what is outside of the body up to where it waits
-    along this path. Where no tip ever waits, for want of skin or beyond a limit, that is where any could at most.
+    Against structures of the body: the needle, inserted. Against what is outside of the body (table, gantry): up to the
+    waiting flange, for the needle comes from there.
     """
     farthest = farthest_flange(case.needle, case.search.max_skin_angle)
-    waiting = np.fmin(waiting_flange(case.needle, paths.path_length, paths.skin_angle), farthest)
+    waiting = np.fmin(waiting_flange(case.needle, paths.path_length, paths.skin_angle), farthest)  # NaN without skin
     return np.where([s.outside for s in structures], waiting[:, None], case.needle.length_mm)
 
 
-def own_lengths(case: Case, anatomy: Anatomy, outward_ct: Floats) -> Floats:
-    """`axis_lengths` of paths to the case's target, ``outward_ct`` (n, 3), against everything that is checked."""
-    return axis_lengths(case, anatomy.checked, own_paths(case, anatomy.skin, outward_ct))
+def case_axis_lengths(case: Case, anatomy: Anatomy, outward_ct: Floats) -> Floats:
+    """`axis_lengths` of n paths to the case's target against everything that is checked; ``outward_ct`` (n, 3)."""
+    return axis_lengths(case, anatomy.checked, case_paths(case, anatomy.skin, outward_ct))
 
 
 UNEVEN_SKIN_MM = 1.0
@@ -70,15 +73,16 @@ on two label maps of a real CT 0 and 0.1 mm leave the needle too near in up to 1
 in none of it."""
 
 MAX_GAP_MM = 200.0
-"""Along a path that grazes the skin no gap suffices; none is larger than the largest that a case may ask for."""
+"""Largest gap, as large as a case may state: along a path that grazes the skin none would suffice."""
 
 
 def skin_gaps(needle: Needle, skin_angle: Floats | float) -> Floats:
-    """Distance along the needle from the waiting tip to the skin, for a case that states no standoff.
+    """Least distance from the waiting tip to the skin, along the needle, at which the arm's checker sees no contact.
 
-    The arm's checker keeps its padding p from the skin: about the needle (radius r) it sees a cylinder of radius r + p
-    that begins p before the tip. At an angle a to the normal of flat skin, the rim of that cylinder's end lies
-    (gap - p) cos(a) - (r + p) sin(a) above it, which is positive for gap > p + (r + p) tan(a).
+        gap(a) > p + (r + p) tan(a)
+
+    The checker pads the needle (radius r) by p: a cylinder of radius r + p that begins p before the tip. At an angle a
+    to the normal of flat skin, the rim of its end is (gap - p) cos(a) - (r + p) sin(a) above the skin.
 
     Args:
         needle: With ``skin_gap_mm``, the least gap.

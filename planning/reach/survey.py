@@ -18,7 +18,7 @@ from puncture_twin.planning.arm.inverse_kinematics import EVERY_BRANCH, N_BRANCH
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, least_term, link_frames
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.state_checker import Contact, SweptBodies, motion_bounds
@@ -47,14 +47,14 @@ class ReachRequest:
         for name in ("target_base", "outward_base"):
             array = np.array(getattr(self, name), dtype=np.float64)
             if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
-                raise InputError(f"{name} = {array}", where="reach request", allowed="three finite numbers")
+                refuse(f"{name} = {array}", "reach request", "three finite numbers", "not_finite")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         if abs(math.hypot(*self.outward_base.tolist()) - 1.0) > SAME_UNIT:
-            raise InputError(f"outward_base = {self.outward_base}", where="reach request", allowed="a unit vector")
+            refuse(f"outward_base = {self.outward_base}", "reach request", "a unit vector", "not_unit")
         for name in ("needle_length_mm", "standoff_mm"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise InputError(f"{name} = {getattr(self, name)}", where="reach request", allowed="finite and above 0")
+                refuse(f"{name} = {getattr(self, name)}", "reach request", "finite and above 0", "not_positive")
 
 
 SAME_UNIT = 1e-9
@@ -202,7 +202,7 @@ def survey(
         model: The arm.
         lines: The n directions.
         distances_mm: For each direction, shape (m,): target to flange at the samples of the path.
-        depths_mm: The same as depths, rising, shape (m,).
+        depths_mm: Shape (m,), the distances as depths of insertion, rising.
         rolls: Shape (r,), rad.
     """
     count = len(lines)

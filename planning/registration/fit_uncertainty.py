@@ -1,4 +1,4 @@
-"""What a registration's method makes of the declared errors of its markers.
+"""Covariance of a registration, from its method and the declared errors of its markers.
 
 The declared noise of a case's markers, and how the arm stood, or may have stood, when it touched them.
 """
@@ -35,7 +35,7 @@ from puncture_twin.planning.registration.fits import (
     least_squares_map,
 )
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, check_pairs
-from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
+from puncture_twin.planning.registration.residuals import NoiseTest, noise_test
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +180,8 @@ def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, ne
         if len(q) and singularity(model, q).least().max() >= LEAST_SINGULARITY:
             return farthest_from_singular(model, q, -needle_base)
     place = ", ".join(f"{value:.1f}" for value in point_base)
-    raise NoAnswerError(f"a {model.name} cannot touch ({place}) mm with a needle of {tip_mm:g} mm")
+    what = f"a {model.name} cannot touch ({place}) mm with a needle of {tip_mm:g} mm"
+    raise NoAnswerError(what, code="marker_out_of_reach")
 
 
 def touching_poses(tip_mm: float, point_base: Floats, needle_base: Floats, tilt: float) -> list[Floats]:
@@ -215,7 +216,7 @@ def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where:
 
 
 def touches(case: Case, markers: MarkerPairs) -> Floats:
-    """How the arm stood when it touched each marker, shape (N, 6), rad: as the file says, or as it may have stood."""
+    """Joints of the arm at the touch of each marker, shape (N, 6), rad: the file's, or likely ones."""
     if markers.joints is not None:
         return markers.joints
     model, tip = case.robot.model, case.needle.length_mm

@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.geometry.gauss_newton import lacking
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_of_points, log_rotation, pose, skew
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
@@ -192,7 +193,7 @@ def _transposed(R: Floats) -> Floats:
     return np.swapaxes(R, -1, -2)
 
 
-DOUBTED, SURE = 0.05, 0.01
+SIGNIFICANT, SURE = 0.05, 0.01
 """True lists look so deformed once in 20 registrations, and once in 100: it is said, and nothing is refused for it.
 Where one axis is read five times as badly as the others and nobody declares it, the second is up to one in ten (1,000
 draws each, 3 to 12 markers)."""
@@ -216,7 +217,7 @@ class Distortion:
         moved_mm: What it moves the markers by beside a rigid motion, rms.
         reading_mm: The standard deviation per coordinate that it leaves to the readings.
         rms_mm: Expected error at the target by the residuals of the rigid fit.
-        rms_without_mm: The same by those of the fit with the deformation.
+        rms_without_mm: The rms by the residuals of the fit with the deformation.
     """
 
     axes: str
@@ -228,9 +229,14 @@ class Distortion:
     rms_without_mm: float
 
     @property
-    def doubted(self) -> bool:
+    def significant(self) -> bool:
         """Whether true lists would seldom look so deformed, by so much that it matters: then it is reported."""
-        return self.probability < DOUBTED and self.moved_mm >= LEAST_MM
+        return self.probability < SIGNIFICANT and self.moved_mm >= LEAST_MM
+
+    def finding(self) -> Finding:
+        """The finding, a warning."""
+        numbers: dict[str, float | str] = {"axes": self.axes, "amount": self.amount, "probability": self.probability}
+        return Finding("lists_deformed", Severity.WARNING, self.text(), numbers)
 
     def text(self) -> str:
         """The finding, in one sentence."""
@@ -242,7 +248,7 @@ class Distortion:
         )
 
     def brief(self) -> str:
-        """What is deformed, by how much, and how sure that is."""
+        """How the lists differ, by how much, and how sure that is."""
         along = "" if self.axes == "xyz" else f" along the CT's {self.axes}"
         said = f"markers_base look {1 + self.amount:.4f} times as large as markers_ct{along}"
         if len(self.axes) == 2:
@@ -331,7 +337,7 @@ class NoiseCovariance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ReadingNoise:
-    """What the readings of N markers may be off by, all normal with mean zero.
+    """Declared errors of the readings of N markers, all normal with mean zero.
 
     Attributes:
         cov_ct: Shape (3, 3), mm^2, of each reading in the CT.
@@ -348,7 +354,7 @@ class ReadingNoise:
     touches_known: bool
 
     def covariance(self, R_base_ct: Floats) -> NoiseCovariance:
-        """Of all readings stacked, CT axes rotated by (..., 3, 3)."""
+        """Covariance of all readings stacked, CT axes rotated by (..., 3, 3)."""
         blocks = self.blocks(R_base_ct)
         count = blocks.shape[-3]
         omega = np.zeros((*blocks.shape[:-3], 3 * count, 3 * count))

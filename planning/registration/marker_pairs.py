@@ -1,4 +1,4 @@
-"""The same markers in the CT and at the robot, paired by name."""
+"""Markers paired by name: the same ones in the CT and at the robot."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.formats.points import NamedPoints
 
@@ -68,13 +68,10 @@ def match(
         missing = sorted(wanted - set(points.names))
         if missing:
             near = "".join(did_you_mean(name, set(points.names) - set(other.names)) for name in missing[:1])
-            raise InputError(
-                f"{', '.join(missing)} missing on the {side} side{near}",
-                where=where,
-                allowed="the same names on both sides, or registration.use = [names]",
-            )
+            allowed = "the same names on both sides, or registration.use = [names]"
+            refuse(f"{', '.join(missing)} missing on the {side} side{near}", where, allowed, "markers_missing")
     if len(set(names)) < len(names):
-        raise InputError(f"names repeat: {', '.join(names)}", where=where, allowed="unique names")
+        refuse(f"names repeat: {', '.join(names)}", where, "unique names", "duplicate_name")
     rows_ct = [markers_ct.names.index(name) for name in names]
     rows_base = [markers_base.names.index(name) for name in names]
     joints = None if markers_base.joints is None else markers_base.joints[rows_base]
@@ -88,35 +85,28 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
         InputError: Fewer than three, not finite, on a line, of two sizes, or all at one place.
     """
     if len(markers) < MIN_MARKERS:
-        raise InputError(f"{len(markers)} markers", where=where, allowed="3 or more, by the same names")
+        refuse(f"{len(markers)} markers", where, "3 or more, by the same names", "too_few_markers")
     both = np.concatenate([markers.points_ct, markers.points_base])
     if not np.isfinite(both).all():
         bad = [n for n, a, b in zip(markers.names, markers.points_ct, markers.points_base, strict=True)
                if not np.isfinite([a, b]).all()]  # fmt: skip
-        raise InputError(f"marker {', '.join(bad)} is not finite", where=where, allowed="finite mm")
+        refuse(f"marker {', '.join(bad)} is not finite", where, "finite mm", "not_finite")
     spreads = [_singular_values(points) for points in (markers.points_ct, markers.points_base)]
     for side, values in zip(("CT", "base"), spreads, strict=True):
         if values[0] == 0 or values[1] / values[0] < COLLINEAR:
-            raise InputError(
-                f"markers {', '.join(markers.names)} are collinear on the {side} side",
-                where=where,
-                allowed="three markers that span a triangle",
-            )
+            what = f"markers {', '.join(markers.names)} are collinear on the {side} side"
+            refuse(what, where, "three markers that span a triangle", "markers_collinear")
     ratio = float(np.linalg.norm(spreads[1]) / np.linalg.norm(spreads[0]))
     if not 1 / UNIT_SLIP < ratio < UNIT_SLIP:
-        raise InputError(
-            f"base markers spread {ratio:.3g} times as wide as the CT's: a likely mm/cm/m slip",
-            where=where,
-            allowed="both sides in mm",
-        )
+        what = f"base markers spread {ratio:.3g} times as wide as the CT's: a likely mm/cm/m slip"
+        refuse(what, where, "both sides in mm", "wrong_unit")
     span = max(_span(markers.points_ct), _span(markers.points_base))
     if span < LEAST_SPAN_MM:
-        raise InputError(
+        what = (
             f"markers {', '.join(markers.names)} span {span:.2g} mm, no more than a needle tells apart: a likely slip "
-            "of unit (m or cm as mm) on both sides",
-            where=where,
-            allowed=f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least",
+            "of unit (m or cm as mm) on both sides"
         )
+        refuse(what, where, f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least", "wrong_unit")
 
 
 def _span(points: Floats) -> float:

@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import (
     ReadingNoise,
@@ -30,7 +30,7 @@ from puncture_twin.planning.registration.fits import (
     fit_weighted,
 )
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import MAX_FRE_MM
+from puncture_twin.planning.registration.residuals import MAX_FRE_MM
 
 Method = Literal["triad", "rigid", "weighted", "joint", "affine"]
 
@@ -80,17 +80,13 @@ def _fit_by(method: Method, noise: ReadingNoise | None) -> Fit:
 
 def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path) -> None:
     if method == "affine":
-        raise InputError(
-            "method 'affine' bends the patient",
-            where=where,
-            allowed="triad, rigid or weighted; affine only reproduces the paper's Table 6",
-        )
+        allowed = "triad, rigid or weighted; affine only reproduces the paper's Table 6"
+        refuse("method 'affine' bends the patient", where, allowed, "method_bends")
     if method not in get_args(Method):
-        raise InputError(f"method {method!r}", where=where, allowed=", ".join(get_args(Method)), code="method")
+        refuse(f"method {method!r}", where, ", ".join(get_args(Method)), "unknown_method")
     if method in WEIGHING and noise is None:
-        raise InputError(
-            f"method '{method}' weighs by declared errors", where=where, allowed="[errors], or method rigid"
-        )
+        what = f"method '{method}' weighs by declared errors"
+        refuse(what, where, "[errors], or method rigid", "method_without_errors")
 
 
 def _check_noise(
@@ -101,18 +97,18 @@ def _check_noise(
     covariance = noise.covariance(R)
     values = np.linalg.eigvalsh(covariance.independent if method in WEIGHING else covariance.whole)
     if not values[0] > SINGULAR * values[-1]:
-        message = "the declared errors leave readings of the markers without any"
-        raise InputError(message, where=where, allowed="ct_in_plane_mm, ct_slice_mm or touch_mm above 0")
+        allowed = "ct_in_plane_mm, ct_slice_mm or touch_mm above 0"
+        refuse("the declared errors leave readings of the markers without any", where, allowed, "no_marker_noise")
     if found_in_mm is not None and found_in_mm < LEAST_FOUND_MM:
         message = f"marker_noise = 'found', but the residuals ({found_in_mm:.2g} mm) hold none"
-        raise InputError(message, where=where, allowed="markers measured on both sides, or marker_noise = 'declared'")
+        refuse(message, where, "markers measured on both sides, or marker_noise = 'declared'", "no_marker_noise")
 
 
 MAX_RESIDUAL_MM = 15.0
 """A marker that misses by more was swapped, moved or typed wrongly: the paper's worst set misses by 7 mm."""
 
 MIRROR_GAIN = 2.0
-"""A mirrored fit that is better than the proper one by this factor (and 1 mm) says that one side is mirrored."""
+"""Factor (and 1 mm) by which a mirrored fit must be better than the proper one: then one list is mirrored."""
 
 
 def _rms(residuals: Floats) -> float:
@@ -134,21 +130,19 @@ def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, 
     mirrored = _least_squares(markers.points_ct, markers.points_base, mirrored=True)
     best = _rms(apply(mirrored, markers.points_ct) - markers.points_base)
     if _rms(residuals) > MIRROR_GAIN * best + 1.0:
-        raise InputError(
+        what = (
             f"markers {', '.join(markers.names)} match only mirrored (rms {best:.2f} mm against "
-            f"{_rms(residuals):.2f} mm){better_names(markers, target_ct, _rms(residuals))}",
-            where=where,
-            allowed="both sides right-handed: check LPS/RAS and the marker names",
+            f"{_rms(residuals):.2f} mm){better_names(markers, target_ct, _rms(residuals))}"
         )
+        refuse(what, where, "both sides right-handed: check LPS/RAS and the marker names", "markers_mirrored")
     lengths = np.linalg.norm(residuals, axis=1)
     worst = int(np.argmax(lengths))
     if lengths[worst] > MAX_RESIDUAL_MM:
-        raise InputError(
+        what = (
             f"marker {markers.names[worst]} misses by {lengths[worst]:.1f} mm: swapped, moved or mistyped"
-            f"{better_names(markers, target_ct, _rms(residuals))}",
-            where=where,
-            allowed=f"residuals up to {MAX_RESIDUAL_MM:g} mm",
+            f"{better_names(markers, target_ct, _rms(residuals))}"
         )
+        refuse(what, where, f"residuals up to {MAX_RESIDUAL_MM:g} mm", "marker_misses")
 
 
 MAX_NUMBERS = 20_000_000
@@ -289,7 +283,7 @@ SHOWN = 3
 
 
 def better_names(markers: MarkerPairs, target_ct: Floats, fre_mm: float) -> str:
-    """All permutations of the names that fit where the given ones do not, the best first; empty for none.
+    """Sentence on permutations of the names that fit where the given ones do not, the best first; empty for none.
 
     Args:
         markers: As the user named them.

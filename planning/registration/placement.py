@@ -1,4 +1,4 @@
-"""Where the patient lies for the robot: T_base_ct from markers or from the stated mount, and its expected error.
+"""The patient's pose for the robot, T_base_ct, from markers or from the stated mount, and its expected error.
 
 A pose corrected for what its own residuals tell of the arm: pose and arm errors estimated together.
 
@@ -30,7 +30,7 @@ from puncture_twin.planning.arm.inverse_kinematics import branch_of
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.case.tables import MarkerSection
@@ -40,8 +40,8 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, marker_noise
 from puncture_twin.planning.registration.fits import ReadingNoise, carried, design, fit_joint
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, check_pairs, match
-from puncture_twin.planning.registration.noise_test import noise_test
 from puncture_twin.planning.registration.registration import Aim, Registration, aim_at, reached_insertion, register
+from puncture_twin.planning.registration.residuals import noise_test
 
 MAX_AIM_OFF_MM = 20.0
 """A plan's joints are at the target as it was corrected then: no nominal arm errs by so much."""
@@ -116,7 +116,7 @@ def corrected(case: Case, registration: Registration, *, where: str | Path) -> R
     """
     if registration.markers.joints is None:
         message = "correct = true, but the touches do not say how the arm stood: they tell nothing of its errors"
-        raise InputError(message, where=where, allowed="q1_deg to q6_deg in markers_base; or correct = false")
+        refuse(message, where, "q1_deg to q6_deg in markers_base; or correct = false", "no_touch_joints")
     model, tip = case.robot.model, case.needle.length_mm
     q = _aimed_insertion(case, registration.T_base_ct, where)
     return aimed(registration, aim_at(model, tip, case.target_ct, q))
@@ -129,19 +129,14 @@ def _aimed_insertion(case: Case, T_base_ct: Floats, where: str | Path) -> Floats
         reached = reached_insertion(case, T_base_ct)
         if reached is None:
             message = "correct = true, but the arm reaches the target in none of the directions tried"
-            raise InputError(
-                message, where=where, allowed="correct_joints_deg, how the arm stands at the insertion's end"
-            )
+            refuse(message, where, "correct_joints_deg, how the arm stands at the insertion's end", "out_of_reach")
         return reached
     q = np.radians(np.asarray(case.registration.correct_joints_deg))
     T = flange_pose(case.robot.model, q)
     away = float(np.linalg.norm(T[:3, 3] + case.needle.length_mm * T[:3, 2] - apply(T_base_ct, case.target_ct)))
     if away > MAX_AIM_OFF_MM:
-        raise InputError(
-            f"correct_joints_deg put the tip {away:.1f} mm from the target",
-            where=where,
-            allowed=f"within {MAX_AIM_OFF_MM:g} mm: joints at an insertion's end, with this needle",
-        )
+        allowed = f"within {MAX_AIM_OFF_MM:g} mm: joints at an insertion's end, with this needle"
+        refuse(f"correct_joints_deg put the tip {away:.1f} mm from the target", where, allowed, "aim_beside_target")
     return q
 
 
@@ -179,8 +174,8 @@ def aimed(registration: Registration, aim: Aim) -> Registration:
     T = _aimed(registration.T_base_ct, markers.points_ct, markers.points_base, fit.noise, aim)
     T.setflags(write=False)
     target = apply(registration.T_base_ct, aim.target_ct)
-    told = aimed_uncertainty(fit, markers.points_ct, T, target, aim)
-    return replace(registration, T_base_ct=T, uncertainty=told, aim=aim)
+    uncertainty = aimed_uncertainty(fit, markers.points_ct, T, target, aim)
+    return replace(registration, T_base_ct=T, uncertainty=uncertainty, aim=aim)
 
 
 def aimed_uncertainty(
@@ -225,11 +220,11 @@ class WithoutMarker:
 
 @dataclass(frozen=True, eq=False)
 class OneMore:
-    """Where a further marker would help most.
+    """The place on the skin where a further marker would help most.
 
     Attributes:
         point_ct: Shape (3,), mm.
-        rms_mm: Expected error at the target with it, by the readings, scaled likewise.
+        rms_mm: Expected error at the target with it, by the readings, scaled to the residuals where they are.
     """
 
     point_ct: Floats
@@ -237,7 +232,7 @@ class OneMore:
 
 
 def without_each(registration: Registration, target_ct: Floats) -> tuple[WithoutMarker, ...]:
-    """What each marker's absence would do; empty with three markers or without declared errors."""
+    """Expected error without each marker in turn; empty with three markers or without declared errors."""
     uncertainty, markers = registration.uncertainty, registration.markers
     if uncertainty is None or len(markers) <= MIN_MARKERS:
         return ()
@@ -257,7 +252,7 @@ def without_each(registration: Registration, target_ct: Floats) -> tuple[Without
 
 
 def one_more(registration: Registration, target_ct: Floats, skin_points_ct: Floats) -> OneMore | None:
-    """Where on the skin a further marker, read and touched like the others, would leave the least error.
+    """Find the place on the skin where a further marker, read and touched like the others, would leave the least error.
 
     Args:
         registration: With declared errors; None is returned without them.

@@ -1,6 +1,7 @@
 """CT to robot from markers: their fit, its residuals, and the error to expect at the target.
 
-The insertion for which a pose is corrected, and how residuals tell of the arm's errors there.
+`register` is the list of its stages. `Aim` is the insertion for which a pose is corrected by what the residuals show of
+the arm's errors.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import away_from_singularities, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import outward
@@ -34,29 +35,29 @@ from puncture_twin.planning.registration.fits import (
 )
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
 from puncture_twin.planning.registration.method import Method, better_names, check_residuals, checked_fit
-from puncture_twin.planning.registration.noise_test import (
+from puncture_twin.planning.registration.residuals import (
     Conditioning,
     Interval,
-    OddMarker,
+    OutlierMarker,
     ResidualTest,
     conditioning,
-    odd_marker,
+    outlier_marker,
 )
 
 
-def fit_doubts(test: ResidualTest, uncertainty: FitUncertainty | None) -> tuple[str, ...]:
-    """Residuals that the noise does not explain and the case accepts: of the rigid fit, or of the declared errors."""
-    if uncertainty is None:
-        return () if test.explained else (f"{test.text()}; accepted by the case",)
-    declared = uncertainty.test
-    if declared.agrees:
-        return ()
-    return (declared.text() + ("; all errors are scaled to them" if declared.explained else "; accepted by the case"),)
+def unexplained_residuals(test: ResidualTest, uncertainty: FitUncertainty | None) -> Finding | None:
+    """Warning of residuals that the noise does not explain, and the case accepts: against FRE or declared errors."""
+    declared = test if uncertainty is None else uncertainty.test
+    if test.explained if uncertainty is None else uncertainty.test.agrees:
+        return None
+    scaled = uncertainty is not None and declared.explained
+    said = declared.text() + ("; all errors are scaled to them" if scaled else "; accepted by the case")
+    return Finding("residuals_unexplained", Severity.WARNING, said, {"chi_squared": declared.chi_squared})
 
 
-def odd_marker_of(markers: MarkerPairs, fle_mm: float | None) -> OddMarker | None:
-    """The marker that does not fit the others, if there is one; ``fle_mm`` is the declared noise or None."""
-    return odd_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
+def outlier_marker_of(markers: MarkerPairs, fle_mm: float | None) -> OutlierMarker | None:
+    """The marker that least fits the others, if chance does not explain it; ``fle_mm``: the declared noise, or None."""
+    return outlier_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
 
 
 ALLOWED_RESIDUALS = "names and readings checked, the true errors declared, or registration.accept_residuals = true"
@@ -74,9 +75,9 @@ class Registration:
         residual_test: The residuals of the rigid fit against the noise.
         conditioning: The three flags of a weak set, for the target given.
         target_ct: That target, shape (3,), mm.
-        uncertainty: What the declared errors make of it; None where none are declared.
-        aim: The insertion for which the pose was corrected by what the residuals tell of the arm; None where it was
-            not. The residuals are those before.
+        uncertainty: Covariance by the declared errors; None where none are declared.
+        aim: The insertion for which the pose was corrected by what the residuals show of the arm's errors; None where
+            it was not. ``residuals`` are those before the correction.
     """
 
     method: str
@@ -100,7 +101,7 @@ class Registration:
 
     @property
     def fle_source(self) -> str:
-        """Where that number comes from."""
+        """Where `fle_mm` comes from: declared, estimated from FRE, or scaled to the residuals."""
         if self.uncertainty is None:
             return self.residual_test.source
         scaled = (
@@ -119,16 +120,19 @@ class Registration:
         return Interval(*(fle / test.scale * end for end in test.interval))
 
     @property
-    def flags(self) -> tuple[str, ...]:
-        """What weakens it, in words: the conditioning, accepted residuals, an odd marker, lists of two sizes."""
-        doubts = fit_doubts(self.residual_test, self.uncertainty)
-        odd, deformed = odd_marker_of(self.markers, self.residual_test.declared_fle_mm), self.distortion
-        found = (odd, deformed if deformed is not None and deformed.doubted else None)
-        return (*self.conditioning.flags, *doubts, *(one.text() for one in found if one is not None))
+    def flags(self) -> tuple[Finding, ...]:
+        """Warnings of what weakens it: conditioning, accepted residuals, an outlier marker, lists of two sizes."""
+        outlier, deformed = outlier_marker_of(self.markers, self.residual_test.declared_fle_mm), self.distortion
+        found = (
+            unexplained_residuals(self.residual_test, self.uncertainty),
+            None if outlier is None else outlier.finding(),
+            deformed.finding() if deformed is not None and deformed.significant else None,
+        )
+        return (*self.conditioning.flags, *(one for one in found if one is not None))
 
     @cached_property
     def distortion(self) -> Distortion | None:
-        """By what one list seems deformed against the other, doubted or not; None where the markers cannot show it."""
+        """By what one list seems deformed against the other, significant or not; None where markers cannot show it."""
         noise = None if self.uncertainty is None else self.uncertainty.noise
         return distortion(self.T_base_ct, self.markers, noise, self.target_ct)
 
@@ -156,7 +160,7 @@ class Registration:
         return np.sqrt([np.trace(self.tre_covariance(point)) for point in points_ct])
 
     def tre_covariance(self, point_ct: Floats) -> Floats:
-        """Of that error at one point (3,), shape (3, 3), mm^2, base axes."""
+        """Covariance of the registration error at a point (3,) of the CT frame, shape (3, 3), mm^2, base axes."""
         point_base = apply(self.T_base_ct, point_ct)
         if self.uncertainty is not None:
             return self.uncertainty.cov_at(point_base)[:3, :3]
@@ -167,7 +171,7 @@ class Registration:
 
     @property
     def freedom(self) -> int | None:
-        """Degrees of freedom of the errors' size where the residuals gave it; None where it is declared, and agrees."""
+        """Degrees of freedom of the noise where the residuals gave its size; None where it is declared and agrees."""
         if self.uncertainty is not None:
             return self.uncertainty.test.freedom if self.uncertainty.test.scaled else None
         declared = self.residual_test.declared_fle_mm is not None and self.residual_test.explained
@@ -200,35 +204,39 @@ def register(
         fle_mm: Known localisation error (rms, both sides together); None estimates it from FRE. Not beside ``noise``.
         noise: What is declared of each marker, in the order of ``markers``.
         noise_found: Whether ``noise`` is a shape alone, its size to be found from the residuals.
-        accept_residuals: Whether residuals beyond the noise are taken, and the noise is scaled to them.
+        accept_residuals: Whether residuals beyond the noise are accepted, and the noise is scaled to them.
         where: What errors name.
 
     Raises:
         InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``,
             ``weighted`` or ``joint`` without noise, noise that is none, or residuals that the noise does not explain.
     """
+    # 1. The fit.
     check_pairs(markers, where)
     fre_mm = rigid_fre_mm(markers.points_ct, markers.points_base)
     fit = checked_fit(markers, method, noise, fre_mm if noise_found else None, where=where)
     if method == "triad" and len(markers) != MIN_MARKERS:
-        raise InputError(f"triad takes 3 markers, not {len(markers)}", where=where, allowed="3 names in use")
+        refuse(f"triad takes 3 markers, not {len(markers)}", where, "3 names in use", "wrong_count")
     T_base_ct = fit(markers.points_ct, markers.points_base)
     residuals = apply(T_base_ct, markers.points_ct) - markers.points_base
     check_residuals(markers, residuals, target_ct, where)
+    # 2. Its uncertainty, by the declared noise.
     uncertainty = None
     if noise is not None:
         points = markers.points_ct, markers.points_base
         uncertainty = fit_uncertainty(method, fit, T_base_ct, *points, noise, found=noise_found)
         fle_mm = None if noise_found else noise.covariance(T_base_ct[:3, :3]).greatest_fle_mm
+    # 3. Whether the noise explains the residuals; if not, what may be wrong.
     test = ResidualTest(len(markers), fre_mm, fle_mm)
     noise_test = test if uncertainty is None else uncertainty.test
     if not (noise_test.explained or accept_residuals):
-        odd = odd_marker_of(markers, fle_mm)
-        what = noise_test.text() if odd is None else f"{noise_test.text()}; {odd.text()}"
+        outlier = outlier_marker_of(markers, fle_mm)
+        what = noise_test.text() if outlier is None else f"{noise_test.text()}; {outlier.text()}"
         what += better_names(markers, target_ct, fre_mm)
         deformed = distortion(T_base_ct, markers, noise, target_ct)
-        what += f"; {deformed.brief()}" if deformed is not None and deformed.doubted else ""
-        raise InputError(what, where=where, allowed=ALLOWED_RESIDUALS)
+        what += f"; {deformed.brief()}" if deformed is not None and deformed.significant else ""
+        refuse(what, where, ALLOWED_RESIDUALS, "residuals_too_large")
+    # 4. Whether the markers suit the target: spread, leverage.
     weak = conditioning(markers.points_ct, target_ct)
     return Registration(method, T_base_ct, markers, residuals, test, weak, target_ct, uncertainty)
 
@@ -240,7 +248,7 @@ class Aim:
     Attributes:
         target_ct: Shape (3,), mm.
         q: Shape (6,), rad, the tip on the target.
-        arm_jacobian: Shape (6, 28), J_f: how the arm's parameters move the needle there, base axes.
+        arm_jacobian: Shape (6, 28), J_f: motion of the needle there per arm parameter, base axes.
     """
 
     target_ct: Floats
@@ -248,7 +256,14 @@ class Aim:
     arm_jacobian: Floats
 
     def response(self, noise: ReadingNoise, weights: Floats) -> Floats:
-        """J_f Sigma_eta J' W, shape (..., 6, 3 N): motion of the pose at the target per residual, W (..., 3 N, 3 N)."""
+        """Correction of the pose at the target per residual, shape (..., 6, 3 N).
+
+            J_f Sigma_eta J' W        (Sigma_eta, J: the arm's parameters and their effect on the touches)
+
+        Args:
+            noise: Of the readings, with the arm's parameters.
+            weights: W, shape (..., 3 N, 3 N), of the residuals.
+        """
         return np.asarray((self.arm_jacobian * noise.eta_variances) @ noise.arm_jacobian.T @ weights)
 
 
@@ -265,9 +280,9 @@ AZIMUTHS = 12
 
 
 def reached_insertion(case: Case, T_base_ct: Floats) -> Floats | None:
-    """Joints (6,), rad, that put the tip on the target at the least puncture angle tried; None where none reach.
+    """Joints (6,), rad, that put the tip on the target, at the least puncture angle tried; None where none do.
 
-    Only an arm's kinematics are looked at: organs and collisions are the search's.
+    Kinematics alone, to estimate an error: organs and collisions are not checked.
     """
     model = case.robot.model
     target = apply(T_base_ct, case.target_ct)

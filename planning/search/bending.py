@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.naming import REST
@@ -37,10 +37,10 @@ from puncture_twin.planning.search.candidates import Candidates, Verdict
 
 
 def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBound | None) -> Candidates:
-    """Reject what lacks the clearance to bend; nothing that was rejected becomes safe.
+    """Reject candidates whose clearance is less than the margin and the largest deflection.
 
     Args:
-        anatomy: The structures of ``found``.
+        anatomy: The structures of ``candidates``.
         candidates: Checked for a straight needle.
         bound: How far the needle may bend; None bends nothing.
     """
@@ -52,7 +52,7 @@ def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBoun
 
 
 def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance: Floats, deflection: Floats) -> Verdict:
-    """A verdict with those rejected whose clearance is less than a margin and the deflection.
+    """A verdict with candidates rejected whose clearance is less than margin + deflection; others keep theirs.
 
     Args:
         verdict: Of n candidates.
@@ -145,7 +145,7 @@ def check_tissues(case: Case, anatomy: Anatomy) -> None:
             bend = shortest_bend(case.bending.shaft)
             what = f"tissue.{pattern}: {tissue.stiffness_n_mm2:g} N/mm2 bends this shaft within {bend:.2g} mm"
             allowed = f"at most {most:.3g} N/mm2 for it: beyond, no bound of its bending is known"
-            raise InputError(what, where=case.path, allowed=allowed)
+            refuse(what, case.path, allowed, "tissue_too_stiff")
 
 
 def path_layers(

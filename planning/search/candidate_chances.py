@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances
-from puncture_twin.planning.reach.standoff import own_lengths
+from puncture_twin.planning.reach.standoff import case_axis_lengths
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.windows import find_windows
@@ -37,14 +37,14 @@ def with_chances(
     model: ChanceModel | None,
     axes: AxisDistances | None = None,
 ) -> Candidates:
-    """Compute the chances of all candidates that geometry and reach left, and reject those beyond the case's limits.
+    """Compute the chances of all candidates that are safe so far, and reject those beyond the case's limits.
 
     Args:
         case: Declares errors; else nothing is computed.
         anatomy: Its structures.
         candidates: Checked against organs and arm.
         model: None where the pose's error is not known: the chances are blank.
-        axes: What the engine measured of the candidates; None measures those that are left again.
+        axes: Distances of the candidates' axes; None measures those of the safe ones again.
 
     Raises:
         InputError: A limit that nothing can be compared with.
@@ -66,15 +66,15 @@ def with_chances(
 
 
 def limited(case: Case, candidates: Candidates) -> Candidates:
-    """Reject candidates too unlikely to hit, or too likely to touch."""
+    """Reject candidates whose chance to hit is below, or to touch above, the case's limit; unknown ones too."""
     chances, least = candidates.chances, case.search.min_hit
     assert chances is not None
     if least is not None:
-        rows = np.flatnonzero(candidates.safe & ~(chances.hit >= least))  # what is not known is not enough
+        rows = np.flatnonzero(candidates.safe & ~(chances.hit >= least))  # true for NaN
         target = np.full(len(rows), case.target_structure, dtype=object)
         candidates = _rejected(candidates, rows, Reason.HIT_UNLIKELY, target, chances.hit[rows])
     limits = np.array([touch_limit(case, name) for name in chances.structures])
-    touch = np.where(np.isnan(chances.touch), np.inf, chances.touch)  # nor is it little enough
+    touch = np.where(np.isnan(chances.touch), np.inf, chances.touch)
     with np.errstate(invalid="ignore"):  # without a limit both may be infinite
         beyond = np.where(touch > limits, touch - limits, -np.inf)
     rows = np.flatnonzero(candidates.safe & (beyond > 0).any(axis=1))
@@ -91,19 +91,19 @@ def _rejected(candidates: Candidates, rows: Ints, reason: Reason, structure: Tex
 
 
 BEST = 200
-"""How many of the ranked candidates get the chances that cost more."""
+"""How many of the best candidates get the chances that take long to compute."""
 
 
 REFINED_FROM = 1 / 60
-"""Times its limit: what first order, or its bound, puts above is refined. The chance to be displaced so far to any
-side at all is 56 times that to one side at 3.5 standard deviations, and less for less."""
+"""Fraction of its limit from which on a chance of first order, or its bound, is refined. The chance to be displaced so
+far to any side is 56 times that to one side at 3.5 standard deviations, and less for less."""
 
 ROWS_AT_ONCE = 4096
 """Candidates at once: a table of gradients of 60 structures stays below 20 MB."""
 
 
 def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidates:
-    """Refine the chances to touch that first order puts near a limit or beyond, or that may be if the needle leans."""
+    """Refine the chances to touch that may exceed a limit, by first order or by the bound for a tilted needle."""
     chances, limits = candidates.chances, model.limits
     assert chances is not None
     if not np.isfinite(limits).any():
@@ -114,12 +114,12 @@ def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidate
 
 
 def _touch_bounds(candidates: Candidates, model: ChanceModel) -> Floats:
-    """Shape (n, k), of the safe candidates' chances to touch; NaN for others."""
+    """Upper bounds of the safe candidates' chances to touch, shape (n, k); NaN for others."""
     error, columns = model.error, model.columns
     surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])  # in the worst direction
     bounds, rows = np.full((len(candidates), len(columns)), np.nan), np.flatnonzero(candidates.safe)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
-        length = float(own_lengths(model.case, model.anatomy, candidates.outward_ct[part])[:, columns].max())
+        length = float(case_axis_lengths(model.case, model.anatomy, candidates.outward_ct[part])[:, columns].max())
         slack, cov_ct = (
             candidates.clearance.distance[part][:, columns],
             error.covariance_ct(candidates.arm.q_insertion[part]),
@@ -155,7 +155,7 @@ def with_best_refined(candidates: Candidates, model: ChanceModel | None) -> Cand
 
 
 def _shown(candidates: Candidates) -> Ints:
-    """Rows that people are shown, and whose chances are still of first order."""
+    """Rows of the candidates that are shown to people and whose chances are still of first order."""
     assert candidates.chances is not None
     best = [window.best for window in find_windows(candidates).windows]
     shown = np.unique(np.append(candidates.ranked[:BEST], best)).astype(np.int64)
@@ -165,7 +165,7 @@ def _shown(candidates: Candidates) -> Ints:
 NORMALS = 4096
 """Fixed draws of the jointly linearised chance: its own error is .008 at most."""
 
-DRAWN_WITH = 20191104
+DRAWS_SEED = 20191104
 """Seed of those draws, the same in every run: the table must not depend on chance."""
 
 
@@ -180,12 +180,12 @@ def joint_touch_chance(
 
     Args:
         near: Of needles and structures.
-        cov_ct: Shape (n, 6, 6), Sigma6, as there.
+        cov_ct: Shape (n, 6, 6), covariance of each needle's pose, CT axes, twist order.
         threshold_mm: One number or shape (k,).
         freedom: As in `touch_chance`.
         surface_mm: As in `proximity`: every structure's surface lies off by a normal number of its own.
     """
-    rng = np.random.default_rng(DRAWN_WITH)
+    rng = np.random.default_rng(DRAWS_SEED)
     draws = rng.normal(size=(NORMALS, 6))
     sizes = np.ones(NORMALS) if freedom is None else np.sqrt(freedom / rng.chisquare(freedom, NORMALS))
     surfaces = np.nan_to_num(np.broadcast_to(surface_mm, near.distance.shape))

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -14,12 +12,18 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import decode_text, read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
-from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_coordinate, parse_points
+from puncture_twin.planning.formats.points import (
+    MAX_FILE_BYTES,
+    csv_lines,
+    parse_coordinate,
+    parse_points,
+    parse_triple,
+)
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
@@ -101,11 +105,6 @@ def best_pick(candidates: Candidates) -> Pick | None:
 def choose(context: CaseContext, candidates: Candidates, choice: Choice) -> Chosen:
     """The candidates that a choice leaves, in the order of preference.
 
-    Args:
-        context: Of the case.
-        candidates: The search of its grid.
-        choice: The person's choice.
-
     Raises:
         InputError: A rank or window that there is not, or a point that is no skin entry.
         NoAnswerError: Nothing is safe, or the chosen direction is rejected: says why.
@@ -114,7 +113,7 @@ def choose(context: CaseContext, candidates: Candidates, choice: Choice) -> Chos
         return choose_stated(context, choice)
     rows = candidates.ranked
     if not len(rows):
-        raise NoAnswerError("no candidate is safe", counts=candidates.counts())
+        raise NoAnswerError("no candidate is safe", counts=candidates.counts(), code="no_safe_direction")
     if choice.rank is not None:
         _refuse_beyond(choice.rank, len(rows), "--rank", "safe candidates")
         return Chosen(candidates, rows[choice.rank - 1 : choice.rank])
@@ -137,7 +136,8 @@ def choose_stated(context: CaseContext, choice: Choice) -> Chosen:
     if not checked.safe[0]:
         at = checked.at(0)
         where = f"theta {at['theta_deg']:.4g} deg, beta {at['beta_deg']:.4g} deg"
-        raise NoAnswerError(f"{where} is rejected: {reason_text(checked, 0)}", counts=checked.counts())
+        what = f"{where} is rejected: {reason_text(checked, 0)}"
+        raise NoAnswerError(what, counts=checked.counts(), code="direction_rejected")
     return Chosen(checked, np.zeros(1, np.int64))
 
 
@@ -152,7 +152,7 @@ def chosen_angles(case: Case, choice: Choice) -> tuple[float, float]:
     lever = _entry_ct(case, choice) - case.target_ct
     reach = float(np.linalg.norm(lever))
     if not reach >= LEAST_LEVER_MM:
-        raise InputError(f"{reach:.2g} mm from the target", where="--entry", allowed="a point on the skin")
+        refuse(f"{reach:.2g} mm from the target", "--entry", "a point on the skin", "entry_at_target")
     theta, beta = angles((lever / reach) @ case.T_ct_entry[:3, :3])
     return float(theta), float(beta)
 
@@ -166,15 +166,16 @@ def parse_choice(
         InputError: Two choices at once, one angle alone, or an entry that is not X,Y,Z.
     """
     if (theta_deg is None) != (beta_deg is None):
-        raise InputError("one angle alone gives no direction", where="--theta, --beta", allowed="both")
+        refuse("one angle alone gives no direction", "--theta, --beta", "both", "one_angle")
     stated = {"--theta and --beta": theta_deg, "--rank": rank, "--window": window, "--entry": entry}
     names = [name for name, value in stated.items() if value is not None]
     if len(names) > 1:
-        raise InputError(f"{', '.join(names)} at once", where="choice", allowed="one of them")
+        refuse(f"{', '.join(names)} at once", "choice", "one of them", "conflicting_options")
     angles = None if theta_deg is None or beta_deg is None else (np.radians(theta_deg), np.radians(beta_deg))
     if entry is not None and entry.lower().endswith(FILES):
         return Choice(entry_file=Path(entry))
-    return Choice(angles, rank, window, None if entry is None else _parse_point(entry))
+    entry_mm = None if entry is None else parse_triple(entry, "--entry", "X,Y,Z in mm, in the case's space")
+    return Choice(angles, rank, window, entry_mm)
 
 
 def with_file_read(case: Case, choice: Choice) -> Choice:
@@ -189,21 +190,13 @@ def with_file_read(case: Case, choice: Choice) -> Choice:
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     points = parse_points(data, path, default_space=case.space).points
     if len(points) > MOST_POINTS:
-        raise InputError(f"{len(points)} points", where=path, allowed="one point, or a line from entry to target")
+        refuse(f"{len(points)} points", path, "one point, or a line from entry to target", "wrong_count")
     away = np.linalg.norm(points - case.target_ct, axis=1)
     if len(points) == MOST_POINTS and away.min() > NEAR_ENTRY_MM:
-        what = f"neither end is the target: {away.min():.1f} mm away from it"
-        raise InputError(what, where=path, allowed=f"a line with one end within {NEAR_ENTRY_MM:g} mm of the target")
+        allowed = f"a line with one end within {NEAR_ENTRY_MM:g} mm of the target"
+        refuse(f"neither end is the target: {away.min():.1f} mm away from it", path, allowed, "line_misses_target")
     x, y, z = to_lps(points[[int(np.argmax(away))]], case.space)[0].tolist()  # the change of signs undoes itself
     return replace(choice, entry_mm=(x, y, z), read=(content_input("entry", str(path), data),))
-
-
-def _parse_point(text: str) -> tuple[float, float, float]:
-    where = "--entry"
-    numbers = [parse_coordinate(part.strip(), where) for part in text.split(",")]
-    if len(numbers) != 3:
-        raise InputError(f"{len(numbers)} numbers", where=where, allowed="X,Y,Z in mm, in the case's space")
-    return numbers[0], numbers[1], numbers[2]
 
 
 def _entry_ct(case: Case, choice: Choice) -> Floats:
@@ -212,7 +205,7 @@ def _entry_ct(case: Case, choice: Choice) -> Floats:
 
 def _refuse_beyond(number: int, count: int, where: str, what: str) -> None:
     if not 1 <= number <= count:
-        raise InputError(f"{number}: there are {count} {what}", where=where, allowed=f"1 to {count}")
+        refuse(f"{number}: there are {count} {what}", where, f"1 to {count}", "out_of_range")
 
 
 def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
@@ -227,11 +220,8 @@ def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
     apart = float(np.linalg.norm(real - _entry_ct(case, choice)))
     if apart > NEAR_ENTRY_MM:
         place = ", ".join(f"{mm:.1f}" for mm in to_lps(real[None], case.space)[0])
-        raise InputError(
-            f"the path from there to the target enters the skin {apart:.1f} mm away, at ({place}) mm {case.space}",
-            where="--entry",
-            allowed=f"a point on the skin, to {NEAR_ENTRY_MM:g} mm",
-        )
+        what = f"the path from there to the target enters the skin {apart:.1f} mm away, at ({place}) mm {case.space}"
+        refuse(what, "--entry", f"a point on the skin, to {NEAR_ENTRY_MM:g} mm", "entry_elsewhere")
 
 
 ANGLES = ("theta_deg", "beta_deg")
@@ -310,28 +300,19 @@ def _header(data: bytes, path: Path) -> list[str]:
 def _angle_rows(data: bytes, path: Path) -> tuple[Listed, ...]:
     header = _header(data, path)
     if sorted(header) not in (sorted(ANGLES), sorted((*ANGLES, "name"))):
-        raise InputError(f"columns {header}"[:200], where=f"{path}, header", allowed=ALLOWED_ANGLES)
-    reader = csv.reader(io.StringIO(decode_text(data, str(path)), newline=""), strict=True)
-    rows: list[Listed] = []
-    try:
-        next(reader)
-        for fields in reader:
-            if any(field.strip() for field in fields):
-                where = f"{path}, line {reader.line_num}"
-                rows.append(_angle_row(len(rows) + 1, header, fields, where))
-    except csv.Error as error:
-        raise InputError(f"{error}", where=f"{path}, line {reader.line_num}", allowed=ALLOWED_ANGLES) from error
-    if not rows:
-        raise InputError("no line", where=path, allowed=ALLOWED_ANGLES)
-    return tuple(rows)
+        refuse(f"columns {header}"[:200], f"{path}, header", ALLOWED_ANGLES, "wrong_columns")
+    lines = list(csv_lines(data, str(path), ALLOWED_ANGLES))[1:]
+    if not lines:
+        refuse("no line", path, ALLOWED_ANGLES, "empty")
+    return tuple(_angle_row(i, header, fields, f"{path}, line {line}") for i, (line, fields) in enumerate(lines, 1))
 
 
 def _angle_row(number: int, header: list[str], fields: list[str], where: str) -> Listed:
     if len(fields) != len(header):
-        raise InputError(f"{len(fields)} fields instead of {len(header)}", where=where, allowed=ALLOWED_ANGLES)
+        refuse(f"{len(fields)} fields instead of {len(header)}", where, ALLOWED_ANGLES, "ragged_row")
     stated = dict(zip(header, (field.strip() for field in fields), strict=True))
     theta, beta = (parse_coordinate(stated[name], where) for name in ANGLES)
     for name, angle, most in zip(ANGLES, (theta, beta), GREATEST, strict=True):
         if not 0.0 <= angle <= most:
-            raise InputError(f"{name} {angle:g}", where=where, allowed=f"0 to {most:g}")
+            refuse(f"{name} {angle:g}", where, f"0 to {most:g}", "out_of_range")
     return Listed(number, stated.get("name", ""), None, parse_choice(theta, beta, None, None, None))

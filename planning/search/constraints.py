@@ -40,10 +40,10 @@ def first_broken(
     needle: Needle,
     max_skin_angle: float,
 ) -> Verdict:
-    """Apply every constraint; the reason given is the first that is broken, in the order of the code.
+    """Verdict of n candidates for skin and organs: each one's reason is the first constraint that it breaks.
 
-    What the skin does not show comes first: nothing behind it is known. Structures come last: some count only for a tip
-    that waits at its standoff, and without the constraints on the path none ever waits.
+    The order is that of the ``give`` calls. Unscanned regions come first: nothing behind them is known. Structures come
+    last: some matter only to a tip that waits at its standoff, so only on paths that satisfy the others.
 
     Args:
         paths: The skin along the n paths.
@@ -58,7 +58,7 @@ def first_broken(
     unset = np.ones(count, bool)
 
     def give(reason: Reason, where: Bools, names: Column, depth: Column, amount: Column = np.nan) -> None:
-        rows = np.flatnonzero(where & unset)
+        rows = np.flatnonzero(where & unset)  # who has a reason keeps it
         unset[rows] = False
         reasons[rows] = reason.value
         columns: tuple[tuple[NDArray[Any], Column], ...]
@@ -84,9 +84,9 @@ def first_broken(
 
 
 def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:
-    """Column of the structure that lacks most of its margin, shape (n,); of equal ones the first along the needle.
+    """Column of the structure whose margin is violated by most, shape (n,); 0 where none is.
 
-    0 where none lacks any.
+    Of equal violations that at the least depth counts.
     """
     count = len(clearances.clearance)
     worst, most, reached = np.zeros(count, np.int64), np.full(count, -np.inf), np.full(count, np.inf)
@@ -100,9 +100,10 @@ def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -
 
 
 def closest_miss(candidates: Candidates) -> int | None:
-    """Row of the rejected candidate that came closest: one that the organs allow, and passed most of what follows.
+    """Row of the rejected candidate that came closest to being safe, for the report; None without candidates.
 
-    Without such a row, the least lack of clearance among those that lack only that; None for no rows at all.
+    First one that is safe for the organs, rejected by the latest constraint possible; else the one whose clearance is
+    least below its margin; else one rejected by skin or path.
     """
     late = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY, Reason.UNSAFE_WHEN_BREATHING, Reason.NEEDLE_BENDS)
     of_arm = (Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
@@ -135,7 +136,7 @@ class ArmReach:
 
 
 def with_reach(case: Case, candidates: Candidates, reach: ArmReach, progress: Count | None = None) -> Candidates:
-    """Check the arm for every candidate that the organs allow; progress counts the checked ones."""
+    """Check whether the arm reaches, and can insert along, every candidate that is safe so far; fill its columns."""
     rows = np.flatnonzero(candidates.safe)
     requests = reach_requests(case, candidates, rows, reach.T_base_ct)
     answers = assess_reach_all(reach.checker, requests, progress)

@@ -1,7 +1,8 @@
-"""One case, prepared: structures, clearance engine, the arm in its workcell, and every question about them.
+"""A case with all that it names, prepared once for every question about it.
 
-`prepare` reads a case once; `CaseContext` then searches its grid, checks and explains single directions, and gives
-errors and provenance. A search also reports what else would be safe (`alternatives`).
+`prepare` reads the case: structures, clearance engine, the arm in its workcell. `CaseContext` then searches its grid,
+checks and explains single directions, and gives errors and provenance. A search also reports what else would be safe
+(`alternatives`).
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE, beyond_images
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, NO_MEMORY, Memory, user_cache
-from puncture_twin.planning.base.errors import Finding, InputError, Severity
-from puncture_twin.planning.base.progress import Silent, Stages, Watcher
+from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Cache, Memory, user_cache
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
+from puncture_twin.planning.base.progress import LOG, Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.case.case import Case
@@ -33,7 +34,7 @@ from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, cross_check
 from puncture_twin.planning.collision.workcell import case_checker, with_surroundings
 from puncture_twin.planning.evidence.checks import findings
-from puncture_twin.planning.reach.standoff import axis_lengths, own_lengths, own_paths
+from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths, case_paths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.bedside import EntryFacts, Landmark, entry_facts
 from puncture_twin.planning.search.bending import check_tissues
@@ -55,7 +56,7 @@ COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "dir
 """The unit of each engine's progress."""
 
 NO_BASE = "the case does not say where the robot's base is"
-ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]; or a check without the arm"
+ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +64,9 @@ class CaseContext:
     """A prepared case: everything that questions about it need, read once.
 
     Attributes:
-        placement: Where the patient lies for the robot, or None when the case does not say.
-        reach: The checker of the arm, or None without a placement.
-        chance: Of the declared errors; None where the case declares none, or the arm is not checked.
+        placement: Where the patient is for the robot, T_base_ct; None where the case does not say.
+        reach: The checker of the arm; None without a placement.
+        chance: Model of the declared errors; None where the case declares none, or the arm is not checked.
         stages: How long reading took; later stages are added as they happen.
     """
 
@@ -96,7 +97,7 @@ class CaseContext:
 
     @cached_property
     def sides(self) -> tuple[Side, ...]:
-        """Open sides of the body around the target, and which of them the case's grid covers."""
+        """Sides of the body from which the target can be approached, and which of them the case's grid covers."""
         return sides_of(self.case, self.anatomy)
 
     def search(self) -> Candidates:
@@ -164,7 +165,7 @@ class CaseContext:
         with self.stages.time("cross-check"):
             case, outward = self.case, self.case.directions().outward_ct
             meshes = tuple(structure.mesh for structure in self.anatomy.checked)
-            length, rng = own_lengths(case, self.anatomy, outward), np.random.default_rng(case.rehearsal.seed)
+            length, rng = case_axis_lengths(case, self.anatomy, outward), np.random.default_rng(case.rehearsal.seed)
             distances = self.engine.measure(case.target_ct, outward, length)
             return cross_check(distances, meshes, case.target_ct, outward, length, count=count, rng=rng)
 
@@ -208,42 +209,47 @@ def prepare(
             case that does not say where its base is.
     """
     if engine not in ENGINES:
-        raise InputError(f"engine '{engine}' is not known", where="--engine", allowed=", ".join(ENGINES))
+        refuse(f"engine '{engine}' is not known", "--engine", ", ".join(ENGINES), "unknown_engine")
     watcher = watcher or Silent()
     stages = Stages(announce=partial(watcher.step, "stage"))
-    with stages.time("case"):
+    with stages.time("case"):  # case.toml, validated, and T_base_ct from markers, a transform or a mount
         case = load_case(path, options)
         case = case if target_ct is None else case.aimed_at(target_ct)
         placement = load_placement(case)
     if arm and placement is None:
-        raise InputError(f"the arm is to be checked, but {NO_BASE}", where=case.path, allowed=ALLOWED_BASE)
-    with stages.time("anatomy"):
+        refuse(NO_BASE, case.path, f"{ALLOWED_BASE}; or a check without the arm", "no_base")
+    with stages.time("anatomy"):  # surfaces of skin, organs and surroundings, and whether all fits together
         cache = replace(user_cache(), memory=memory)
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), cache)
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
         watcher.step("anatomy", "whether all fits together")
-        read = (*case.warnings, *anatomy.warnings)
-        collected = (
-            *(Finding("reading", Severity.WARNING, one) for one in read),
-            *anatomy.findings,
-            *findings(case, anatomy, placement, cache),
-            *(Finding("breathing", Severity.WARNING, one) for one in breath_warnings(case, anatomy)),
-        )
+        anatomy = _with_findings(case, anatomy, placement, cache)
         check_tissues(case, anatomy)
-        shown = tuple(one.sentence for one in collected if one.severity is not Severity.NOTE)
-        anatomy = replace(anatomy, warnings=shown, findings=collected)
-        case.files.release()
-        memory.limit(MEMORY_BYTES)
-    with stages.time("trees"):
+        case.files.release()  # image and labels are read: their memory is given back
+    with stages.time("trees"):  # what questions are answered with: clearance engine, arm's checker, model of errors
         meshes = [structure.mesh for structure in anatomy.checked]
         cache_option = {"cache": cache} if engine == "fast" else {}
-        measurer = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **cache_option)
+        clearance_engine = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **cache_option)
         reach = None
         if arm is not False and placement is not None:
             reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, memory), placement.T_base_ct)
         error = None if reach is None or placement is None else pose_error(case, placement.registration)
-        chance = chance_model(case, anatomy, measurer, error)
-    return CaseContext(case, anatomy, placement, measurer, reach, chance, watcher, stages)
+        chance = chance_model(case, anatomy, clearance_engine, error)
+    return CaseContext(case, anatomy, placement, clearance_engine, reach, chance, watcher, stages)
+
+
+def _with_findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache) -> Anatomy:
+    """The anatomy with all that reading and the checks of plausibility found; what is more than a note is a warning."""
+    collected = (
+        *(Finding("reading", Severity.WARNING, one) for one in (*case.warnings, *anatomy.warnings)),
+        *anatomy.findings,
+        *findings(case, anatomy, placement, cache),
+        *(Finding("breathing", Severity.WARNING, one) for one in breath_warnings(case, anatomy)),
+    )
+    warnings = tuple(one.sentence for one in collected if one.severity is not Severity.NOTE)
+    for warning in warnings:
+        LOG.warning(warning)
+    return replace(anatomy, warnings=warnings, findings=collected)
 
 
 def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Iterator[Finding]:
@@ -253,11 +259,11 @@ def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidat
         text = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
         yield Finding("hangs_on_beyond_image", Severity.NOTE, text, {"directions": more})
     if case.needle.lengths_mm:
-        yield _catalogue(case, anatomy, engine, candidates)
+        yield _needle_catalogue(case, anatomy, engine, candidates)
 
 
 def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) -> int:
-    """How many directions only the assumed body beyond the image keeps from being safe."""
+    """How many directions are unsafe only for the body that is assumed beyond the image: safe if it ends there."""
     clearance, named = candidates.clearance, candidates.verdict.structure == BEYOND_IMAGE
     others = ~np.isnan(clearance.margins) & (np.array(clearance.structures) != BEYOND_IMAGE)
     rows = np.flatnonzero(named & (clearance.distance[:, others] >= clearance.margins[others]).all(axis=1))
@@ -265,12 +271,12 @@ def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) ->
         return 0
     narrow = replace(case, ct=replace(case.ct, beyond_mm=0.0))
     (solid,), outward = beyond_images(narrow, anatomy.skin, anatomy.scan).structures, candidates.outward_ct[rows]
-    lengths = axis_lengths(case, [solid], own_paths(case, anatomy.skin, outward))
+    lengths = axis_lengths(case, [solid], case_paths(case, anatomy.skin, outward))
     axes = FastEngine([solid.mesh]).measure(case.target_ct, outward, lengths, shown=False)
     return int((axes.distance >= case.needle.radius_mm + solid.margin_mm).sum())
 
 
-def _catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Finding:
+def _needle_catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Finding:
     """How many directions are safe with each needle, and the shortest that fits the best path of each window."""
     directions = Directions(candidates.theta, candidates.beta, candidates.outward_ct, candidates.grid)
     safe = {

@@ -44,7 +44,7 @@ class Explanation:
 
     Attributes:
         candidates: A search's result with this candidate alone.
-        facts: The same path for whoever stands at the patient.
+        facts: The path as a person at the patient sees it.
         breakdown: How sure it is; None where the case declares no errors, or the candidate was rejected before.
         read: What was read besides the case to choose it.
     """

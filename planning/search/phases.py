@@ -1,9 +1,9 @@
-"""The breath in the search: skin, organs and arm at every position of it, and between positions.
+"""Breathing in the search: skin, organs and arm at every checked position of the breath, and clearance between them.
 
-At the position s the target is at t + s b d, and a structure of weight w is displaced by s w b d (amplitude b, unit
-direction d). Seen from the structure, the needle starts at t + s b (1 - w) d: the surfaces stay where they are, and
-their engine measures from another target. What moves with the target (w = 1) is not measured again.
-What the gate lets through decides the verdict.
+At the position s (0 exhale, 1 inhale) the target is at t + s b d, and a structure of weight w is displaced by s w b d
+(amplitude b, unit direction d). Seen from the structure, the needle starts at t + s b (1 - w) d: so the surfaces stay
+where they are, and the engine measures from another target. What moves with the target (w = 1) is not measured again.
+Positions in the gate's window decide the verdict.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from puncture_twin.planning.anatomy.skin import SkinPaths
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within
 from puncture_twin.planning.case.case import Case
@@ -29,7 +29,7 @@ from puncture_twin.planning.collision.workcell import GANTRY, OF_CASE_FILE, case
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.needle.deflection import DeflectionBound
-from puncture_twin.planning.reach.standoff import axis_lengths, own_paths
+from puncture_twin.planning.reach.standoff import axis_lengths, case_paths
 from puncture_twin.planning.search.bending import bent_verdict
 from puncture_twin.planning.search.candidates import ArmColumns, BreathingColumns, Candidates, Verdict
 from puncture_twin.planning.search.constraints import ArmReach, first_broken, with_reach
@@ -38,7 +38,7 @@ from puncture_twin.planning.search.constraints import ArmReach, first_broken, wi
 def with_breathing(
     case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates, bound: DeflectionBound | None = None
 ) -> Candidates:
-    """Check what is safe through the whole breath, and reject what is not while the gate lets the needle through.
+    """Check safe candidates at every position of the breath, and reject those that are unsafe in the gate's window.
 
     Args:
         case: The case; nothing is done where it declares no breathing.
@@ -73,7 +73,7 @@ def with_breathing(
 
 
 def with_breathing_reach(case: Case, anatomy: Anatomy, candidates: Candidates, reach: ArmReach) -> Candidates:
-    """Reject what the arm cannot reach and insert along at a phase that the gate lets through.
+    """Reject candidates that the arm cannot reach, or insert along, at a phase in the gate's window.
 
     Args:
         case: The case; nothing is done where it declares no breathing.
@@ -104,7 +104,7 @@ def _at_phase(
     displaced = _displaced(anatomy, weights, breathing, s)
     solids = _with_moved_solids(case, anatomy, weights, breathing, s, reach.T_base_ct)
     there = ArmReach(case_checker(solids, displaced, reach.T_base_ct), reach.T_base_ct)
-    paths = own_paths(case, anatomy.skin, candidates.outward_ct, (1 - weights.skin) * moved)
+    paths = case_paths(case, anatomy.skin, candidates.outward_ct, (1 - weights.skin) * moved)
     path = replace(candidates.path, length=paths.path_length, skin_angle=paths.skin_angle)
     shifted = replace(candidates, path=path, arm=ArmColumns.unknown(len(candidates)))
     answered = with_reach(replace(case, target_ct=case.target_ct + moved), shifted, there)
@@ -129,7 +129,7 @@ def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s
 def _with_moved_solids(
     case: Case, anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float, T_base_ct: Floats
 ) -> Case:
-    """The case with obstacles and gantry moved as their weights say: the arm's checker takes them from it."""
+    """The case with obstacles and gantry displaced by their weights: the arm's checker reads them from the case."""
     names = [one.name for one in anatomy.checked]
     of = dict(zip(names, weights.structures.tolist(), strict=True))
 
@@ -187,7 +187,7 @@ class BreathingBody:
     def paths(self, outward_ct: Floats, s: float) -> SkinPaths:
         """Skin paths (n, 3) at a position; entries in the moved skin's own coordinates."""
         moved = (1 - self.weights.skin) * self.breathing.moved_ct(s)
-        return own_paths(self.case, self.anatomy.skin, outward_ct, moved)
+        return case_paths(self.case, self.anatomy.skin, outward_ct, moved)
 
     @property
     def demanding(self) -> Ints:
@@ -294,7 +294,7 @@ CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE
 
 
 def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:
-    """A verdict with what is rejected at one phase; what is rejected already keeps its reason.
+    """A verdict with candidates rejected that are unsafe at one phase; those rejected already keep their reason.
 
     Args:
         verdict: Of n candidates.
@@ -315,7 +315,10 @@ def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Brea
 
 
 def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
-    """The verdict with those candidates rejected that no measurement shows to be clear between two positions.
+    """The verdict with candidates rejected that are not proven clear between two positions.
+
+    A structure moves by m between them, so a clearance changes by m at most: its least in between is at least
+    (low + high - m) / 2. Where that does not suffice, the interval is halved and measured in the middle (`_checked`).
 
     Args:
         body: The case.
@@ -410,7 +413,7 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
     own = stated.get(case.target_structure, 1.0)
     if own != 1.0:
         message = f"breathing.weights: '{case.target_structure}' holds the target, and {own:g} is not its weight"
-        raise InputError(message, where=case.path, allowed="1, or no weight for it: the amplitude is the target's")
+        refuse(message, case.path, "1, or no weight for it: the amplitude is the target's", "breathing_weight")
     of = breathing.weights.of
     weights = [of(name) if weight is None else stated.get(name, weight) for name, weight in fixed.items()]
     return MovingWeights(float(of(skin) or 0.0), np.array(weights, dtype=np.float64))

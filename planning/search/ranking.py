@@ -1,6 +1,6 @@
-"""The order of the safe candidates: a weighted cost of six terms, and the Pareto front of the same terms.
+"""The order of the safe candidates: a weighted cost of six terms, and the Pareto front of these terms.
 
-One of the terms is the safe cone: by how much a needle may be off and still be safe, as far as the grid tells.
+One of the terms is the safe cone: by how much a direction may be off and still be safe, as far as the grid shows.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import AngleGrid, outward
@@ -85,7 +85,7 @@ def ranked_by(candidates: Candidates, cost: Floats) -> Candidates:
     rows = np.flatnonzero(candidates.safe)
     if cost.shape != (len(candidates),) or cost.dtype.kind not in "iufb" or not np.isfinite(cost[rows]).all():
         allowed = f"shape ({len(candidates)},), real numbers, finite for the {len(rows)} safe candidates"
-        raise InputError(f"a cost of shape {cost.shape}, {cost.dtype}", where="rerank", allowed=allowed, code="cost")
+        refuse(f"a cost of shape {cost.shape}, {cost.dtype}", "rerank", allowed, "wrong_shape")
     ranks = np.zeros(len(candidates), np.int32)
     ranks[rows[np.argsort(cost[rows], kind="stable")]] = np.arange(1, len(rows) + 1)
     ranking = Ranking(np.where(candidates.safe, cost, np.nan), ranks, candidates.ranking.pareto)
@@ -105,12 +105,14 @@ def rank(
     weights: RankingSection,
     touch_chance: Floats | None = None,
 ) -> Order:
-    """Rank candidates; all arrays have shape (n,), mm and rad.
+    """Rank candidates by the weighted mean of six terms in 0..1, 0 is best; all arrays have shape (n,), mm and rad.
 
-    The terms: 1 - min(clearance, 20 mm)/20 mm to the nearest structure with a margin, or where chances are known the
-    risk min(1, log10(p/1e-6)/6), at least 0, of touching any; path length over usable shaft;
-    skin angle over the largest allowed; length through other structures over usable shaft; 1 - reach margin
-    (0 for all where reach was not checked); 1 - min(safe cone, 5 degrees)/5 degrees (0 for all without a certificate).
+    clearance    1 - min(clearance, 20 mm) / 20 mm; where chances are known log10(p / 1e-6) / 6, of touching any
+    path_length  path length / usable shaft
+    skin_angle   skin angle / largest allowed
+    tissue       length through other structures / usable shaft
+    reach        1 - reach margin (0 for all where reach was not checked)
+    safe_cone    1 - min(safe cone, 5 degrees) / 5 degrees (0 for all where no cone is known)
     """
     terms = np.stack(
         [

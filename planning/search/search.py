@@ -1,7 +1,7 @@
 """The batch search: a case in, one checked row per direction out.
 
-`search` is the list of its stages; `organ_candidates` is the first of them: path, clearance and verdict of every
-direction for skin and organs, without the arm.
+`search` is the list of its stages. `organ_candidates`, the first, needs no arm: path, clearance and verdict of every
+direction for skin and organs.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, measure
 from puncture_twin.planning.geometry.containment import contains, crossings
-from puncture_twin.planning.reach.standoff import axis_lengths, own_lengths, own_paths
+from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths, case_paths
 from puncture_twin.planning.search.bending import with_bending
 from puncture_twin.planning.search.candidate_chances import with_best_refined, with_chances, with_joint_chances
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
@@ -38,8 +38,8 @@ def search(
 ) -> Candidates:
     """Check every direction against the organs, those that pass against the arm, and rank what is left.
 
-    One table grows, a row per direction: each stage fills its columns and rejects, with a reason, only rows that
-    every stage before it left.
+    One table grows, a row per direction: each stage fills its own columns, and rejects, with a reason, rows that every
+    stage before it accepted.
 
     Args:
         case: The validated case.
@@ -47,25 +47,25 @@ def search(
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
         directions: What to check.
         reach: Checks the arm; None leaves ``reachable`` unknown.
-        chance: Of the case's declared errors; None leaves the chances blank.
+        chance: Model of the case's declared errors; None leaves the chances to hit and to touch blank.
         progress: Called with (candidates checked, candidates to check) while the arm is checked.
     """
-    axes = None if chance is None else organ_distances(case, anatomy, engine, directions)
+    axes = None if chance is None else organ_distances(case, anatomy, engine, directions)  # two stages read them
     candidates = organ_candidates(case, anatomy, engine, directions, axes)  # skin entry, clearance, bending, breathing
-    candidates = with_grid_cone(candidates)
+    candidates = with_grid_cone(candidates)  # by how much a direction may be off and still be safe for the organs
     if reach is not None:
-        candidates = with_reach(case, candidates, reach, progress)
-        candidates = with_breathing_reach(case, anatomy, candidates, reach)
-    candidates = with_chances(case, anatomy, candidates, chance, axes)
-    candidates = ranked(case, candidates)
-    candidates = with_best_refined(candidates, chance)  # ranks anew what it rejects
-    return with_joint_chances(candidates, chance)
+        candidates = with_reach(case, candidates, reach, progress)  # inverse kinematics and collisions, to the target
+        candidates = with_breathing_reach(case, anatomy, candidates, reach)  # the same, the patient breathing
+    candidates = with_chances(case, anatomy, candidates, chance, axes)  # of hitting the target, of touching structures
+    candidates = ranked(case, candidates)  # cost, rank, Pareto front
+    candidates = with_best_refined(candidates, chance)  # chances of the best by sampling; ranks again if it rejects
+    return with_joint_chances(candidates, chance)  # of touching any structure, for the best
 
 
 def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> AxisDistances:
-    """Distances of the needle's axis from every structure in every direction."""
+    """Distances of the needle's axis from every structure, in every direction."""
     outward = directions.outward_ct
-    return engine.measure(case.target_ct, outward, own_lengths(case, anatomy, outward))
+    return engine.measure(case.target_ct, outward, case_axis_lengths(case, anatomy, outward))
 
 
 def organ_candidates(
@@ -75,21 +75,21 @@ def organ_candidates(
     directions: Directions,
     axes: AxisDistances | None = None,
 ) -> Candidates:
-    """Check every direction against skin and organs alone, bent and breathing as declared; nothing is ranked yet.
+    """Check every direction against skin and organs, needle bending and breathing included; without arm and ranks.
 
     Args:
         case: The validated case.
         anatomy: Its structures.
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
         directions: What to check.
-        axes: What `organ_distances` says of them; None measures them here.
+        axes: Their `organ_distances`; None measures them here.
     """
     needle, outward, checked = case.needle, directions.outward_ct, anatomy.checked
-    paths = own_paths(case, anatomy.skin, outward)
-    lengths = axis_lengths(case, checked, paths)
+    paths = case_paths(case, anatomy.skin, outward)  # where each path crosses the skin, and at which angle
+    lengths = axis_lengths(case, checked, paths)  # how far out each axis is checked
     clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes)
     demanding, count = np.array([s.demands_margin for s in checked], bool), len(directions)
-    candidates = Candidates(
+    candidates = Candidates(  # a straight needle, the patient as the CT shows them
         theta=directions.theta,
         beta=directions.beta,
         outward_ct=outward,
@@ -121,8 +121,8 @@ def tissue_crossed(
 ) -> Floats:
     """Length of each path, target to skin, inside structures that may be crossed; shape (n,), mm.
 
-    Counted are roles ``traverse`` and ``target``, but not the target's own structure, and only closed surfaces: of an
-    open one the inside is not known. Nested structures count each.
+    These are structures of role ``traverse`` or ``target`` other than the target's own, and closed: an open surface has
+    no inside. Where structures are nested, each one counts.
     """
     total = np.zeros(len(outward_ct))
     for structure in structures:
@@ -135,15 +135,16 @@ def tissue_crossed(
 def inside_length(structure: Structure, target_ct: Floats, outward_ct: Floats, path_length: Floats) -> Floats:
     """Length of each path inside one closed structure, shape (n,), mm.
 
-    Crossings alternate between leaving and entering, so the length is their alternating sum, closed by the path's
-    end where the path ends inside.
+        length = d_1 - d_2 + d_3 - ... (+ path length, where the path ends inside)        for a target inside
+
+    d_i: depths of the ray's crossings, which leave and enter by turns; all signs are reversed for a target outside.
     """
     crossing = crossings(structure.mesh, target_ct, outward_ct)
     starts_inside = contains(structure.mesh, target_ct)
     limit = np.nan_to_num(path_length, nan=0.0)
     number = np.arange(len(crossing.ray)) - crossing.first[crossing.ray]  # 0 for a ray's first crossing
     sign = np.where((number % 2 == 0) == starts_inside, 1.0, -1.0)
-    signed = sign * np.minimum(crossing.depth, limit[crossing.ray])  # what is beyond the skin cancels
+    signed = sign * np.minimum(crossing.depth, limit[crossing.ray])  # crossings beyond the skin cancel in pairs
     inside = np.bincount(crossing.ray, weights=signed, minlength=len(outward_ct))
     ends_inside = (crossing.count % 2 == 0) == starts_inside
     return np.asarray(np.maximum(inside + np.where(ends_inside, limit, 0.0), 0.0))

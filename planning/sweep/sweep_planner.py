@@ -15,7 +15,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import away_from_singularities, flange_pose, slowed
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.collision.checker import CellChecker
@@ -28,7 +28,7 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.reach.reach import approach_goals
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.reach.survey import ReachRequest
-from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
 from puncture_twin.planning.search.explain import reason_text
 
 
@@ -83,7 +83,7 @@ def plan_sweep(
     Args:
         context: Of a case that says where the arm's base is.
         start: Theta and beta, rad.
-        end: The same; beta goes the shorter way around.
+        end: (theta, beta) of the end; beta takes the shorter arc.
         seed: Of the approach's planner.
         progress: Called with directions checked and all of them.
 
@@ -92,14 +92,14 @@ def plan_sweep(
         NoAnswerError: The first directions are not allowed, or no approach to them was found.
     """
     if context.reach is None:
-        raise InputError("the case does not say where the robot stands", where=context.case.path, allowed=_BASE)
+        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
     route = _allowed(context, _angles(start, end), progress)
     point = apply(context.reach.T_base_ct, context.case.target_ct)
     T_base_ct, frame = context.reach.T_base_ct, context.case.T_ct_entry[:3, :3]
     directions = outward(route.angles[:, 0], route.angles[:, 1]) @ (T_base_ct[:3, :3] @ frame).T
     q, stopped = _farthest(context, point, directions, route)
     if len(q) < 2:
-        raise NoAnswerError(f"no sweep: {stopped}")
+        raise NoAnswerError(f"no sweep: {stopped}", code="sweep_stops")
     speeds, checker = context.case.robot.speeds, context.reach.checker
     approach = plan_approach(checker, home_configuration(context.case), q[0], seed=seed, speeds=speeds)
     rotated = np.arccos(np.clip(np.vecdot(directions[1 : len(q)], directions[: len(q) - 1]), -1.0, 1.0))
@@ -109,7 +109,8 @@ def plan_sweep(
         dense_states(checker, sweep.q, RESOLUTION_RAD / FINER), needle_may_touch_patient=False
     )
     if contact is not None:
-        raise NoAnswerError(f"no sweep: between its directions {contact.contact.body} touches {contact.contact.other}")
+        what = f"no sweep: between its directions {contact.contact.body} touches {contact.contact.other}"
+        raise NoAnswerError(what, code="motion_touches")
     length = context.case.needle.length_mm
     return SweepPlan(
         checker.model,
@@ -124,15 +125,12 @@ def plan_sweep(
     )
 
 
-_BASE = "[registration] with markers, or [robot.mount]"
-
-
 def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:
     """Directions on the straight line, shape (k, 2), rad, `STEP` apart at most."""
     change = np.array([end[0] - start[0], (end[1] - start[1] + np.pi) % (2 * np.pi) - np.pi])
     count = int(np.ceil(np.abs(change).max() / STEP))
     if count == 0:
-        raise InputError("a sweep to where it starts", where="--to", allowed="another direction")
+        refuse("a sweep to where it starts", "--to", "another direction", "no_motion")
     return np.asarray(start + np.linspace(0.0, 1.0, count + 1)[:, None] * change)
 
 

@@ -15,12 +15,12 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import away_from_singularities, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
 from puncture_twin.planning.touch.touch_planner import PLANNED_PADDING_MM, approach_checkers
 from puncture_twin.planning.touch.tour_motions import (
     ApproachCheckers,
@@ -42,7 +42,7 @@ RADII = (0.6, 0.8, 0.45)
 """Distances from the shoulder at which the flange is tried, over the arm's reach without its wrist."""
 
 HEIGHTS = (0.0, 0.3, -0.3, 0.6)
-"""Heights above the shoulder at which it is tried, likewise."""
+"""Heights above the shoulder at which the flange is tried, over the same reach."""
 
 SIDES = 12
 """Directions from the base in which they lie."""
@@ -69,7 +69,7 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
         NoAnswerError: No place, or not this one, can be touched in so many poses, or no motion was found.
     """
     if context.reach is None:
-        raise InputError("no robot", where=context.case.path, allowed="a case with [robot], placed in its base frame")
+        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
     checkers = approach_checkers(context, PLANNED_PADDING_MM)
     places, most = _places(context) if place_base is None else [place_base], 0
     for place in places:
@@ -84,7 +84,8 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
         except NoMotionError:
             continue
     where = "no place was found that can" if place_base is None else "this place cannot"
-    raise NoAnswerError(f"{where} be touched in {count} poses by free motions: {most} poses at most")
+    what = f"{where} be touched in {count} poses by free motions: {most} poses at most"
+    raise NoAnswerError(what, code="too_few_poses")
 
 
 def spread_poses(R_base_flange: Floats, count: int) -> list[int]:

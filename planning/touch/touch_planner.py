@@ -1,4 +1,7 @@
-"""The planning of touches: poses in which the arm's errors cancel best at the target, a short tour, its motions."""
+"""The planning of touches: poses in which the arm's errors cancel best at the target, a short tour, its motions.
+
+`plan_touches` is the list of its stages: markers that can be touched, a pose for each, a tour through them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ import numpy as np
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool, outside_surface
@@ -36,15 +39,15 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError, expected_er
 from puncture_twin.planning.uncertainty.touch_choice import Candidates, least_error, touch_candidates
 
 PLANNED_PADDING_MM = 4.0
-"""Kept between the shaft of a touching needle and the patient where the markers are believed: they lie elsewhere."""
+"""Distance of a touching needle's shaft from the patient in a plan: the markers are only believed to be there."""
 
 TOUCHING_PADDING_MM = 1.0
-"""Padding when the line was set onto the marker."""
+"""The same distance while touching, when the needle's line was set onto the marker."""
 
 ALLOWED = "a case with [errors] and markers, which say where to touch and how sure that is"
 
 MOST_MARKERS = 12
-"""The order of more takes too long to be the best one."""
+"""Markers at most: the shortest tour of more takes too long to find."""
 
 
 def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progress: Count) -> TouchPlan:
@@ -52,7 +55,7 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
 
     Args:
         context: Of a case with declared errors, markers and an arm.
-        q_insertion: Shape (6,), rad, the tip on the target: what the touches shall be good for.
+        q_insertion: Shape (6,), rad, the tip on the target: where the error of the touches is to be least.
         seed: Of the motions' planner.
         progress: Called with motions done and all of them.
 
@@ -62,22 +65,20 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
             found.
     """
     every = _task(context, q_insertion)
-    open_markers = _open(every)
-    while True:
-        task = every.of(open_markers.rows)
-        error = _error(task, every, open_markers.left_out)
-        chosen, worst = (
-            least_error(error, open_markers.candidates, q_insertion, worst=worst) for worst in (False, True)
-        )
+    touchable = _touchable(every)
+    while True:  # until a motion leads to each marker that is left
+        task = every.of(touchable.rows)
+        error = _error(task, every, touchable.left_out)
+        chosen, worst = (least_error(error, touchable.candidates, q_insertion, worst=worst) for worst in (False, True))
         stops = Stops(task.markers.names, task.markers.points_base, chosen)
         try:
             tour = tour_through(context, stops, seed=seed, progress=progress)
         except NoMotionError as none:
-            open_markers = open_markers.without(none.place, task.markers.names[none.place], str(none))
+            touchable = touchable.without(none.place, task.markers.names[none.place], str(none))
             continue
         return TouchPlan(
             **vars(tour),
-            left_out=open_markers.left_out,
+            left_out=touchable.left_out,
             expected_mm=task.expected_mm(chosen),
             worst_mm=task.expected_mm(worst),
         )
@@ -89,8 +90,8 @@ class _Task:
 
     Attributes:
         context: The case.
-        markers: Those that are touched; their points in the base frame are where they are believed to be.
-        method: Of the registration that they are for.
+        markers: Those to touch; ``points_base`` are where they are believed to be.
+        method: Of the registration by these touches.
         q_insertion: Shape (6,), rad, the tip on the target.
     """
 
@@ -110,7 +111,7 @@ class _Task:
         return self.context.case.needle.length_mm
 
     def of(self, rows: Sequence[int]) -> _Task:
-        """The task with some of its markers."""
+        """The same task for some of its markers."""
         at, names = list(rows), self.markers.names
         points_ct, points_base = self.markers.points_ct[at], self.markers.points_base[at]
         return replace(self, markers=MarkerPairs(tuple(names[row] for row in at), points_ct, points_base))
@@ -139,18 +140,18 @@ class _Task:
         return expected_error_mm(self.error(q_touch), self.q_insertion)
 
 
-class _Open(NamedTuple):
-    """The markers that can be touched, as rows, with the poses that the workcell leaves, and why others cannot."""
+class _Touchable(NamedTuple):
+    """The markers that can be touched, as rows, with free touch poses (n, 6) for each, and why the others cannot."""
 
     rows: tuple[int, ...]
     candidates: tuple[Floats, ...]
     left_out: dict[str, str]
 
-    def without(self, place: int, name: str, why: str) -> _Open:
-        """The open markers without the one at a place of ``rows``."""
+    def without(self, place: int, name: str, why: str) -> _Touchable:
+        """The touchable markers without that at index ``place`` of ``rows``."""
         rows, candidates = list(self.rows), list(self.candidates)
         del rows[place], candidates[place]
-        return _Open(tuple(rows), tuple(candidates), {**self.left_out, name: why})
+        return _Touchable(tuple(rows), tuple(candidates), {**self.left_out, name: why})
 
 
 def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
@@ -162,11 +163,12 @@ def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
     why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
     count = f"{len(task.markers)} of {len(every.markers)} markers can be touched"
     if len(task.markers) < MIN_MARKERS:
-        raise NoAnswerError(f"{count}, {MIN_MARKERS} are needed: {why}")
+        raise NoAnswerError(f"{count}, {MIN_MARKERS} are needed: {why}", code="too_few_markers")
     try:
         return task.error(task.q_insertion)
     except InputError as error:
-        raise NoAnswerError(f"{count}, which do not suffice: {error.what}" + (f"; {why}" if why else "")) from error
+        what = f"{count}, which do not suffice: {error.what}" + (f"; {why}" if why else "")
+        raise NoAnswerError(what, code=error.code) from error
 
 
 def expected_of_touches(context: CaseContext, q_insertion: Floats, read: NamedPoints) -> float:
@@ -212,11 +214,11 @@ def registered(context: CaseContext, read: NamedPoints) -> Registration:
 def _task(context: CaseContext, q_insertion: Floats) -> _Task:
     placement = context.placement
     if context.reach is None or placement is None or placement.registration is None or context.case.errors is None:
-        raise InputError("no touches can be planned", where=context.case.path, allowed=ALLOWED)
+        refuse("no touches can be planned", context.case.path, ALLOWED, "no_markers")
     found = placement.registration.markers
     if len(found) > MOST_MARKERS:
-        where = f"{context.case.path}: registration"
-        raise InputError(f"{len(found)} markers", where=where, allowed=f"at most {MOST_MARKERS}: see registration.use")
+        what = f"{len(found)} markers"
+        refuse(what, f"{context.case.path}: registration", f"at most {MOST_MARKERS}: see registration.use", "too_many")
     believed = MarkerPairs(found.names, found.points_ct, apply(placement.T_base_ct, found.points_ct))
     return _Task(context, believed, cast(Method, placement.registration.method), q_insertion)
 
@@ -240,8 +242,8 @@ def approach_checkers(context: CaseContext, needle_padding_mm: float) -> Approac
     return ApproachCheckers(context.reach.checker, blunted)
 
 
-def _open(task: _Task) -> _Open:
-    """Poses of each marker that reach it and are clear."""
+def _touchable(task: _Task) -> _Touchable:
+    """Poses for each marker that put the tip on it without contact."""
     checkers = approach_checkers(task.context, PLANNED_PADDING_MM)
     rows, candidates, left_out = [], [], {}
     for row, (name, point) in enumerate(zip(task.markers.names, task.markers.points_base, strict=True)):
@@ -251,11 +253,11 @@ def _open(task: _Task) -> _Open:
             candidates.append(free)
         else:
             left_out[name] = why
-    return _Open(tuple(rows), tuple(candidates), left_out)
+    return _Touchable(tuple(rows), tuple(candidates), left_out)
 
 
 def _free(checkers: ApproachCheckers, tip_mm: float, candidates: Candidates) -> tuple[Floats, str]:
-    """Free poses of the insertion's own branch, else of the others; and what blocks most often."""
+    """Free poses (n, 6), in the insertion's own branch if it has any; where no branch has, what blocks most often."""
     reasons: list[str] = []
     for q in (candidates.alike, candidates.others):
         blocked_by = [why_not(checkers, tip_mm, one) for one in q]

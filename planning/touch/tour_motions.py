@@ -81,7 +81,7 @@ class TouchPlan(TouchTour):
     Attributes:
         left_out: Marker to why it is not touched, in words.
         expected_mm: Of the tip at the target when the registration comes from these touches (rms), mm.
-        worst_mm: The same with the worst of the poses that could be taken, mm.
+        worst_mm: ``expected_mm`` with the worst of the poses that could be taken, mm.
     """
 
     left_out: Mapping[str, str]
@@ -96,9 +96,9 @@ RESOLUTION = 1e-9
 class NoMotionError(NoAnswerError):
     """Raised where no motion leads to the standoff of one of the touches."""
 
-    def __init__(self, place: int, why: str) -> None:
+    def __init__(self, place: int, why: str, code: str) -> None:
         self.place = place
-        super().__init__(why)
+        super().__init__(why, code=code)
 
 
 class Stops(NamedTuple):
@@ -134,7 +134,7 @@ def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Cou
             found = plan_approach(checker, places[start], places[end], seed=seed, speeds=case.robot.speeds)
         except NoAnswerError as error:
             if end in order:
-                raise NoMotionError(end, str(error)) from error
+                raise NoMotionError(end, str(error), error.code) from error
             raise
         legs.append(found.trajectory)
         progress(len(legs), len(places))
@@ -197,7 +197,7 @@ class ApproachCheckers:
 
     Attributes:
         whole: The arm with its needle.
-        blunted: The same with a needle that is `TIP_MM` shorter.
+        blunted: The checker of a needle that is `TIP_MM` shorter.
     """
 
     whole: CellChecker
@@ -291,7 +291,7 @@ def registered_joints(
     every = nearest_within_limits(model, inverse(model, T)[0], q_insertion)
     away = np.abs(every - q_insertion).max(axis=1)
     if np.isnan(away).all():
-        raise NoAnswerError("the arm does not reach the target where the touches put it")
+        raise NoAnswerError("the arm does not reach the target where the touches put it", code="out_of_reach")
     return np.asarray(every[int(np.nanargmin(away))])
 
 
@@ -316,7 +316,8 @@ def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
     standoff = float(standoffs(case.needle, paths.path_length[0], paths.skin_angle[0]))
     line = line_to(model, tip_mm, q, standoff, 0.0)
     if line is None:
-        raise NoAnswerError("the arm cannot follow the needle's line to the target where the touches put it")
+        what = "the arm cannot follow the needle's line to the target where the touches put it"
+        raise NoAnswerError(what, code="out_of_reach")
     approach = plan_approach(
         checker, home_configuration(case), line[0], seed=case.rehearsal.seed, speeds=speeds
     ).trajectory
@@ -345,5 +346,5 @@ def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
     )
     touched = motion_contact(plan, checker)
     if touched is not None:
-        raise NoAnswerError(touched)
+        raise NoAnswerError(touched, code="motion_touches")
     return replace(plan, roll=roll_of(plan))

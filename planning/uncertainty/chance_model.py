@@ -14,11 +14,11 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, normals_of
-from puncture_twin.planning.reach.standoff import own_lengths
+from puncture_twin.planning.reach.standoff import case_axis_lengths
 from puncture_twin.planning.uncertainty.hit import (
     HitModel,
     hit_model,
@@ -96,7 +96,7 @@ class ChanceModel:
         """Needles with their covariances and proximity to the structures; arguments as of `chances`."""
         target, columns = self.case.target_ct, self.columns
         if axes is None:
-            lengths = own_lengths(self.case, self.anatomy, outward_ct)
+            lengths = case_axis_lengths(self.case, self.anatomy, outward_ct)
             axes = self.engine.measure(target, outward_ct, lengths, shown=False)
         normal = normals_of(self.engine.triangles, target, outward_ct, axes)[:, columns]
         distance, depth = axes.distance[:, columns], axes.depth[:, columns]
@@ -149,11 +149,11 @@ def chance_model(case: Case, anatomy: Anatomy, engine: ClearanceEngine, error: P
     taken = [anatomy.checked[column].name for column in demanding(anatomy.checked)]
     if not TAKEN.isdisjoint(taken):
         message = f"structures {', '.join(sorted(TAKEN.intersection(taken)))}: p_touch_<name> is another column"
-        raise InputError(message, where=case.path, allowed="other names than any and joint")
+        refuse(message, case.path, "other names than any and joint", "reserved_name")
     mesh = anatomy.structure(case.target_structure).mesh
     if case.hit_radius_mm is None and not mesh.closed:
         message = f"the mesh of '{case.target_structure}' is open: what lies in it, and is hit, is not known"
-        raise InputError(message, where=case.path, allowed="target.hit_radius_mm, or a closed mesh")
+        refuse(message, case.path, "target.hit_radius_mm, or a closed mesh", "open_mesh")
     return ChanceModel(case, anatomy, engine, error, hit_model(case.hit_radius_mm, mesh, case.target_ct))
 
 
@@ -170,7 +170,7 @@ def refined_chances(
         wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
     """
     every = np.ones(first.touch.shape, bool)
-    blocks, lengths = model.engine.blocks, own_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
+    blocks, lengths = model.engine.blocks, case_axis_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
     around = Surroundings(tuple(blocks[column] for column in model.columns), lengths, model.case.target_ct)
     needles = model.needles(outward_ct, q)
     touch = refined(around, needles, model.touching, first.touch, every if wanted is None else wanted)
@@ -239,7 +239,7 @@ class Chances:
         return cls(structures, refined=np.zeros(count, bool), **blank)
 
     def put(self, rows: Ints, known: Chances) -> Chances:
-        """These chances with some candidates' replaced."""
+        """These chances with those of some candidates replaced."""
         values = {field.name: getattr(self, field.name).copy() for field in fields(self) if field.name != "structures"}
         for name, value in values.items():
             value[rows] = getattr(known, name)
@@ -267,13 +267,13 @@ def check_limits(case: Case, anatomy: Anatomy, error_known: bool) -> None:
     if limited and not error_known:
         message = "search.min_hit and max_touch cannot be checked: only markers and the arm give the needle's error"
         allowed = "[registration] with markers, and a search with the arm; or no such limit"
-        raise InputError(message, where=case.path, allowed=allowed)
+        refuse(message, case.path, allowed, "no_needle_error")
     names = [anatomy.checked[column].name for column in demanding(anatomy.checked)]
     unknown = sorted(set(settings.max_touch_of) - set(names))
     if unknown:
         message = f"search.max_touch_of '{unknown[0]}' is no structure that must not be touched"
         message += did_you_mean(unknown[0], names)
-        raise InputError(message, where=case.path, allowed=", ".join(names))
+        refuse(message, case.path, ", ".join(names), "unknown_structure")
 
 
 def touch_limit(case: Case, name: str) -> float:

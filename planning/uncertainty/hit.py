@@ -58,7 +58,7 @@ class HitModel:
 
 
 def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:
-    """By the radius where there is one, else by the mesh of the target's structure."""
+    """Model of hitting the target: by its radius where one is stated, else by the mesh of its structure."""
     return HitModel(radius_mm, None if radius_mm is not None else target_rays(mesh, target_ct))
 
 

@@ -304,7 +304,7 @@ class NeedleUncertainty:
 
     @cached_property
     def _widths(self) -> Callable[[float], tuple[float, float, float]]:
-        """By length of the axis: largest displacement of tip (mm), other end (mm) and direction (rad) per deviation."""
+        """Largest displacement of tip (mm), other end (mm) and direction (rad) per deviation, by length of the axis."""
         shift, lean = self.root[:3], self.root[3:]
         tip, turn = float(np.linalg.norm(shift, 2)), float(np.linalg.norm(lean, 2))
 
@@ -324,8 +324,8 @@ def needle_uncertainty(
         origin: Shape (3,), mm, the covariance's point of reference.
         outward: Shape (3,), unit.
         cov_ct: Shape (6, 6), CT axes.
-        surface_mm: As there.
-        freedom: As there.
+        surface_mm: Deviation of each structure's surface, mm, as in `proximity`.
+        freedom: Of the errors' size, as in `touch_chance`.
     """
     across = frame_about(outward)[:, :2]
     keep = np.zeros((6, 5))

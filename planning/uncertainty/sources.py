@@ -21,14 +21,14 @@ NOT_MODELLED: Mapping[str, tuple[str, str]] = MappingProxyType(
         ),
     }
 )
-"""What no source stands for, which is something else than 0; and where the case declares it, what is done instead."""
+"""Effects that no source models, which does not make them 0; and where the case declares them, what is done instead."""
 
 NAMED = 3
 """Meshes that are named; of more their number is stated."""
 
 
 def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
-    """What the chances of a case leave out, in words: undeclared errors, and those counted elsewhere.
+    """Sentences on what the chances of a case leave out: undeclared errors, and those counted elsewhere.
 
     Args:
         case: The case.

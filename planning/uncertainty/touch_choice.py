@@ -56,7 +56,8 @@ def choose_touches(error: PoseError, points_base: Floats, q_insertion: Floats) -
     for point, q in zip(points_base, candidates, strict=True):
         if not len(q):
             place = ", ".join(f"{value:.1f}" for value in point)
-            raise NoAnswerError(f"a {error.model.name} cannot touch ({place}) mm near the insertion's orientation")
+            what = f"a {error.model.name} cannot touch ({place}) mm near the insertion's orientation"
+            raise NoAnswerError(what, code="marker_out_of_reach")
     return least_error(error, candidates, q_insertion)
 
 

@@ -8,14 +8,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from puncture_twin.planning.anatomy.anatomy import ball
 from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
 from puncture_twin.planning.anatomy.unseen import OUTLINE_MM, REACH_MM, USUAL_MM, assumed, beyond_image
 from puncture_twin.planning.case.settings import CtSettings
 from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.mesh import joined
 from puncture_twin.planning.geometry.rigid import exp_rotation
 
 SIZE = np.array([300.0, 240.0, 180.0])
 HEAD, LEFT = (2, 1), (0, 1)
+TRUNK, RIGHT_ARM, LEFT_ARM = [((0, 0, 0), 150)], ((-350, 0, 0), 50), ((350, 40, 0), 50)
+"""Balls."""
 
 
 def box_with(*faces, T_ct_box=None):
@@ -107,18 +111,24 @@ def test_a_breath_brings_it_nearer():
 
 
 @pytest.mark.parametrize(
-    ("stated", "region", "cut", "wider"),
+    ("stated", "region", "cut", "parts", "wider"),
     [
-        ({}, "abdomen", [HEAD], np.inf),
-        ({"arms": "none"}, "abdomen", [HEAD], USUAL_MM),
-        ({}, "phantom", [HEAD], USUAL_MM),
-        ({"arms": "present"}, "abdomen", [HEAD], USUAL_MM),
-        ({"arms": "present"}, "abdomen", [HEAD, LEFT], np.inf),
-        ({"arms": "none", "beyond_mm": np.inf}, "phantom", [HEAD], np.inf),
-        ({"beyond_mm": 0.0}, "abdomen", [HEAD, LEFT], 0.0),
+        ({}, "abdomen", [HEAD], TRUNK, np.inf),
+        ({}, "abdomen", [HEAD], [*TRUNK, RIGHT_ARM], np.inf),
+        ({}, "abdomen", [HEAD], [*TRUNK, RIGHT_ARM, ((350, 0, 0), 20)], np.inf),
+        ({}, "abdomen", [HEAD], [*TRUNK, RIGHT_ARM, ((0, 250, 0), 50)], np.inf),
+        ({}, "abdomen", [HEAD], [*TRUNK, RIGHT_ARM, LEFT_ARM], USUAL_MM),
+        ({}, "abdomen", [HEAD, LEFT], [*TRUNK, RIGHT_ARM, LEFT_ARM], np.inf),
+        ({"arms": "none"}, "abdomen", [HEAD], TRUNK, USUAL_MM),
+        ({}, "phantom", [HEAD], TRUNK, USUAL_MM),
+        ({"arms": "present"}, "abdomen", [HEAD], TRUNK, USUAL_MM),
+        ({"arms": "present"}, "abdomen", [HEAD, LEFT], TRUNK, np.inf),
+        ({"arms": "none", "beyond_mm": np.inf}, "phantom", [HEAD], TRUNK, np.inf),
+        ({"beyond_mm": 0.0}, "abdomen", [HEAD, LEFT], TRUNK, 0.0),
     ],
 )
-def test_what_is_assumed(stated, region, cut, wider):
-    """A person's word first; the usual where no arm can lie beyond; else nothing is excluded."""
+def test_what_is_assumed(stated, region, cut, parts, wider):
+    """A person's word first; the usual where no arm can lie beyond, or both are seen; else nothing is excluded."""
     case = SimpleNamespace(ct=CtSettings(**stated), region=region)
-    assert assumed(case, box_with(*cut)).wider_mm == wider
+    skin = SimpleNamespace(mesh=joined([ball(np.array(middle, float), radius) for middle, radius in parts]))
+    assert assumed(case, box_with(*cut), skin).wider_mm == wider

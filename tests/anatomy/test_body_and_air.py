@@ -7,12 +7,12 @@ import pytest
 import scipy
 import SimpleITK as sitk  # noqa: N813
 from case_world import whole
+from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN, ball
 from puncture_twin.planning.anatomy.body.body_mask import body_mask, filled_slices
 from puncture_twin.planning.anatomy.body.unscanned import BLANK_HU, find_unscanned, measured_hu
-from puncture_twin.planning.anatomy.second_witness import Named
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.certify.checker import verify
@@ -376,7 +376,7 @@ def test_two_cts_are_refused(scene):
     folder, _ = scene("alone")
     (folder / "other.nii.gz").write_bytes((folder / "ct.nii.gz").read_bytes())
     path = write_case(folder, more='[ct]\nfile = "other.nii.gz"', name="two")
-    with pytest.raises(InputError, match="is not the CT of the skin"):
+    with refused("several_cts"):
         prepare(path, arm=False)
 
 
@@ -384,7 +384,7 @@ def test_two_cts_are_refused(scene):
 def test_a_level_of_air_that_cannot_be_is_refused(scene, level):
     """``air_hu`` between air and fat."""
     folder, _ = scene("alone")
-    with pytest.raises(InputError, match="air_hu"):
+    with refused("bad_value", "air_hu"):
         load_case(write_case(folder, more=f"[ct]\nair_hu = {level!r}".replace("'", '"'), name="level"))
 
 
@@ -406,7 +406,7 @@ def test_what_a_person_declares_stands_in_every_result(scene):
 def test_what_cannot_be_declared_is_refused(scene, line):
     """The key is named."""
     folder, _ = scene("alone")
-    with pytest.raises(InputError, match=line.split()[0]):
+    with refused("bad_value", line.split()[0]):
         load_case(write_case(folder, more=f"[ct]\n{line}", name="undeclared"))
 
 
@@ -420,7 +420,7 @@ def test_a_table_that_touches_the_back_is_no_body(scene):
     assert rows.sum() > 100
     assert not found.safe[rows].any()
     assert found.safe.sum() > 40
-    assert any("flat at its back side" in warning for warning in context.anatomy.warnings)
+    assert any("at its back side" in warning for warning in context.anatomy.warnings)
 
 
 def test_a_board_under_a_third_of_the_image_is_no_body(tmp_path):
@@ -436,7 +436,7 @@ def test_a_board_under_a_third_of_the_image_is_no_body(tmp_path):
     assert rows.sum() > 100
     assert not found.safe[rows].any()
     assert found.safe.sum() > 40
-    assert any("flat at its back side" in warning for warning in prepared.anatomy.warnings)
+    assert any("at its back side" in warning for warning in prepared.anatomy.warnings)
 
 
 @pytest.mark.parametrize(
@@ -529,9 +529,8 @@ def test_a_ct_that_is_shifted_against_the_skin_is_refused(scene):
         if not shift:
             assert "labels_beside_image" not in {one.code for one in prepare(path, arm=False).anatomy.findings}
             continue
-        with pytest.raises(InputError) as caught:
+        with refused("labels_beside_image"):
             prepare(path, arm=False)
-        assert caught.value.code == "labels_beside_image"
 
 
 def test_a_table_beside_a_long_image_is_drawn_as_far_as_is_plausible(tmp_path):
@@ -552,7 +551,7 @@ def test_a_ct_of_another_place_is_refused(scene):
     write_trunk(folder, parts, supine.grid())
     crop(folder, np.s_[:, :, :], move_mm=(1000.0, 0.0, 0.0))
     path = write_case(folder, skin=TRUNK_SKIN, more='[ct]\nfile = "crop.nii.gz"', name="elsewhere")
-    with pytest.raises(InputError, match="does not show the target"):
+    with refused("target_outside_ct"):
         prepare(path, arm=False)
 
 
@@ -575,7 +574,10 @@ def test_what_is_padded_around_a_circle_was_not_scanned():
     hu = np.random.default_rng(1).normal(-1000.0, 15.0, (80, 80, 12)).clip(-1024)
     for padding in (-3024.0, -1024.0, -1000.0, 0.0):
         padded = np.where(disc(39.0)[:, :, None], hu, padding)
-        assert np.array_equal(find_unscanned(padded).voxels, np.broadcast_to(~disc(39.0)[:, :, None], hu.shape))
+        found = find_unscanned(padded)
+        assert found[~disc(39.0)].all()
+        assert not (found[disc(39.0)] & (padded[disc(39.0)] != padding)).any()
+        assert found[disc(36.0)].sum() == 0
 
 
 def beyond_slab(grid):
@@ -612,7 +614,7 @@ def test_a_slice_of_one_value_was_not_scanned(value):
     hu = np.random.default_rng(1).normal(-1000.0, 15.0, (40, 40, 12))
     assert measured_hu(hu)[0] is hu
     hu[:, :, 5] = value
-    assert np.array_equal(find_unscanned(hu).voxels, np.broadcast_to(np.arange(12) == 5, hu.shape))
+    assert np.array_equal(find_unscanned(hu), np.broadcast_to(np.arange(12) == 5, hu.shape))
     assert (measured_hu(hu)[0][:, :, 5] == (BLANK_HU if value == 0.0 else value)).all()
 
 
@@ -621,11 +623,11 @@ def test_constant_air_about_a_body_was_scanned():
     still = np.where(disc(25.0)[:, :, None], 40.0, np.full((80, 80, 12), -1000.0))
     clipped = np.random.default_rng(1).normal(-1024.0, 15.0, (80, 80, 12)).clip(-1024)
     ball = np.where(sum((np.indices((99, 99, 99)) - 49.0) ** 2) < 45.0**2, 40.0, -1000.0)
-    assert not find_unscanned(still).voxels.any()
-    assert not find_unscanned(ball).voxels.any()
-    assert not find_unscanned(clipped).voxels.any()
+    assert not find_unscanned(still).any()
+    assert not find_unscanned(ball).any()
+    assert not find_unscanned(clipped).any()
     blanked = np.where(disc(30.0)[:, :, None], np.random.default_rng(1).normal(40.0, 15.0, (80, 80, 12)), -1024.0)
-    assert not find_unscanned(blanked).voxels.any()
+    assert not find_unscanned(blanked).any()
 
 
 def test_an_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_path):

@@ -1,4 +1,4 @@
-"""Limbs pressed against a trunk: found by neck, by long bone and by air about their bones; none in a trunk or head."""
+"""Limbs pressed against a trunk: found by neck and by air about their bones; none in a trunk or head."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from places import DATA, REAL_CT
 from puncture_twin.planning.anatomy.anatomy import ball
 from puncture_twin.planning.anatomy.body.body_mask import CtImage, ct_image
 from puncture_twin.planning.anatomy.body.limbs import limb_search
-from puncture_twin.planning.anatomy.second_witness import Named
+from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 
 CT = REAL_CT / "ct.nii.gz"
@@ -67,10 +67,7 @@ def test_the_bone_of_an_arm_beside_the_trunk_is_found(slope):
     line = (36.0, 165.0 - 90.0 * slope, 0.0), (36.0, 165.0 + 90.0 * slope, 180.0)
     hu, body = image(line, radius=32.0, bone=10.0)
     hu[about(*line) < 4.0] = 30.0
-    found = search(hu, body)
-    (bone,) = found._rods()
-    assert np.abs(np.argwhere(bone)[:, 0] * 4.0 - 36.0).max() <= 12.0
-    assert found.limbs()[(about(*line) < 32.0) & ~TRUNK].mean() > 0.9
+    assert search(hu, body).limbs()[(about(*line) < 32.0) & ~TRUNK].mean() > 0.9
 
 
 @pytest.mark.parametrize("line", [ACROSS, ((36.0, 165.0, 0.0), (36.0, 165.0, 180.0))])

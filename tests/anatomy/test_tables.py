@@ -11,8 +11,8 @@ from puncture_twin.planning.anatomy.body.tables import (
     Shown,
     drawn_sides,
     find_support,
-    support_side,
     support_warnings,
+    surface_ends,
     touching_tables,
 )
 from puncture_twin.planning.geometry.parts import largest_part
@@ -42,42 +42,43 @@ def noisy(field, hu=20.0):
     return field + np.random.default_rng(5).normal(0.0, hu, SHAPE)
 
 
+def drawn(field, body, spacing=SPACING):
+    """The drawn sides of a body."""
+    return drawn_sides(surface_ends(field, body), body, spacing)
+
+
 def test_a_body_in_air_has_no_drawn_side():
     """What changes along the bed is no table."""
     above = noisy(trunk())
-    assert drawn_sides(above, trunk() > 0.0, SPACING) == ()
+    assert drawn(above, trunk() > 0.0) == ()
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.03, 0.0), (0.0, 0.06), (-0.02, 0.05)])
 def test_a_cradle_that_holds_together_with_the_body_is_drawn(slope):
-    """Its far side is found to a millimetre, at any angle between bed and slices."""
+    """Its far side is found to a part of a voxel, at any angle between bed and slices."""
     scene = np.maximum(trunk(), cradle(slope=slope))
-    back = next(side for side in drawn_sides(noisy(scene), scene > 0.0, SPACING) if (side.axis, side.end) == (1, -1))
-
-    for k in (0, 31):
-        across_mm = (back.across + back.slope[0] * k) * 4.0 - 198.0 - slope[0] * (k * 5.0 - 80.0)
-        along_mm = (back.along + back.slope[1] * k) * 4.0
-        truth = 232.0 - 250.0 + np.sqrt(274.0**2 - across_mm**2) + slope[1] * (k * 5.0 - 80.0)
-        flat = np.abs(across_mm) < 110.0
-        assert flat.sum() > 40
-        assert np.abs(along_mm - truth)[flat].max() < 1.5
-    assert back.whole
-    assert "back side" in back.warning
+    (back,) = drawn(noisy(scene), scene > 0.0)
+    across_mm = np.arange(100.0)[:, None] * 4.0 - 198.0 - slope[0] * (np.arange(32) * 5.0 - 80.0)
+    truth = 232.0 - 250.0 + np.sqrt(274.0**2 - across_mm**2) + slope[1] * (np.arange(32) * 5.0 - 80.0)
+    flat = np.abs(across_mm) < 110.0
+    assert back.face == (1, -1)
+    assert np.abs(back.line * 4.0 - truth)[flat].max() < 2.5
+    beyond = np.argwhere(back.beyond(SHAPE) & flat[:, None])
+    assert np.all(beyond[:, 1] * 4.0 > truth[beyond[:, 0], beyond[:, 2]] - 2.5)
 
 
 def test_a_short_image_shows_no_drawn_side():
     """Over 40 mm every body is nearly one section: nothing is said of its sides."""
     scene = np.maximum(trunk(), cradle())[:, :, :8]
-    assert drawn_sides(scene, scene > 0.0, SPACING) == ()
+    assert drawn(scene, scene > 0.0) == ()
 
 
 def test_the_top_of_a_table_beside_the_body_is_no_support():
     """Seen from the front a table's top lies behind the body's middle; the side it is on is the back."""
     inside = trunk() > 0.0
     table = (Y > 250.0) & (Y < 275.0) & (X > 20.0) & (X < 380.0)
-    side = support_side(table & ~inside, inside, SPACING)
-    assert side is not None
-    assert (side.axis, side.end) == (1, -1)
+    (side,) = find_support(table & ~inside, inside, SPACING).drawn
+    assert side.face == (1, -1)
 
 
 @pytest.mark.parametrize(("rows", "faces"), [(slice(8, 68), ((1, 0), (1, -1))), (slice(8, None), ((1, 0),))])
@@ -123,12 +124,12 @@ def test_of_a_real_patient_only_the_back_lies_on_something(slices):
     hu = hu[tuple(slice(None, None, int(step)) for step in np.sign(np.diag(directions)))]
     spacing = np.array(image.GetSpacing())
     found = body_mask(hu, spacing, where=CT)
-    sides = drawn_sides(hu - BODY_HU, found.body, spacing)
-    outside = outside_mask(OutsideImage(hu, found.body, np.eye(4), spacing), -900.0)
+    sides = drawn(hu - BODY_HU, found.body, spacing)
+    outside = outside_mask(OutsideImage(hu, found.body, found.unscanned, np.eye(4), spacing), -900.0)
     support = find_support(outside, found.body, spacing, sides)
 
-    assert {(side.axis, side.end) for side in sides if side.whole} <= {(1, -1)}
-    assert (support.drawn[0].axis, support.drawn[0].end) == (1, -1)
+    assert {side.face for side in sides} <= {(1, -1)}
+    assert support.drawn[0].face == (1, -1)
     assert (1, 0) not in support.open_faces
 
 
@@ -196,5 +197,5 @@ def test_a_shell_in_front_counts_beside_a_table_that_was_cut_off():
     scene = np.maximum.reduce([trunk(), *(125.0 * np.clip(one, -4.0, 4.0) for one in (board, shell))])
     found = touching_tables(noisy(scene), scene > 0.0, SPACING)
     assert found.cut_off[(board > 4.0) & (x > 150.0)].mean() > 0.85
-    assert (1, 0) in {side.face for side in found.sides if side.whole}
+    assert (1, 0) in {side.face for side in found.sides}
     assert (1, -1) not in {side.face for side in found.sides}

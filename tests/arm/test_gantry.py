@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 from kept_checkers import built
+from refusals import refused
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.tool import SIDES, Tool, gantry_boxes
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.case.read_case import load_case
@@ -64,7 +64,7 @@ def test_in_a_gantry_both_checkers_agree() -> None:
 @pytest.mark.parametrize("name", sorted(SIZES))
 def test_sizes_that_make_no_sense_are_refused(name: str) -> None:
     """By name."""
-    with pytest.raises(InputError, match=name):
+    with refused("not_positive", name):
         gantry_boxes(TILT, **{**SIZES, name: np.nan})
 
 
@@ -145,17 +145,17 @@ def test_an_arm_through_the_wall_is_a_collision_that_names_the_gantry(in_gantry)
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (("bore_diameter_mm = 700.0", "bore_diameter_mm = 70.0"), "gantry.bore_diameter_mm"),
-        (("tilt_deg = 0.0", "tilt_deg = 80.0"), "gantry.tilt_deg"),
-        (("tilt_deg = 0.0", 'up = "head"'), "gantry: axis and up are parallel"),
-        (("wall_mm", "wal_mm"), "did you mean 'wall_mm'"),
+        (("bore_diameter_mm = 700.0", "bore_diameter_mm = 70.0"), "bad_value gantry.bore_diameter_mm"),
+        (("tilt_deg = 0.0", "tilt_deg = 80.0"), "bad_value gantry.tilt_deg"),
+        (("tilt_deg = 0.0", 'up = "head"'), "axes_parallel"),
+        (("wall_mm", "wal_mm"), "unknown_key wall_mm"),
     ],
 )
 def test_gantries_that_make_no_sense_are_refused(in_gantry, change, match):
     """By key."""
     path = in_gantry()
     path.write_text(path.read_text().replace(*change))
-    with pytest.raises(InputError, match=match):
+    with refused(*match.split()):
         load_case(path)
 
 
@@ -163,7 +163,7 @@ def test_a_gantry_that_does_not_go_around_the_patient_is_refused(in_gantry):
     """A bore narrower than he is, or beside him."""
     path = in_gantry()
     path.write_text(path.read_text().replace("bore_diameter_mm = 700.0", "bore_diameter_mm = 300.0"))
-    with pytest.raises(InputError, match="wall stands .* mm in the patient"):
+    with refused("gantry_in_patient"):
         prepare(path)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from own_arms import LENGTHS, LINKS, beside, origin, placed, shipped_as_own, slow_chain, write_own_arm
+from refusals import refused
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
@@ -18,7 +19,6 @@ from puncture_twin.planning.arm.links import collision_links, own_arm
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.arm.urdf.lengths import StatedLimits
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 
@@ -131,21 +131,20 @@ def test_what_is_not_understood_is_refused_with_its_place(plain, tmp_path, kind)
     """One line that names the file, and the joint or link where there is one."""
     case = REFUSED[kind]
     path = edited(plain, tmp_path, *case["changes"])
-    with pytest.raises(InputError, match=case["says"].replace("(", r"\(").replace(")", r"\)")) as error:
+    with refused(*case["says"].split(), "toy.urdf"):
         arm(path)
-    assert "toy.urdf" in str(error.value) and "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
     ("joint", "change", "says"),
     [
         (2, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0), None),  # along its own axis, and all after it: a longer d4
-        (2, (0.0, 2.0, 0.0, 0.0, 0.0, 0.0), "axis 3 .'j3'. passes 2 mm beside"),
-        (3, (0.0, 0.0, 0.0, 0.0, 0.01, 0.0), "axis 4 .'j4'. points along"),
-        (3, (0.0, 0.0, 0.0, 0.0, 0.0, 1.5), "axis 5 .'j5'. points along"),  # another zero
-        (4, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0), "axis 5 .'j5'. passes 1 mm beside"),
-        (1, (3.0, 0.0, 0.0, 0.0, 0.0, 0.0), "axis 2 .'j2'. passes 3 mm beside"),
-        (5, (0.0, 0.0, 0.0, 0.0, 0.0, 0.5), "the flange 'tool0' is .* turned by 28.65 degrees"),
+        (2, (0.0, 2.0, 0.0, 0.0, 0.0, 0.0), "arm_not_as_ur j3"),
+        (3, (0.0, 0.0, 0.0, 0.0, 0.01, 0.0), "arm_not_as_ur j4"),
+        (3, (0.0, 0.0, 0.0, 0.0, 0.0, 1.5), "arm_not_as_ur j5"),  # another zero
+        (4, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0), "arm_not_as_ur j5"),
+        (1, (3.0, 0.0, 0.0, 0.0, 0.0, 0.0), "arm_not_as_ur j2"),
+        (5, (0.0, 0.0, 0.0, 0.0, 0.0, 0.5), "arm_not_as_ur 28.65"),
     ],
 )
 def test_an_arm_that_is_not_built_as_a_ur_is_refused_at_its_joint(plain, tmp_path, joint, change, says):
@@ -161,7 +160,7 @@ def test_an_arm_that_is_not_built_as_a_ur_is_refused_at_its_joint(plain, tmp_pat
     if says is None:
         assert (arm(path).lengths - LENGTHS).tolist() == [0, 0, 0, 1, 0, 0]
         return
-    with pytest.raises(InputError, match=says):
+    with refused(*says.split()):
         arm(path)
 
 
@@ -170,7 +169,7 @@ def test_rounded_angles_are_a_right_angle_and_two_digits_are_not(plain, tmp_path
     text = plain.read_text(encoding="utf-8")
     assert "1.5707963267948966" in text
     assert arm(edited(plain, tmp_path, ("1.5707963267948966", "1.5708"))).lengths == pytest.approx(LENGTHS, abs=1e-3)
-    with pytest.raises(InputError, match=r"axis 2 \('j2'\)"):
+    with refused("arm_not_as_ur", "j2"):
         arm(edited(plain, tmp_path, ("1.5707963267948966", "1.57")))
 
 
@@ -230,21 +229,21 @@ def test_meshes_are_the_same_body_however_they_are_written(plain, tmp_path, what
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (('filename="ulna.stl"', 'filename="ulna.stl" scale="0.3 0.3 0.3"'), "gap of|do not meet"),
+        (('filename="ulna.stl"', 'filename="ulna.stl" scale="0.3 0.3 0.3"'), "forearm"),
         (
             ('<geometry><mesh filename="ulna.stl"', '<origin xyz="0 0.3 0"/><geometry><mesh filename="ulna.stl"'),
-            "do not meet",
+            "forearm",
         ),
         (
             ('<geometry><mesh filename="roll.stl"', '<origin xyz="0 0 0.4"/><geometry><mesh filename="roll.stl"'),
-            "gap of",
+            "wrist",
         ),
     ],
 )
 def test_links_that_do_not_hang_together_are_refused(plain, tmp_path, change, says):
     """A mesh in another unit, or at another place, leaves a gap through which a surface could pass unseen."""
     CellChecker(arm(plain), TOOL)
-    with pytest.raises(InputError, match=f"toy.urdf.*{says}"):
+    with refused("links_apart", "toy.urdf", says):
         CellChecker(arm(edited(plain, tmp_path, change)), TOOL)
 
 
@@ -253,7 +252,7 @@ def test_flat_shapes_are_refused(plain, tmp_path):
     path = edited(plain, tmp_path)
     sheet = trimesh.Trimesh([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0]], [[0, 1, 2]])
     sheet.export(tmp_path / "ulna.stl")
-    with pytest.raises(InputError, match=r"toy.urdf: a shape of the forearm is flat"):
+    with refused("flat_mesh", "toy.urdf"):
         collision_links(arm(path))
 
 
@@ -311,7 +310,7 @@ def solid(mesh):
 def test_a_shape_that_hangs_on_nothing_is_refused(plain, tmp_path):
     """A camera whose bracket was left out could lie in the patient while nothing touches the skin."""
     path = edited(plain, tmp_path, ("</robot>", CAMERA.format(0.3, 0.0, 0.02, 0.3, -0.1)))
-    with pytest.raises(InputError, match=r"shape of wrist_3, 20 x \d+ x \d+ mm, hangs on nothing"):
+    with refused("shape_detached", "wrist_3", "20"):
         CellChecker(arm(path), TOOL)
 
 

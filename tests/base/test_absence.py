@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
+from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import absence, read_input
 
 
@@ -47,5 +47,5 @@ def test_what_may_not_be_looked_at_is_not_missing(place, monkeypatch):
 
 def test_a_file_in_another_case_is_named_by_its_reader(place):
     """As systems that fold cases would have found it."""
-    with pytest.raises(InputError, match="no such file; there is 'Liver.STL'"):
+    with refused("no_such_file", "Liver.STL"):
         read_input(place / "liver.stl", max_bytes=10, where="liver.stl")

@@ -1,5 +1,6 @@
 """Compiled kernels are kept for the very sources that they were made from, in a folder that nobody else may write."""
 
+import json
 import os
 import pickle
 import shutil
@@ -18,7 +19,14 @@ from puncture_twin.planning.base.numba_kernels import KEPT_FOLDERS, KEPT_S, PREF
 
 BASE = "planning/base"
 COPIED = (
-    *("__init__.py", "planning/__init__.py", f"{BASE}/__init__.py", f"{BASE}/errors.py", f"{BASE}/numba_kernels.py"),
+    *(
+        "__init__.py",
+        "planning/__init__.py",
+        f"{BASE}/__init__.py",
+        f"{BASE}/errors.py",
+        f"{BASE}/files.py",
+        f"{BASE}/numba_kernels.py",
+    ),
     *(f"{BASE}/cache/{name}.py" for name in ("__init__", "source_stamp", "entry_file")),
 )
 """What a project needs to keep its kernels as ours does."""
@@ -154,6 +162,46 @@ def test_files_that_are_cut_are_removed_and_said(tmp_path):
         numba_kernels._own_folder(tmp_path / "kernels")
     assert {path.name for path in (tmp_path / "kernels").iterdir()} == {"a.nbi", "b.nbc", "f.nbc.tmp.12"}
     assert len(said_of) == 3
+
+
+def test_a_bit_that_flips_in_a_kept_kernel_is_seen(project):
+    """It would run, or end the process: nothing of what was kept is as it was. It is compiled anew, and said once."""
+    assert answer(project) == ["2", "0"]
+    (data,) = (project / "cache").rglob("caller.*.nbc")
+    content, status = bytearray(data.read_bytes()), data.stat()
+    content[len(content) // 2] ^= 1
+    data.write_bytes(content)
+    os.utime(data, ns=(status.st_atime_ns, status.st_mtime_ns))
+    words, warned = said(project)
+    assert words == ["2", "0"] and warned.count("a compiled kernel is cut or damaged") == 1
+    assert answer(project) == ["2", "1"]
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1]", '{"a": 1}', "null"])
+def test_a_list_of_sums_that_cannot_be_read_is_written_anew(project, content):
+    """Nothing is known of the files then; what they hold is as good."""
+    assert answer(project) == ["2", "0"]
+    (sums,) = (project / "cache").rglob("sums.json")
+    whole = sums.read_text()
+    sums.write_text(content)
+    assert answer(project) == ["2", "1"]
+    assert json.loads(sums.read_text()) == json.loads(whole)
+
+
+FULL = (
+    "import errno, os\nreal = os.replace\ndef full(source, target):\n"
+    "    if str(target).endswith({!r}):\n        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))\n"
+    "    real(source, target)\nos.replace = full\n"
+)
+
+
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+def test_a_disk_that_is_full_leaves_nothing_that_a_later_process_stumbles_over(project, ending):
+    """This one ends with the system's error, which a command tells in one line."""
+    begun = process(project, FULL.format(ending) + ASKED)
+    assert "No space left" in begun.communicate(timeout=600)[1] and begun.returncode == 1
+    assert answer(project) == ["2", "0"]
+    assert answer(project) == ["2", "1"]
 
 
 class Forged:

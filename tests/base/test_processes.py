@@ -19,8 +19,8 @@ from puncture_twin.planning.base.processes import process_pool
     "error",
     [
         InputError("what", where="where", allowed="allowed", code="odd", numbers={"shift_mm": 2.0}),
-        InputListError("what", where="where", allowed="allowed"),
-        NoAnswerError("none", counts={"too_close": 3}),
+        InputListError("what", where="where", allowed="allowed", code="odd"),
+        NoAnswerError("none", counts={"too_close": 3}, code="odd"),
     ],
 )
 def test_errors_are_made_again_with_all_their_parts(error):

@@ -1,7 +1,10 @@
 """The stopwatch: names, sums, and whoever is told."""
 
 import io
+import logging
 import shutil
+import subprocess
+import sys
 
 import pytest
 
@@ -133,3 +136,19 @@ def test_an_engine_counts_what_a_person_counts(engine, most, tmp_path):
         stage: {whole[stage]} for stage in most
     }
     assert max(heard.totals["directions of the arm"]) <= len(found)
+
+
+def test_who_embeds_it_hears_of_stages_and_warnings(caplog):
+    """By one logger: stages with their seconds, what each is at, and what the case warns of."""
+    caplog.set_level(logging.DEBUG, "puncture_twin")
+    context = prepare(folder() / "carton" / "case_m.toml", arm=False)
+    said = {(one.levelname, one.getMessage().partition(":")[0]) for one in caplog.records}
+    assert {("INFO", "case"), ("INFO", "anatomy"), ("DEBUG", "stage"), ("DEBUG", "anatomy")} <= said
+    assert [one.getMessage() for one in caplog.records if one.levelname == "WARNING"] == list(context.anatomy.warnings)
+
+
+def test_nothing_is_printed_by_default():
+    """Neither warnings nor anything else, as Python does where no handler is."""
+    code = "from puncture_twin.planning.base.progress import LOG, Silent\nLOG.warning('a')\nSilent().note('b')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    assert (done.stdout, done.stderr) == (b"", b"")

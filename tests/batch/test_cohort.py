@@ -4,8 +4,8 @@ import os
 
 import pytest
 from cohort_world import plan_of, write_patient
+from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.batch.cohort import read_cohort
 
 
@@ -28,9 +28,8 @@ def test_a_patient_that_cannot_be_looked_up_is_not_left_out(tmp_path, monkeypatc
     """Behind a link to an archive that is not mounted, or in a folder that may not be read."""
     write_patient(tmp_path / "c" / "a")
     (tmp_path / "c" / "b").symlink_to(tmp_path / "archive" / "b")
-    with pytest.raises(InputError, match="'b' is a link to what is not there") as caught:
+    with refused("cohort_not_whole"):
         read_cohort(tmp_path / "c")
-    assert caught.value.code == "cohort_not_whole"
     (tmp_path / "c" / "b").unlink()
     write_patient(tmp_path / "c" / "b")
     listed = os.scandir
@@ -41,9 +40,8 @@ def test_a_patient_that_cannot_be_looked_up_is_not_left_out(tmp_path, monkeypatc
         return listed(folder)
 
     monkeypatch.setattr(os, "scandir", scandir)
-    with pytest.raises(InputError, match="cannot be read .Permission denied") as caught:
+    with refused("cohort_not_whole", "/b: "):
         read_cohort(tmp_path / "c")
-    assert caught.value.where.endswith("/b")
 
 
 def test_a_csv_lists_cases_relative_to_itself_or_absolute(tmp_path):
@@ -78,22 +76,22 @@ def test_a_target_is_a_point_or_a_name(tmp_path, cell, option):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("path\na\n", "has no column 'case'"),
-        ("case,colour\na,red\n", "column 'colour' is not known"),
-        ("case,needle\na,red\n", "column 'needle' is not known"),
-        ("case,case\na,b\n", "column 'case' stands twice"),
-        ("case,name\na\n", "line 2: 1 cells"),
-        ("case\n", "holds no case"),
-        ("", "file of 0 bytes"),
-        ("case,name\n,b\n", "line 2: has no case"),
-        ("case\na\0b\n", "is no CSV"),
-        ("case,needle.length_mm\na,nan\n", "an option cannot be used"),
+        ("path\na\n", "missing_column"),
+        ("case,colour\na,red\n", "unknown_column colour"),
+        ("case,needle\na,red\n", "unknown_column"),
+        ("case,case\na,b\n", "duplicate_column"),
+        ("case,name\na\n", "ragged_row"),
+        ("case\n", "cohort_size"),
+        ("", "file_size"),
+        ("case,name\n,b\n", "bad_name"),
+        ("case\na\0b\n", "not_csv"),
+        ("case,needle.length_mm\na,nan\n", "bad_value"),
     ],
 )
 def test_a_csv_that_cannot_be_used_is_refused(tmp_path, text, message):
     """With its line, and nothing is guessed."""
     (tmp_path / "c.csv").write_text(text)
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         read_cohort(tmp_path / "c.csv")
 
 
@@ -126,16 +124,16 @@ def test_a_cohort_file_is_a_grid(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "cases: Field required"),
-        ("cases = []\n", "cases: Tuple should have at least 1"),
-        ('cases = ["q*"]\n', r"cases 'q\*' matches nothing"),
-        ('cases = ["p0"]\ncolours = ["red"]\n', "unknown key 'colours'"),
-        ('cases = ["p0"]\nmargins = [3]\n', "margins.1: option 'margins' is no table"),
-        ('schema = 2\ncases = ["p0"]\n', "schema 2 is not known"),
-        ('cases = ["p0"]\n[mounts.a]\nwhen = 2020-01-01\n', "an option cannot be used"),
+        ("", "missing_key Field"),
+        ("cases = []\n", "bad_value Tuple"),
+        ('cases = ["q*"]\n', "no_match q*"),
+        ('cases = ["p0"]\ncolours = ["red"]\n', "unknown_key colours"),
+        ('cases = ["p0"]\nmargins = [3]\n', "not_a_table margins.1"),
+        ('schema = 2\ncases = ["p0"]\n', "unknown_version"),
+        ('cases = ["p0"]\n[mounts.a]\nwhen = 2020-01-01\n', "bad_value"),
         (
             'cases = ["p0"]\n' + "".join(f"{axis} = {EMPTY}\n" for axis in ("needles", "arms", "errors")),
-            "makes 1030301",
+            "cohort_size 1030301",
         ),
     ],
 )
@@ -143,7 +141,7 @@ def test_a_cohort_file_that_cannot_be_used_is_refused(tmp_path, text, message):
     """With its key."""
     write_patient(tmp_path / "p0")
     (tmp_path / "cohort.toml").write_text(text or "# nothing\n")
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         read_cohort(tmp_path / "cohort.toml")
 
 
@@ -151,7 +149,7 @@ def test_a_folder_whose_name_is_no_text_is_refused(tmp_path):
     """No table can hold its case, and a case is not left out."""
     (tmp_path / os.fsdecode(b"p\xff")).mkdir()
     (tmp_path / os.fsdecode(b"p\xff") / "case.toml").write_text("schema = 1\n")
-    with pytest.raises(InputError, match="is no UTF-8"):
+    with refused("not_text"):
         read_cohort(tmp_path)
 
 
@@ -159,6 +157,6 @@ def test_what_is_no_cohort_is_refused(tmp_path):
     """An empty folder, a file of another kind, nothing at all."""
     (tmp_path / "empty").mkdir()
     (tmp_path / "c.txt").write_text("case\n")
-    for name, message in (("empty", "holds no case"), ("c.txt", "is no cohort"), ("gone.csv", "no such file")):
-        with pytest.raises(InputError, match=message):
+    for name, message in (("empty", "cohort_size"), ("c.txt", "not_a_cohort"), ("gone.csv", "no_such_file")):
+        with refused(message):
             read_cohort(tmp_path / name)

@@ -10,8 +10,8 @@ import cohort_world
 import pytest
 from cohort_world import merged, run_here, write_cohort
 from places import ROOT, TESTS
+from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.batch.plan import read_plan_table
 from puncture_twin.planning.batch.run import Request, on_scheduler, run_cohort
@@ -95,7 +95,7 @@ def test_no_scheduler_is_one_line(tmp_path, monkeypatch, capfd):
     assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(out), "--no-arm"]) == 0
     monkeypatch.setattr("puncture_twin.planning.batch.run.CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
-        with pytest.raises(InputError, match="no scheduler answers there"):
+        with refused("no_scheduler"):
             run_cohort(out, Request(), Silent(), on_scheduler(address))
-    with pytest.raises(InputError, match="are limited by Dask's workers"):
+    with refused("dask_limits"):
         run_cohort(out, Request(limits=Limits(1000, None)), Silent(), on_scheduler("tcp://127.0.0.1:1"))

@@ -7,8 +7,8 @@ import polars
 import pyarrow.parquet as pq
 import pytest
 from cohort_world import merged, plan_of, run_here, tiny_text, write_cohort, write_patient
+from refusals import refused, refused_command
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.batch.merge import compare, read_cases, union_schema
 from puncture_twin.planning.batch.run import cohort_state
 from puncture_twin.run_twin import main
@@ -80,7 +80,7 @@ def test_a_column_of_two_types_is_refused(tmp_path):
     """Results of two versions are not mixed."""
     import pyarrow as pa
 
-    with pytest.raises(InputError, match="column 'a' is int64 in one case and string in another"):
+    with refused("tables_differ", "int64"):
         union_schema([pa.schema([("a", pa.int64())]), pa.schema([("a", pa.string())])], tmp_path)
 
 
@@ -125,7 +125,8 @@ def test_what_is_expected_is_held(cohort, tmp_path, capfd):
     pq.write_table(table.slice(1), expected)
     assert main(command) == 1 and "p0/case.toml: new" in capfd.readouterr().out
     expected.write_text("no table")
-    assert main(command) == 2 and "is no table" in capfd.readouterr().err
+    capfd.readouterr()
+    refused_command(command, capfd, "not_parquet")
 
 
 def row(case, safe, clearance=None, entry=None, reason=None, code=0):
@@ -178,7 +179,7 @@ def test_compare_prints_what_changed(cohort, tmp_path, capfd):
     """From folders or tables."""
     assert main(["batch", "compare", str(cohort / "out"), str(cohort / "out" / "cases.parquet")]) == 0
     assert "4 cases: 4 same" in capfd.readouterr().out
-    with pytest.raises(InputError, match="no such file"):
+    with refused("no_such_file"):
         read_cases(tmp_path)
 
 

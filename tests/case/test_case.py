@@ -6,9 +6,9 @@ import tomllib
 import numpy as np
 import pytest
 from case_world import ORGAN, SKIN, case_text, changed
+from refusals import refused
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.case_file import case_schema
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.spaces import Space
@@ -82,65 +82,47 @@ def test_a_target_may_come_from_a_file_of_points(write, tmp_path):
     path = write(("position_mm = [1.0, 2.0, 3.0]", 'points = "targets.csv"\nname = "A"'))
     np.testing.assert_array_equal(load_case(path).target_ct, [4, 5, 6])
     path = write(("position_mm = [1.0, 2.0, 3.0]", 'points = "targets.csv"\nname = "B"'))
-    with pytest.raises(InputError, match=r"target.name 'B' is not in targets.csv; allowed: A"):
+    with refused("unknown_point", "targets.csv"):
         load_case(path)
 
 
 BAD = {
-    "unknown key": (("diameter_mm", "diamter_mm"), "unknown key 'diamter_mm'; did you mean 'diameter_mm'"),
-    "unknown section": (("[search]", "[serach]"), "unknown key 'serach'; did you mean 'search'"),
-    "wrong unit in a key": (("length_mm", "length_m"), "needle: unknown key 'length_m'; did you mean 'length_mm'"),
-    "metres under a mm key": (
-        ("length_mm = 210.0", "length_mm = 0.21"),
-        "needle.length_mm: .*greater than or equal to 20",
-    ),
-    "another schema": (("schema = 2", "schema = 1"), "schema 1 is not known; write schema = 2, region"),
-    "no schema": (("schema = 2", ""), "schema: not stated; write schema = 2, region"),
-    "text for a number": (
-        ("diameter_mm = 1.2", 'diameter_mm = "1.2"'),
-        "needle.diameter_mm: Input should be a valid number",
-    ),
-    "true for a number": (
-        ("diameter_mm = 1.2", "diameter_mm = true"),
-        "needle.diameter_mm: Input should be a valid number",
-    ),
-    "nan": (("diameter_mm = 1.2", "diameter_mm = nan"), "needle.diameter_mm: Input should be a finite number"),
-    "negative": (("diameter_mm = 1.2", "diameter_mm = -1.2"), "needle.diameter_mm: .*greater than or equal to 0.1"),
-    "infinite target": (
-        ("[1.0, 2.0, 3.0]", "[1.0, inf, 3.0]"),
-        "target.position_mm number 2: Input should be a finite number",
-    ),
-    "two coordinates": (("[1.0, 2.0, 3.0]", "[1.0, 2.0]"), "target.position_mm: number 3 of the list is missing"),
-    "no target": (("position_mm = [1.0, 2.0, 3.0]", ""), "needs either position_mm or points"),
+    "unknown key": (("diameter_mm", "diamter_mm"), "unknown_key diamter_mm diameter_mm"),
+    "unknown section": (("[search]", "[serach]"), "unknown_key serach search"),
+    "wrong unit in a key": (("length_mm", "length_m"), "unknown_key length_m length_mm"),
+    "metres under a mm key": (("length_mm = 210.0", "length_mm = 0.21"), "bad_value needle.length_mm 20"),
+    "another schema": (("schema = 2", "schema = 1"), "unknown_version"),
+    "no schema": (("schema = 2", ""), "unknown_version"),
+    "text for a number": (("diameter_mm = 1.2", 'diameter_mm = "1.2"'), "bad_value needle.diameter_mm"),
+    "true for a number": (("diameter_mm = 1.2", "diameter_mm = true"), "bad_value needle.diameter_mm"),
+    "nan": (("diameter_mm = 1.2", "diameter_mm = nan"), "bad_value needle.diameter_mm"),
+    "negative": (("diameter_mm = 1.2", "diameter_mm = -1.2"), "bad_value needle.diameter_mm 0.1"),
+    "infinite target": (("[1.0, 2.0, 3.0]", "[1.0, inf, 3.0]"), "bad_value target.position_mm"),
+    "two coordinates": (("[1.0, 2.0, 3.0]", "[1.0, 2.0]"), "missing_key target.position_mm"),
+    "no target": (("position_mm = [1.0, 2.0, 3.0]", ""), "not_one_source position_mm"),
     "shaft longer than the needle": (
         ("shaft_mm = 150.0", "shaft_mm = 250.0"),
-        "shaft_mm 250 is longer than length_mm 210",
+        "out_of_range shaft_mm 250 length_mm 210",
     ),
-    "descending range": (("[0, 60]", "[60, 0]"), "theta_deg .60, 0. descends"),
-    "range beyond 180": (("[0, 60]", "[0, 200]"), "search.theta_deg number 2: .*less than or equal to 180"),
-    "zero step": (("step_deg = 5.0", "step_deg = 0"), "search.step_deg: .*greater than or equal to 0.05"),
-    "another space": (('"LPS"', '"LAS"'), "space: Input should be 'LPS', 'RAS' or 'local'"),
-    "bed frame in a local space": (('space = "LPS"', 'space = "local"'), 'search.frame must be "ct"'),
-    "unknown role": (
-        ('role = "target"', 'role = "avoidd"'),
-        "structure number 2 \\('organ'\\).role: Input should be 'avoid'",
-    ),
-    "two skins": (('role = "target"', 'role = "skin"'), "one structure has role .skin.; here"),
-    "no skin": (('role = "skin"', 'role = "traverse"'), "one structure has role .skin.; here none"),
-    "a name twice": (('name = "skin"', 'name = "organ"'), "structure 'organ' stands twice"),
+    "descending range": (("[0, 60]", "[60, 0]"), "range_descends theta_deg"),
+    "range beyond 180": (("[0, 60]", "[0, 200]"), "bad_value search.theta_deg 180"),
+    "zero step": (("step_deg = 5.0", "step_deg = 0"), "bad_value search.step_deg 0.05"),
+    "another space": (('"LPS"', '"LAS"'), "bad_value LPS RAS local"),
+    "bed frame in a local space": (('space = "LPS"', 'space = "local"'), "local_space search.frame ct"),
+    "unknown role": (('role = "target"', 'role = "avoidd"'), "bad_value organ avoid"),
+    "two skins": (('role = "target"', 'role = "skin"'), "not_one_skin skin"),
+    "no skin": (('role = "skin"', 'role = "traverse"'), "not_one_skin skin"),
+    "a name twice": (('name = "skin"', 'name = "organ"'), "duplicate_name organ"),
     "two sources": (
         ('mesh = "organ.stl"', 'mesh = "organ.stl"\nlabelmap = "seg.nii"\nlabel = 3'),
-        "exactly one of mesh",
+        "not_one_source mesh",
     ),
-    "no source": (('mesh = "organ.stl"\nunit = "mm"', ""), "exactly one of mesh, labelmap, ct; it has none"),
-    "label map without a label": (
-        ('mesh = "organ.stl"\nunit = "mm"', 'labelmap = "seg.nii"'),
-        "labelmap and label go together",
-    ),
-    "mesh without a unit": (('mesh = "organ.stl"\nunit = "mm"', 'mesh = "organ.stl"'), "a mesh needs unit"),
-    "margin on the wrong role": (('role = "target"', 'role = "target"\nmargin_mm = 3'), "margin_mm belongs to role"),
-    "missing file": (('mesh = "organ.stl"', 'mesh = "gone.stl"'), "structure 'organ': file 'gone.stl' is not there"),
-    "a name with a path": (('name = "one"', 'name = "../one"'), "name: letters, digits, spaces and . _ - alone"),
+    "no source": (('mesh = "organ.stl"\nunit = "mm"', ""), "not_one_source"),
+    "label map without a label": (('mesh = "organ.stl"\nunit = "mm"', 'labelmap = "seg.nii"'), "keys_together"),
+    "mesh without a unit": (('mesh = "organ.stl"\nunit = "mm"', 'mesh = "organ.stl"'), "unit_not_stated"),
+    "margin on the wrong role": (('role = "target"', 'role = "target"\nmargin_mm = 3'), "key_not_of_it margin_mm"),
+    "missing file": (('mesh = "organ.stl"', 'mesh = "gone.stl"'), "no_such_file organ gone.stl"),
+    "a name with a path": (('name = "one"', 'name = "../one"'), "bad_name"),
 }
 
 
@@ -149,44 +131,41 @@ def test_a_broken_case_is_refused_in_one_line(name, write):
     """Each defect is named with its place and what is allowed."""
     change, message = BAD[name]
     text = GOOD.replace("theta_deg = [0, 60]", 'theta_deg = [0, 60]\nframe = "bed"') if "local" in name else GOOD
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(*message.split(), "case.toml"):
         load_case(write(change, text=text))
-    assert "case.toml" in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert "allowed: " in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("added", "message"),
     [
-        ('[registration]\nmarkers_ct = "a.csv"\nmarkers_base = "b.csv"', "registration.markers_ct: file 'a.csv'"),
+        ('[registration]\nmarkers_ct = "a.csv"\nmarkers_base = "b.csv"', "no_such_file registration.markers_ct a.csv"),
         ('[registration]\nmarkers_ct = "skin.stl"\nmarkers_base = "skin.stl"\n[robot.mount]\nposition_mm=[0,0,0]\n'
-         'x_axis=[1,0,0]\nz_axis=[0,0,1]', "both say where the base is"),
-        ("[robot.mount]\nposition_mm=[0,0,0]\nx_axis=[0,0,2]\nz_axis=[0,0,1]", "x_axis and z_axis are parallel"),
-        ('[robot]\nhome_deg = [0, 0, 0]', "robot.home_deg: number 4 of the list is missing"),
-        ('[[structures]]\nlabelmap = "gone.nii.gz"\nnaming = "totalsegmentator-v2"', "file 'gone.nii.gz' is not there"),
+         'x_axis=[1,0,0]\nz_axis=[0,0,1]', "stated_twice"),
+        ("[robot.mount]\nposition_mm=[0,0,0]\nx_axis=[0,0,2]\nz_axis=[0,0,1]", "axes_parallel"),
+        ('[robot]\nhome_deg = [0, 0, 0]', "missing_key robot.home_deg"),
+        ('[[structures]]\nlabelmap = "gone.nii.gz"\nnaming = "totalsegmentator-v2"', "no_such_file gone.nii.gz"),
     ],
 )  # fmt: skip
 def test_contradictions_with_the_robot_are_refused(added, message, write):
     """Registration, mount and label maps are held against each other and the folder."""
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         load_case(write(text=GOOD + added))
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"\x00\xff\xfe binary", "is not TOML"),
-        (b"schema = ", "is not TOML"),
-        (b"", "schema: not stated; write schema = 2"),
-        (b"# " + b"x" * 2_000_000, "larger than 1 MB"),
+        (b"\x00\xff\xfe binary", "not_toml"),
+        (b"schema = ", "not_toml"),
+        (b"", "file_size"),
+        (b"# " + b"x" * 2_000_000, "file_size"),
     ],
 )
 def test_what_is_no_case_file_is_refused(content, message, tmp_path):
     """Garbage, half a file, nothing at all, far too much."""
     path = tmp_path / "case.toml"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=message):
+    with refused(message):
         load_case(path)
 
 
@@ -198,7 +177,7 @@ def test_a_patient_of_any_alphabet_has_a_case(name, write):
 
 def test_a_missing_case_is_refused(tmp_path):
     """The folder without a case.toml is named."""
-    with pytest.raises(InputError, match="case.toml: cannot be read"):
+    with refused("no_such_file", "case.toml"):
         load_case(tmp_path)
 
 

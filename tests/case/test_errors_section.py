@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.errors import Cells, error_model
 from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.geometry.spaces import Space
@@ -41,16 +41,16 @@ def test_a_bed_axis_turns_the_slices_and_ras_is_understood():
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"space": Space.LOCAL, "ct_slice_mm": 1.0}, "no bed"),
-        ({"space": Space.LOCAL, "ct_slice_mm": 1.0, "bed_axis": "head"}, "no head"),
-        ({"ct_slice_mm": 1.0, "bed_axis": (0.0, 0.0, 0.0)}, "bed_axis is zero"),
-        ({"fle_mm": 1.0, "touch_mm": 0.1}, "state the same error"),
-        ({"fle_mm": 1.0, "ct_pixel_mm": 0.1}, "state the same error"),
+        ({"space": Space.LOCAL, "ct_slice_mm": 1.0}, "local_space"),
+        ({"space": Space.LOCAL, "ct_slice_mm": 1.0, "bed_axis": "head"}, "local_space"),
+        ({"ct_slice_mm": 1.0, "bed_axis": (0.0, 0.0, 0.0)}, "zero_direction"),
+        ({"fle_mm": 1.0, "touch_mm": 0.1}, "stated_twice"),
+        ({"fle_mm": 1.0, "ct_pixel_mm": 0.1}, "stated_twice"),
     ],
 )
 def test_contradictions_are_refused(settings, told):
     """One line that names both keys."""
-    with pytest.raises(InputError, match=told):
+    with refused(told):
         model(**settings)
 
 

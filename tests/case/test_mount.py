@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import MountSection
 from puncture_twin.planning.geometry.spaces import Space
@@ -24,11 +24,11 @@ def test_a_mount_in_millimetres_is_taken():
 @pytest.mark.parametrize("position", [(0.6, 0.02, -0.03), (0.0, 0.0, -1.2), (2.0, 0.0, 0.5)])
 def test_a_mount_in_metres_is_noticed(position):
     """No base stands millimetres from the origin."""
-    with pytest.raises(InputError, match="look like metres"):
+    with refused("wrong_unit"):
         mount_pose(mount(position), Space.LPS, "case.toml")
 
 
 def test_axes_that_are_not_square_are_refused():
     """The angle is named."""
-    with pytest.raises(InputError, match="60.0 degrees apart"):
+    with refused("axes_not_square", "60.0"):
         mount_pose(mount((600.0, 0.0, 0.0), z=(0.5, 0.75**0.5, 0.0)), Space.LPS, "case.toml")

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from case_world import CASE, MARKERS, write_case, write_labels
+from refusals import refused
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
@@ -59,7 +60,7 @@ def test_the_abdomen_cut_at_a_line_is_refused(tmp_path):
     path = tmp_path / "case.toml"
     for count in range(len(lines)):
         path.write_text("".join(lines[:count]))
-        with pytest.raises(InputError, match=r"case.toml"):
+        with pytest.raises(InputError):
             load_case(path)
 
 
@@ -84,20 +85,20 @@ def test_what_a_count_at_the_top_does_not_show_is_said(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (('region = "other"\n', ""), "schema = 2 needs region, one of abdomen, chest"),
-        (('region = "other"', 'region = "belly"'), "region: Input should be 'abdomen'"),
-        (("[end]\nstructures = 4\n", ""), r"schema = 2 needs its last table, \[end\] with structures = N"),
-        (("structures = 4", "structures = 5"), "structures = 5 is stated, and the case has 4"),
-        (("structures = 4", "structures = 0"), "end.structures"),
-        (("structures = 4", "structures = true"), "end.structures"),
-        (("schema = 2", "schema = 2\nstructures = 5"), r"structures = 5 at the top and 4 in \[end\]; keep one"),
-        (("schema = 2", "schema = 1"), r"schema 1 is not known; write schema = 2, region = .* and last \[end\] with"),
-        (("schema = 2", "schema = true"), "schema True is not known"),
+        (('region = "other"\n', ""), "missing_key"),
+        (('region = "other"', 'region = "belly"'), "bad_value abdomen"),
+        (("[end]\nstructures = 4\n", ""), "file_cut"),
+        (("structures = 4", "structures = 5"), "structures_miscounted"),
+        (("structures = 4", "structures = 0"), "bad_value end.structures"),
+        (("structures = 4", "structures = true"), "bad_value end.structures"),
+        (("schema = 2", "schema = 2\nstructures = 5"), "stated_twice"),
+        (("schema = 2", "schema = 1"), "unknown_version"),
+        (("schema = 2", "schema = true"), "unknown_version True"),
     ],
 )
 def test_what_a_case_states_of_itself_must_be_right(change, message, tmp_path):
     """Each defect in one line that says what is allowed."""
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         load_case(write_case(tmp_path, change, listed=None))
 
 
@@ -114,7 +115,7 @@ def test_labels_that_rules_name_count_each(tmp_path):
     write_labels(tmp_path / "many.nrrd", labels)
     assert prepare(path, arm=False).anatomy.ignored == ("fold",)
     path.write_text(path.read_text().replace("structures = 6", "structures = 7"))
-    with pytest.raises(InputError, match="structures = 7 is stated, and the case has 6"):
+    with refused("structures_miscounted"):
         prepare(path, arm=False)
 
 
@@ -126,7 +127,7 @@ def test_a_list_that_ends_within_a_line_is_refused(name, tmp_path):
     (tmp_path / "targets.csv").write_text("name,x_mm,y_mm,z_mm\ntarget,0,0,10\n")
     load_case(path)
     (tmp_path / name).write_text((tmp_path / name).read_text().rstrip("\n")[:-1])
-    with pytest.raises(InputError, match=f"{name}: its last line does not end with a line break; was the file cut"):
+    with refused("file_cut", name):
         load_case(path)
 
 

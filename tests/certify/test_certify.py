@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from oracles import segment_mesh_distance
 from places import REAL_CT, TESTS
+from refusals import refused
 from scipy.optimize import nnls
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh, skin_paths
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.entry import Directions, angles, entry_frame, outward
 from puncture_twin.planning.case.tables import EntryAxes
@@ -348,35 +348,43 @@ def _swap(document, old, new):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda d: _swap(d, "R", "S"), "summary"),
-        (lambda d: _swap(d, "S", ""), "cells or an unknown letter"),
-        (lambda d: d["tree"].pop(), "cells missing"),
-        (lambda d: _swap(d, "S", "X"), "unknown letter"),
-        (lambda d: d["witness"].pop(), "witnesses"),
-        (lambda d: d.update(version=99), "version"),
-        (lambda d: d.pop("tree"), "tree"),
-        (lambda d: d.update(size_rad=float("nan")), "finite"),
-        (lambda d: d["witness"].__setitem__(0, ["because", "", None, None]), "because"),
-        (lambda d: d.update(approved=True), "key 'approved' is not known"),
-        (lambda d: d["inputs"].insert(0, {**d["inputs"][0], "sha256": "0" * 64}), "two hashes"),
+        (lambda d: _swap(d, "R", "S"), "certificate_damaged"),
+        (lambda d: _swap(d, "S", ""), "certificate_damaged"),
+        (lambda d: d["tree"].pop(), "certificate_damaged"),
+        (lambda d: _swap(d, "S", "X"), "certificate_damaged"),
+        (lambda d: d["witness"].pop(), "certificate_damaged"),
+        (lambda d: d.update(version=99), "unknown_version"),
+        (lambda d: d.pop("tree"), "missing_key"),
+        (lambda d: d.update(size_rad=float("nan")), "not_json"),
+        (lambda d: d["witness"].__setitem__(0, ["because", "", None, None]), "bad_value because"),
+        (lambda d: d.update(approved=True), "unknown_key approved"),
+        (lambda d: d["inputs"].insert(0, {**d["inputs"][0], "sha256": "0" * 64}), "bad_value"),
     ],
 )
 def test_a_file_that_contradicts_itself_is_refused(carton, tmp_path, change, says):
     """A flipped or missing cell, a missing part, another version: one line."""
     path = _tampered(carton[1], tmp_path, change)
-    with pytest.raises(InputError, match=says) as caught:
+    with refused(*says.split()):
         read_certificate(path)
-    assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", "null", "\x00\x01"])
-def test_no_certificate_is_refused(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "code"),
+    [
+        ("", "file_size"),
+        ("{", "not_json"),
+        ("[]", "unknown_version"),
+        ("null", "unknown_version"),
+        ("\x00", "not_json"),
+    ],
+)
+def test_no_certificate_is_refused(tmp_path, content, code):
     """Empty, broken or other JSON."""
     path = tmp_path / "c.json"
     path.write_text(content)
-    with pytest.raises(InputError):
+    with refused(code):
         read_certificate(path)
-    with pytest.raises(InputError, match="no such file"):
+    with refused("no_such_file"):
         read_certificate(tmp_path / "none.json")
 
 
@@ -392,7 +400,7 @@ def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new
     for level in found.tree:
         tree.append("".join(letter if letter.islower() else str(next(letters)) for letter in level))
     forged = replace(found, tree=tuple(tree), verdict=verdict, reason=reason, structure=structure)
-    with pytest.raises(InputError, match=f"cell {row} .* is not proven"):
+    with refused("cell_not_proven", row):
         verify(forged, context.case, context.anatomy)
 
 
@@ -403,14 +411,14 @@ def test_a_false_reason_is_refused(carton, reason):
     row = int(np.flatnonzero(found.reason == "too_close")[-1])
     reasons = found.reason.copy()
     reasons[row] = reason
-    with pytest.raises(InputError, match=reason):
+    with refused("cell_not_proven", reason):
         verify(replace(found, reason=reasons), context.case, context.anatomy)
 
 
 def test_a_large_undecided_cell_is_refused(carton):
     """A certificate may not claim a smaller size than it has."""
     context, found = carton
-    with pytest.raises(InputError, match="small"):
+    with refused("cell_not_proven"):
         verify(replace(found, size=found.size / 3), context.case, context.anatomy)
 
 
@@ -421,7 +429,7 @@ def test_a_witness_that_is_none_is_refused(carton, triangle):
     row = int(np.flatnonzero(found.reason == "too_close")[0])
     triangles = found.triangle.copy()
     triangles[row] = triangle
-    with pytest.raises(InputError, match=f"cell {row} .* not proven rejected"):
+    with refused("cell_not_proven", row):
         verify(replace(found, triangle=triangles), context.case, context.anatomy)
 
 
@@ -444,10 +452,10 @@ def test_other_inputs_are_refused(carton):
         replace(case, target_ct=case.target_ct + [0, 0, 0.01]),
     ]
     for other in others:
-        with pytest.raises(InputError, match="certificate"):
+        with refused("input_changed" if other is others[0] else "certificate_of_another"):
             verify(found, other, anatomy)
     thicker = tuple(replace(s, margin_mm=s.margin_mm + 0.1) for s in anatomy.structures)
-    with pytest.raises(InputError, match="margins"):
+    with refused("certificate_of_another"):
         verify(found, case, replace(anatomy, structures=thicker))
 
 
@@ -497,7 +505,7 @@ def test_the_whole_sphere_is_certified(carton, rng):
 def test_a_cap_or_size_that_makes_no_sense_is_refused(carton, theta, beta, size):
     """Descending or too wide ranges, and a size below what rounding allows."""
     context, _ = carton
-    with pytest.raises(InputError):
+    with refused("out_of_range"):
         certify(context.case, context.anatomy, size=size, theta=theta, beta=beta)
 
 
@@ -625,6 +633,6 @@ def test_a_certificate_shows_itself(carton):
     shown = certificate._repr_html_()
     assert "Certificate of carton-m" in shown
     assert "reach of the arm" in shown
-    assert shown.count("<svg") == 1
+    assert shown.count("data:image/png;base64,") == 1
     assert "proven safe for the organs" in shown
     assert replace(certificate, question=None)._repr_html_().startswith("<pre>")

@@ -5,9 +5,10 @@ import json
 
 import pyarrow.parquet as pq
 import pytest
+from refusals import refused_command
 
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.exit_codes import BAD_INPUT, OK
+from puncture_twin.twin.jobs.exit_codes import OK
 from tests.case_world import write_case
 
 CHANGES = (("theta_deg = [0, 10]\nstep_deg = 10.0", 'frame = "ct"\ntheta_deg = [0, 60]\nstep_deg = 6.0'),)
@@ -80,8 +81,6 @@ def test_what_is_no_table_or_was_edited_is_refused(searched, tmp_path, capsys):
     no_table = tmp_path / "x.parquet"
     no_table.write_bytes(b"PAR1 and no more")
     form = ["--format", "candidates-csv", "--out", str(tmp_path / "out")]
-    assert main(["export", str(no_table), *form]) == BAD_INPUT
-    assert "no Parquet file" in capsys.readouterr().err
-    assert main(["export", str(searched[1]), *form, "--rank", "1"]) == BAD_INPUT
-    assert "all candidates" in capsys.readouterr().err
+    refused_command(["export", no_table, *form], capsys, "not_parquet")
+    refused_command(["export", searched[1], *form, "--rank", "1"], capsys, "conflicting_options")
     assert not (tmp_path / "out").exists()

@@ -56,8 +56,8 @@ def test_blocks_are_the_same_from_a_full_an_empty_and_no_cache(cache: Cache, mon
 
 def test_without_a_folder_nothing_is_written_and_no_surface_is_none_to_keep(tmp_path: Path) -> None:
     """The switch that is off, and a case without structures."""
-    FastEngine(SURFACES, cache=Cache(None))
-    FastEngine([], cache=Cache(tmp_path))
+    content(FastEngine(SURFACES, cache=Cache(None)))
+    content(FastEngine([], cache=Cache(tmp_path)))
     assert not list(tmp_path.iterdir())
 
 
@@ -73,7 +73,7 @@ def test_without_a_folder_nothing_is_written_and_no_surface_is_none_to_keep(tmp_
 )
 def test_other_surfaces_have_orders_of_their_own(cache: Cache, others: tuple[TriangleMesh, ...]) -> None:
     """A hundredth of a hair is another surface, whatever its name and its number of triangles."""
-    FastEngine(SURFACES, cache=cache)
+    content(FastEngine(SURFACES, cache=cache))
     assert content(FastEngine(others, cache=cache)) == content(FastEngine(others))
 
 
@@ -97,7 +97,7 @@ WRONG = {
 @pytest.mark.parametrize("wrong", WRONG)
 def test_an_order_that_is_none_of_the_surface_is_found_anew(cache: Cache, wrong: str) -> None:
     """Under a forged digest too: a triangle that is in no block would never be seen, and its organ be free."""
-    FastEngine(SURFACES, cache=cache)
+    content(FastEngine(SURFACES, cache=cache))
     path = entry(cache)
     key = path.name.split(".")[-2]
     whole = path.read_bytes()
@@ -110,7 +110,7 @@ def test_an_order_that_is_none_of_the_surface_is_found_anew(cache: Cache, wrong:
 
 def test_a_flipped_bit_is_seen(cache: Cache) -> None:
     """A damaged order is found anew, and it is said."""
-    FastEngine(SURFACES, cache=cache)
+    content(FastEngine(SURFACES, cache=cache))
     path = entry(cache)
     damaged = bytearray(path.read_bytes())
     damaged[-3] ^= 1

@@ -15,8 +15,8 @@ from puncture_twin.planning.clearance.kernels.side_by_side import (
     ROWS,
     UNDECIDED,
     bring_into_frame,
-    measure_beside,
-    measure_other,
+    measure_lateral,
+    measure_marked,
 )
 from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -117,19 +117,19 @@ def frame(rng):
 
 
 def beside(rows, length, frames, origin, count=None):
-    """`measure_beside`, and `measure_other` where it marks a pair, of one triangle each: distances, depths, marks."""
+    """`measure_lateral`, and `measure_marked` where it marks a pair, of one triangle each: distances, depths, marks."""
     count = len(rows) if count is None else count
     pairs = np.full((ROWS, len(rows)), 7.0)
     pairs[11] = length
     for k, (u, e, f) in enumerate(frames):
         bring_into_frame(tuple(u), tuple(e), tuple(f), rows, k, tuple(origin), pairs, k)
     with np.errstate(divide="ignore", invalid="ignore"):
-        measure_beside(pairs, count)
+        measure_lateral(pairs, count)
     marks, found = pairs[9].copy(), np.empty((len(rows), 2))
     for k in range(count):
         square, depth = pairs[9, k], pairs[10, k]
         if square < 0.0:
-            square, depth = measure_other(pairs, k)
+            square, depth = measure_marked(pairs, k)
         found[k] = np.sqrt(square), depth
     return found[:, 0], found[:, 1], marks
 

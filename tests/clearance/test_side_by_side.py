@@ -4,15 +4,15 @@ import numba as nb
 import numpy as np
 import pytest
 
-from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, least_of, lowest
+from puncture_twin.planning.clearance.kernels.lanes import LANES, lanes_at_most, least_of, lowest_bit
 from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
 from puncture_twin.planning.clearance.kernels.side_by_side import (
     BEYOND,
     ROWS,
     UNDECIDED,
     bring_into_frame,
-    measure_beside,
-    measure_other,
+    measure_lateral,
+    measure_marked,
 )
 
 LENGTH = 80.0
@@ -29,11 +29,11 @@ def _in_pairs(axes, triangles, origin, length, pairs):
         )
         bring_into_frame(u, e, f, triangles, k, (origin[0], origin[1], origin[2]), pairs, k)
     pairs[11] = length
-    measure_beside(pairs, len(axes))
+    measure_lateral(pairs, len(axes))
     marks = pairs[9].copy()
     for k in range(len(axes)):
         if pairs[9, k] < 0.0:
-            pairs[9, k], pairs[10, k] = measure_other(pairs, k)
+            pairs[9, k], pairs[10, k] = measure_marked(pairs, k)
     return marks
 
 
@@ -99,7 +99,11 @@ def test_the_lanes_that_pass_are_bits():
 
     @nb.njit
     def asked(rows, row, limit):
-        return at_most(rows, row, limit), least_of(rows, row), lowest(at_most(rows, row, least_of(rows, row)))
+        return (
+            lanes_at_most(rows, row, limit),
+            least_of(rows, row),
+            lowest_bit(lanes_at_most(rows, row, least_of(rows, row))),
+        )
 
     for row, limit in enumerate(limits):
         bits, least, place = asked(rows, row, limit)

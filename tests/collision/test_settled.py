@@ -69,7 +69,7 @@ def test_a_round_body_is_settled_as_fcl_settles_it() -> None:
     assert isinstance(fast, FastChecker) and fast._patient is not None and fast._patient.outside is not None
     skin, outside = surfaces()
     trees = [fcl.CollisionObject(surface(mesh)) for mesh in (skin, outside)]
-    scene, room = fast._proofs.scene, fast._proofs._beside
+    scene, room = fast._proofs.scene, fast._proofs._on_triangle
     bodies = {body.name: body for body in fast._bodies}
     rows = {"holder": None, "needle": None}
     for check, row in zip(fast._tested, scene.checks, strict=True):
@@ -118,7 +118,7 @@ def test_a_sliver_is_where_its_corners_are_whatever_its_normal_is() -> None:
         T = pose(np.stack([edge, beside, axis], axis=1), a + rng.uniform(0.05, 0.95) * (b - a) + off * beside)
         frames = np.tile(np.eye(4), (7, 1, 1))
         frames[body.frame] = T @ np.linalg.inv(body.T_frame_body)
-        answer = settled_at(scene, fast._proofs._work, fast._proofs._beside, row, frames)
+        answer = settled_at(scene, fast._proofs._work, fast._proofs._on_triangle, row, frames)
         assert (answer == CLEAR) == (trial % 2 == 1), trial
 
 

@@ -11,6 +11,7 @@ import report_world as world
 import yaml
 from export.ros_check import holds, through_ros
 from export.ros_messages import type_store
+from refusals import refused, refused_command
 from rosbags.typesys import Stores
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +20,6 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.links import T_BASE_URDFBASE
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import JOINT_NAMES, ur_model
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.settings import Gantry, Obstacle
 from puncture_twin.planning.export.moveit import (
     BOX,
@@ -32,7 +32,6 @@ from puncture_twin.planning.export.moveit import (
 )
 from puncture_twin.planning.export.ros2 import ros2_text
 from puncture_twin.planning.motion.trajectory import Trajectory
-from puncture_twin.run_twin import main
 
 SLOWER = 30.0
 """The small patient's plan runs at any speed."""
@@ -174,11 +173,11 @@ def test_goals_read_back_as_the_plan(room, tmp_path):
     check_goals(json.loads(text), plan, where=tmp_path)
     changed = json.loads(text)
     changed["insertion"]["trajectory"]["points"][3]["positions"][2] += 1e-6
-    with pytest.raises(InputError, match="the insertion does not read back"):
+    with refused("not_read_back"):
         check_goals(changed, plan, where=tmp_path)
     changed = json.loads(text)
     changed["approach"]["trajectory"]["joint_names"].reverse()
-    with pytest.raises(InputError, match="approach is of other joints"):
+    with refused("other_joints"):
         check_goals(changed, plan, where=tmp_path)
 
 
@@ -209,5 +208,5 @@ def test_the_sender_is_short_and_sound():
 def test_a_plan_without_its_case_has_no_scene(tmp_path, capsys):
     """One line, exit code 2."""
     (tmp_path / "plan.json").write_text("{}")
-    assert main(["export", str(tmp_path / "plan.json"), "--format", "moveit", "--out", str(tmp_path / "out")]) == 2
-    assert "allowed: export plan.json --case CASE" in capsys.readouterr().err
+    command = ["export", tmp_path / "plan.json", "--format", "moveit", "--out", tmp_path / "out"]
+    refused_command(command, capsys, "missing_option", "--case CASE")

@@ -9,8 +9,9 @@ import pytest
 import SimpleITK
 from case_world import CASE, changed, registration_section, whole, write_case
 from export.slicer_facts import MARKUP, POINT, SCHEMA, check_attributes, check_properties
+from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.export.slicer import entry_area
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
@@ -177,16 +178,16 @@ def test_without_a_robot_there_is_no_transform_and_that_is_said(tmp_path, capfd)
 
 def test_what_cannot_be_shown_is_refused_and_nothing_is_written(tmp_path, context):
     """A plan, a rank beyond the last, a rejected direction, a frame of its own."""
-    with pytest.raises(InputError, match="safe candidates"):
+    with refused("out_of_range"):
         export_to_slicer(context, tmp_path / "a", Choice(rank=10_000))
-    with pytest.raises(NoAnswerError, match="rejected"):
+    with refused("direction_rejected", by=NoAnswerError):
         export_to_slicer(context, tmp_path / "a", Choice(angles=(np.radians(45.0), 0.0)))
     local = ('space = "RAS"', 'space = "local"')
     write_case(tmp_path, *CHANGES, local, NO_ROBOT)
     text = (tmp_path / "case.toml").read_text()
     vessel = text.index('[[structure]]\nname = "vessel"')
     (tmp_path / "case.toml").write_text(whole(text[:vessel]))
-    with pytest.raises(InputError, match="Slicer knows LPS and RAS"):
+    with refused("local_space"):
         export_to_slicer(prepare(tmp_path), tmp_path / "a", BEST)
     assert not [one for one in (tmp_path / "a").glob("*") if one.suffix in (".json", ".mrml", ".tfm", ".vtp")]
     (tmp_path / "plan.json").write_text("{}")

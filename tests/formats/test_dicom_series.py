@@ -10,6 +10,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
 from pydicom.encaps import encapsulate
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless
+from refusals import refused
 
 from puncture_twin.planning.anatomy.body.unscanned import UNSCANNED_HU
 from puncture_twin.planning.base.errors import InputError
@@ -142,42 +143,39 @@ def shorter(slices):
 
 
 REFUSED = {
-    "one slice": (lambda: world.series()[:1], "1 slice"),
+    "one slice": (lambda: world.series()[:1], "too_few_slices"),
     "missing slice": (
         lambda: world.series(world.phantom((7, 5, 6)))[:3] + world.series(world.phantom((7, 5, 6)))[4:],
-        "1 slice is missing between .*_2 and .*_3: 5 mm apart.*2.5 mm",
+        "uneven_slices 2.5",
     ),
-    "uneven step": (lambda: moved(2, 812.25 + 5.9), "uneven steps: 3.4 mm between .*_1 and .*_2"),
-    "two at one place": (lambda: moved(2, 812.25 + 2.5), "several slices at one place: .*_1 and .*_2"),
-    "two time points": (lambda: world.series() + world.series(), "several slices at one place.*one time point"),
-    "one slice off the line": (
-        lambda: changed(2, ImagePositionPatient=world.ds([-101.0, 33.0, 817.25])),
-        "off the line",
-    ),
+    "uneven step": (lambda: moved(2, 812.25 + 5.9), "uneven_slices 3.4"),
+    "two at one place": (lambda: moved(2, 812.25 + 2.5), "duplicate_place"),
+    "two time points": (lambda: world.series() + world.series(), "duplicate_place"),
+    "one slice off the line": (lambda: changed(2, ImagePositionPatient=world.ds([-101.0, 33.0, 817.25])), "off_grid"),
     "another orientation": (
         lambda: changed(1, ImageOrientationPatient=["1", "0", "0", "0", "0.98", "0.199"]),
-        "other orientations",
+        "mixed_geometry",
     ),
-    "another pixel size": (lambda: changed(1, PixelSpacing=["0.9", "0.8"]), "pixels of other sizes"),
-    "no position": (
-        lambda: changed(1, ImagePositionPatient=None),
-        r"_1.*ImagePositionPatient \(0020,0032\) is missing",
+    "another pixel size": (lambda: changed(1, PixelSpacing=["0.9", "0.8"]), "mixed_geometry"),
+    "no position": (lambda: changed(1, ImagePositionPatient=None), "missing_tag _1 ImagePositionPatient 0020 0032"),
+    "no orientation": (
+        lambda: changed(1, ImageOrientationPatient=None),
+        "missing_tag ImageOrientationPatient 0020 0037",
     ),
-    "no orientation": (lambda: changed(1, ImageOrientationPatient=None), r"ImageOrientationPatient \(0020,0037\)"),
-    "no spacing": (lambda: changed(1, PixelSpacing=None), r"PixelSpacing \(0028,0030\) is missing"),
-    "no slope": (lambda: changed(1, RescaleSlope=None), r"_1.*RescaleSlope \(0028,1053\) is missing"),
-    "slope 0": (lambda: changed(1, RescaleSlope="0"), "rescaling by 0"),
-    "no Hounsfield units": (lambda: changed(1, RescaleType="MGML"), "RescaleType .* is 'MGML'"),
-    "a skewed plane": (lambda: changed(1, ImageOrientationPatient=list("100") + ["0.5", "1", "0"]), "right angle"),
-    "axes of no length": (lambda: changed(1, ImageOrientationPatient=list("000000")), "unit vectors"),
-    "inverted": (lambda: changed(1, PhotometricInterpretation="MONOCHROME1"), "MONOCHROME1"),
-    "colours": (lambda: changed(1, SamplesPerPixel=3), "SamplesPerPixel .* is 3"),
-    "another frame of reference": (lambda: changed(1, FrameOfReferenceUID=world.ROOT + "9"), "2 frames of reference"),
-    "a high bit elsewhere": (lambda: changed(1, BitsStored=12), "HighBit"),
-    "pixels cut short": (lambda: shorter(world.series()), "_3.*PixelData .* has 56 bytes where .* 70"),
-    "no pixels": (lambda: changed(1, PixelData=None), "PixelData .* is missing"),
-    "slices side by side": (lambda: world.series(T=world.affine(step=(5.0, 0, 2.5))), "63 degrees apart"),
-    "frames in a classic file": (lambda: changed(1, NumberOfFrames=2), "has 70 bytes where the header promises 140"),
+    "no spacing": (lambda: changed(1, PixelSpacing=None), "missing_tag PixelSpacing 0028 0030"),
+    "no slope": (lambda: changed(1, RescaleSlope=None), "no_rescale _1 0028 1053"),
+    "slope 0": (lambda: changed(1, RescaleSlope="0"), "out_of_range"),
+    "no Hounsfield units": (lambda: changed(1, RescaleType="MGML"), "not_hounsfield MGML"),
+    "a skewed plane": (lambda: changed(1, ImageOrientationPatient=list("100") + ["0.5", "1", "0"]), "axes_not_square"),
+    "axes of no length": (lambda: changed(1, ImageOrientationPatient=list("000000")), "axes_not_square"),
+    "inverted": (lambda: changed(1, PhotometricInterpretation="MONOCHROME1"), "unsupported_feature MONOCHROME1"),
+    "colours": (lambda: changed(1, SamplesPerPixel=3), "bad_tag SamplesPerPixel"),
+    "another frame of reference": (lambda: changed(1, FrameOfReferenceUID=world.ROOT + "9"), "several_series"),
+    "a high bit elsewhere": (lambda: changed(1, BitsStored=12), "bad_tag HighBit"),
+    "pixels cut short": (lambda: shorter(world.series()), "size_mismatch _3 56 70"),
+    "no pixels": (lambda: changed(1, PixelData=None), "missing_tag"),
+    "slices side by side": (lambda: world.series(T=world.affine(step=(5.0, 0, 2.5))), "gantry_tilt 63"),
+    "frames in a classic file": (lambda: changed(1, NumberOfFrames=2), "size_mismatch 70 140"),
 }
 
 
@@ -186,9 +184,8 @@ def test_a_series_that_is_no_regular_stack_is_refused_naming_the_slice(tmp_path,
     """One line, with the file that is wrong."""
     make, message = REFUSED[name]
     folder = world.write_series(tmp_path, make(), [f"a{number:02d}_{number}" for number in range(20)])
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(*message.split()):
         read_series(folder)
-    assert "\n" not in str(caught.value)
 
 
 def scout():
@@ -225,10 +222,8 @@ def test_two_series_are_refused_with_names_and_a_file_chooses_one(tmp_path):
     """Their descriptions, counts and a file of each; then one file of a series stands for it."""
     other = world.series(world.phantom() + 5, series=world.ROOT + "70", description="arterial")
     folder = world.write_series(tmp_path / "s", [*world.series(), *other], [f"{n}.dcm" for n in range(8)])
-    listed = r"2 CT series: 4 files of '1 abdomen 2.5' \(such as 0.dcm.*'1 arterial'"
-    with pytest.raises(InputError, match=listed) as caught:
+    with refused("several_series", "2.5", "0.dcm"):
         read_series(folder)
-    assert "name one of its files" in str(caught.value)
     assert by_place(read_series(folder / "2.dcm")) == expected(world.affine())
     assert by_place(read_series(folder / "6.dcm")) == expected(world.affine(), HU + 5)
 
@@ -242,8 +237,8 @@ def test_a_folder_without_a_series_says_what_it_holds(tmp_path, what):
         (tmp_path / "series 1").mkdir()
     elif what == "capture alone":
         world.write_series(tmp_path, [capture()])
-    told = {"folders": r"series 1 \(is a folder\)", "capture alone": "1 Secondary Capture"}.get(what, "no DICOM file")
-    with pytest.raises(InputError, match=f"no CT series here.*{told}"):
+    told = {"folders": "series 1 (is a folder)", "capture alone": "1 Secondary Capture"}.get(what, "no DICOM file")
+    with refused("no_ct", told):
         read_series(tmp_path)
 
 
@@ -343,7 +338,7 @@ def test_a_deflate_bomb_is_not_inflated(tmp_path):
     packer = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
     bomb = b"".join(packer.compress(bytes(1 << 24)) for _ in range(5)) + packer.flush()
     (folder / "3").write_bytes(content[:start] + bomb)
-    with pytest.raises(InputError, match="3: inflates to more than"):
+    with refused("file_damaged"):
         read_series(folder)
 
 
@@ -366,7 +361,7 @@ def test_other_transfer_syntaxes_are_refused_with_what_to_do(tmp_path, syntax):
         new = syntax.encode() + b"\0" * (len(syntax) % 2)
         at = content.index(old)
         path.write_bytes(content[: at - 2] + len(new).to_bytes(2, "little") + new + content[at + len(old) :])
-    with pytest.raises(InputError, match=f"transfer syntax .*{re.escape(syntax)}.*gdcmconv --raw"):
+    with refused("transfer_syntax", syntax):
         read_series(folder)
 
 
@@ -374,7 +369,7 @@ def test_a_gap_is_no_reason_to_delete_good_slices(tmp_path):
     """Beside a gap of twelve steps each true step was less than a tenth of the largest one."""
     slices = world.series(world.phantom((7, 5, 24)))
     folder = world.write_series(tmp_path, slices[:10] + slices[22:])
-    with pytest.raises(InputError, match="12 slices are missing"):
+    with refused("uneven_slices", "12"):
         read_series(folder)
 
 
@@ -389,7 +384,7 @@ def test_a_class_that_only_the_meta_information_states_is_taken(tmp_path):
     series = parse_series(folder, chosen.names, lambda name: (folder / name).read_bytes(), chosen.notes)
     assert any("4 files do not say what they are" in note for note in series.notes)
     slices[2].SOPClassUID = world.CAPTURE_CLASS
-    with pytest.raises(InputError, match="uneven steps"):
+    with refused("uneven_slices"):
         read_series(world.write_series(tmp_path / "t", slices))
 
 
@@ -405,9 +400,8 @@ def test_big_endian_is_refused_by_its_name_where_it_may_be_read(tmp_path):
     big_endian(folder / "4")
     assert by_place(read_series(folder)) == expected(world.affine())
     big_endian(folder / "2")
-    with pytest.raises(InputError, match="Big Endian.*gdcmconv --raw") as caught:
+    with refused("transfer_syntax", folder / "2"):
         read_series(folder)
-    assert caught.value.code == "transfer_syntax" and caught.value.where.endswith("2")
 
 
 def test_pixels_that_no_decoder_takes_are_named_by_their_syntax(tmp_path):
@@ -419,13 +413,12 @@ def test_pixels_that_no_decoder_takes_are_named_by_their_syntax(tmp_path):
         one["PixelData"].VR = "OB"
         one["PixelData"].is_undefined_length = True
     folder = world.write_series(tmp_path, slices)
-    with pytest.raises(InputError, match=r"JPEG Extended.*1\.2\.840\.10008\.1\.2\.4\.51") as caught:
+    with refused("not_decoded", "JPEG", "Extended", "1.2.840.10008.1.2.4.51") as caught:
         read_series(folder)
     assert caught.value.code in {"not_decoded", "no_decoder"} and "damaged" not in str(caught.value)
 
 
 def test_a_missing_rescaling_says_what_to_do(tmp_path):
     """Nothing tells whether air is 0 or -1000."""
-    with pytest.raises(InputError) as caught:
+    with refused("no_rescale", "-1024"):
         read_series(world.write_series(tmp_path, changed(1, RescaleIntercept=None)))
-    assert caught.value.code == "no_rescale" and "-1024" in caught.value.allowed

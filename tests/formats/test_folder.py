@@ -1,7 +1,6 @@
 """Every entry of a folder is read, known to be harmless, or named: what is passed over in silence is an organ lost."""
 
 import os
-import re
 import shutil
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import dicom_world as world
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
+from refusals import refused
 
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE
 from puncture_twin.planning.base.errors import InputError
@@ -62,9 +62,8 @@ def test_what_is_not_read_among_masks_is_refused_by_name(tmp_path: Path, name: s
     """Whatever its ending; the other masks do not stand for it."""
     folder = masks(tmp_path / "seg")
     (folder / name).write_bytes(b"x")
-    with pytest.raises(InputError, match=re.escape(name)) as caught:
+    with refused("entries_not_read", name):
         mask_files(folder, nothing_else, where="case")
-    assert caught.value.code == "entries_not_read"
 
 
 def test_files_about_a_file_do_not_stand_for_it(tmp_path: Path) -> None:
@@ -72,7 +71,7 @@ def test_files_about_a_file_do_not_stand_for_it(tmp_path: Path) -> None:
     folder = masks(tmp_path / "seg")
     for name in ("vessel.nii.gz.dvc", "vessel.nii.gz.json"):
         (folder / name).write_bytes(b"x")
-    with pytest.raises(InputError, match=r"vessel.nii.gz.dvc \(.*vessel.nii.gz.json \("):
+    with refused("entries_not_read", "vessel.nii.gz.dvc", "vessel.nii.gz.json"):
         mask_files(folder, nothing_else, where="case")
 
 
@@ -123,7 +122,7 @@ def test_a_folder_in_a_folder_is_known_by_what_is_in_it(tmp_path: Path) -> None:
     (folder / "notes").mkdir()
     assert len(mask_files(folder, nothing_else, where="case")) == 2
     (folder / "vessel.nii.gz").mkdir()  # unpacked, or not fetched
-    with pytest.raises(InputError, match=r"vessel.nii.gz \(is a folder\)"):
+    with refused("entries_not_read", "vessel.nii.gz"):
         mask_files(folder, nothing_else, where="case")
     (folder / "vessel.nii.gz").rmdir()
     (folder / "notes" / "a.txt").write_text("x")
@@ -132,19 +131,17 @@ def test_a_folder_in_a_folder_is_known_by_what_is_in_it(tmp_path: Path) -> None:
     (folder / "out" / "map.nii.gz").write_text("x")
     assert len(mask_files(folder, nothing_else, where="case")) == 2
     (folder / "notes" / "b").symlink_to("..")  # a folder that holds itself ends somewhere
-    with pytest.raises(InputError, match="notes"):
+    with refused("entries_not_read"):
         mask_files(folder, nothing_else, where="case")
 
 
 def test_a_folder_that_cannot_be_listed_is_refused(tmp_path: Path) -> None:
     """It is no folder without masks."""
-    with pytest.raises(InputError) as caught:
+    with refused("folder_not_listed"):
         entries(tmp_path / "none", most=10)
-    assert caught.value.code == "folder_not_listed"
     masks(tmp_path / "seg")
-    with pytest.raises(InputError) as caught:
+    with refused("folder_too_large"):
         entries(tmp_path / "seg", most=1)
-    assert caught.value.code == "folder_too_large"
     assert [one.name for one in unaccounted(tmp_path, entries(tmp_path, most=9), nothing_else)] == ["seg"]
 
 
@@ -159,9 +156,8 @@ def test_a_slice_that_cannot_be_read_is_no_end_of_the_scan(tmp_path: Path, name:
         (folder / name).symlink_to("not_fetched/4")
     else:
         (folder / name).write_text("version https://git-lfs.github.com/spec/v1\n")
-    with pytest.raises(InputError, match=re.escape(name)) as caught:
+    with refused("slices_not_read", name):
         choose_series(folder)
-    assert caught.value.code == "slices_not_read"
 
 
 def test_slices_in_a_folder_beside_the_series_are_told(tmp_path: Path) -> None:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from numpy.typing import ArrayLike
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE, guard_points, guard_transform
 from puncture_twin.planning.formats.mesh_guard import MAX_DIAGONAL_MM, MIN_DIAGONAL_MM, guard_mesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_space, parse_unit, to_lps
@@ -68,41 +68,39 @@ def test_indices_may_come_as_whole_floats() -> None:
 @pytest.mark.parametrize(
     ("vertices", "faces", "says"),
     [
-        pytest.param([], TWO, "no vertex", id="no-vertex"),
-        pytest.param(SQUARE, [], "no triangle", id="no-triangle"),
-        pytest.param(SQUARE, np.zeros((0, 3), dtype=int), "no triangle", id="no-triangle-with-shape"),
-        pytest.param(with_value(np.nan), TWO, r"vertex 3 is not finite.*nan", id="nan-vertex"),
-        pytest.param(with_value(-np.inf), TWO, r"vertex 3 is not finite.*inf", id="infinite-vertex"),
-        pytest.param([*SQUARE, [np.nan] * 3], TWO, "vertex 4 is not finite", id="nan-in-an-unused-vertex"),
-        pytest.param(SQUARE, [[0, 1, 4]], r"triangle 0 uses vertex 4.*0 to 3", id="index-too-high"),
-        pytest.param(SQUARE, [[0, 1, 2], [0, -1, 2]], "triangle 1 uses vertex -1", id="index-negative"),
-        pytest.param(SQUARE, [[0, 1, 2**40]], "out of range", id="index-beyond-int32"),
-        pytest.param(SQUARE, [[0, 1, 2**32]], "out of range", id="index-that-int32-would-wrap-to-0"),
-        pytest.param(SQUARE, [[0, 1, 1.5]], "not a whole number", id="index-with-a-fraction"),
-        pytest.param(SQUARE, [[0, 1, np.nan]], "not a whole number", id="index-nan"),
-        pytest.param(SQUARE, [[0, 1, np.inf]], "out of range", id="index-infinite"),
-        pytest.param(SQUARE, [["0", "1", "2"]], "not a whole number", id="index-of-text"),
-        pytest.param(SQUARE, [[0, 1, 2, 3]], "shape", id="quads"),
-        pytest.param(SQUARE, [[0, 1, 2], [0, 1]], "ragged", id="faces-ragged"),
-        pytest.param([[0.0, 0.0], [1.0, 1.0]], TWO, "shape", id="vertices-in-2d"),
-        pytest.param([[0.0, 0.0, 0.0], [1.0]], TWO, "ragged", id="vertices-ragged"),
-        pytest.param([["a", "b", "c"]], TWO, "type", id="vertices-of-text"),
-        pytest.param(np.array(SQUARE) * 1j, TWO, "type complex", id="vertices-complex"),
-        pytest.param(np.array(SQUARE) / 1000, TWO, "looks like metres", id="metres-declared-as-mm"),
-        pytest.param(np.array(SQUARE) * 1000, TWO, "looks like mm declared", id="mm-declared-as-m"),
-        pytest.param(np.array(SQUARE) * 0 + 7, TWO, "all corners in one place", id="a-single-point"),
-        pytest.param(np.array(SQUARE) + 1e6, TWO, "from the origin", id="far-from-the-origin"),
-        pytest.param(np.array(SQUARE) * 1e300, TWO, "from the origin", id="near-the-largest-float"),
-        pytest.param([[0, 0, 0], [1, 1, 1], [9, 9, 9]], [[0, 1, 2]], "none of the 1 tri", id="all-on-a-line"),
-        pytest.param(SQUARE, [[0, 0, 1], [2, 2, 2]], "none of the 2 triangles has an area", id="no-area"),
+        pytest.param([], TWO, "empty", id="no-vertex"),
+        pytest.param(SQUARE, [], "empty", id="no-triangle"),
+        pytest.param(SQUARE, np.zeros((0, 3), dtype=int), "empty", id="no-triangle-with-shape"),
+        pytest.param(with_value(np.nan), TWO, "not_finite", id="nan-vertex"),
+        pytest.param(with_value(-np.inf), TWO, "not_finite", id="infinite-vertex"),
+        pytest.param([*SQUARE, [np.nan] * 3], TWO, "not_finite", id="nan-in-an-unused-vertex"),
+        pytest.param(SQUARE, [[0, 1, 4]], "index_out_of_range", id="index-too-high"),
+        pytest.param(SQUARE, [[0, 1, 2], [0, -1, 2]], "index_out_of_range -1", id="index-negative"),
+        pytest.param(SQUARE, [[0, 1, 2**40]], "index_out_of_range", id="index-beyond-int32"),
+        pytest.param(SQUARE, [[0, 1, 2**32]], "index_out_of_range", id="index-that-int32-would-wrap-to-0"),
+        pytest.param(SQUARE, [[0, 1, 1.5]], "not_whole", id="index-with-a-fraction"),
+        pytest.param(SQUARE, [[0, 1, np.nan]], "not_whole", id="index-nan"),
+        pytest.param(SQUARE, [[0, 1, np.inf]], "index_out_of_range", id="index-infinite"),
+        pytest.param(SQUARE, [["0", "1", "2"]], "not_whole", id="index-of-text"),
+        pytest.param(SQUARE, [[0, 1, 2, 3]], "wrong_shape", id="quads"),
+        pytest.param(SQUARE, [[0, 1, 2], [0, 1]], "wrong_shape", id="faces-ragged"),
+        pytest.param([[0.0, 0.0], [1.0, 1.0]], TWO, "wrong_shape", id="vertices-in-2d"),
+        pytest.param([[0.0, 0.0, 0.0], [1.0]], TWO, "wrong_shape", id="vertices-ragged"),
+        pytest.param([["a", "b", "c"]], TWO, "wrong_type", id="vertices-of-text"),
+        pytest.param(np.array(SQUARE) * 1j, TWO, "wrong_type", id="vertices-complex"),
+        pytest.param(np.array(SQUARE) / 1000, TWO, "implausible_size", id="metres-declared-as-mm"),
+        pytest.param(np.array(SQUARE) * 1000, TWO, "implausible_size", id="mm-declared-as-m"),
+        pytest.param(np.array(SQUARE) * 0 + 7, TWO, "implausible_size", id="a-single-point"),
+        pytest.param(np.array(SQUARE) + 1e6, TWO, "too_far", id="far-from-the-origin"),
+        pytest.param(np.array(SQUARE) * 1e300, TWO, "too_far", id="near-the-largest-float"),
+        pytest.param([[0, 0, 0], [1, 1, 1], [9, 9, 9]], [[0, 1, 2]], "no_area", id="all-on-a-line"),
+        pytest.param(SQUARE, [[0, 0, 1], [2, 2, 2]], "no_area", id="no-area"),
     ],
 )
 def test_a_bad_mesh_is_refused_by_name(vertices: ArrayLike, faces: ArrayLike, says: str) -> None:
     """Each fault gives one line that names the place, the fault and what is allowed."""
-    with pytest.raises(InputError, match=says) as caught:
+    with refused(*says.split(), "liver.stl"):
         guard_mesh(vertices, faces, where="liver.stl")
-    assert str(caught.value).startswith("liver.stl: ") and "allowed:" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_limits_of_size_are_the_stated_ones() -> None:
@@ -110,10 +108,10 @@ def test_the_limits_of_size_are_the_stated_ones() -> None:
     unit = np.array(SQUARE) / np.linalg.norm([10.0, 10.0])
     for inside, outside in ((MIN_DIAGONAL_MM, -1), (MAX_DIAGONAL_MM, 1)):
         guard_mesh(unit * inside * (1 - outside * 1e-9), TWO, where="x")
-        with pytest.raises(InputError, match="diagonal"):
+        with refused("implausible_size"):
             guard_mesh(unit * inside * (1 + outside * 1e-9), TWO, where="x")
     guard_mesh(np.array(SQUARE) - [0, 0, MAX_COORDINATE_MM], TWO, where="x")
-    with pytest.raises(InputError, match="origin"):
+    with refused("too_far"):
         guard_mesh(np.array(SQUARE) - [0, 0, MAX_COORDINATE_MM + 0.1], TWO, where="x")
 
 
@@ -128,32 +126,32 @@ def test_a_rigid_transform_passes_unchanged_and_read_only() -> None:
 @pytest.mark.parametrize(
     ("T", "says"),
     [
-        pytest.param(np.eye(3), "shape", id="3x3"),
-        pytest.param([[1, 0], [0]], "ragged", id="ragged"),
-        pytest.param(np.full((4, 4), "1"), "type", id="text"),
-        pytest.param(rigid(m03=np.nan), "not finite", id="nan"),
-        pytest.param(rigid(m12=np.inf), "not finite", id="infinite"),
-        pytest.param(np.zeros((4, 4)), "last row", id="zero"),
-        pytest.param(np.diag([0.0, 0.0, 0.0, 1.0]), "not a rotation", id="zero-rotation"),
-        pytest.param(rigid(m30=0.1), "last row", id="projective"),
-        pytest.param(rigid(m33=2.0), "last row", id="scaled-by-the-last-entry"),
+        pytest.param(np.eye(3), "wrong_shape", id="3x3"),
+        pytest.param([[1, 0], [0]], "wrong_shape", id="ragged"),
+        pytest.param(np.full((4, 4), "1"), "wrong_type", id="text"),
+        pytest.param(rigid(m03=np.nan), "not_finite", id="nan"),
+        pytest.param(rigid(m12=np.inf), "not_finite", id="infinite"),
+        pytest.param(np.zeros((4, 4)), "not_rigid", id="zero"),
+        pytest.param(np.diag([0.0, 0.0, 0.0, 1.0]), "not_rigid", id="zero-rotation"),
+        pytest.param(rigid(m30=0.1), "not_rigid", id="projective"),
+        pytest.param(rigid(m33=2.0), "not_rigid", id="scaled-by-the-last-entry"),
         pytest.param(np.diag([-1.0, 1.0, 1.0, 1.0]), "mirrored", id="mirrored"),
         pytest.param(np.diag([-1000.0, 1000.0, 1000.0, 1.0]), "mirrored", id="mirrored-and-scaled"),
-        pytest.param(np.diag([1000.0, 1000.0, 1000.0, 1.0]), "not a rotation", id="metres-to-mm"),
-        pytest.param(np.diag([2.0, 0.5, 1.0, 1.0]), "not a rotation", id="sheared-with-determinant-1"),
-        pytest.param(rigid(m03=2e5), "moves by", id="far-away"),
+        pytest.param(np.diag([1000.0, 1000.0, 1000.0, 1.0]), "not_rigid", id="metres-to-mm"),
+        pytest.param(np.diag([2.0, 0.5, 1.0, 1.0]), "not_rigid", id="sheared-with-determinant-1"),
+        pytest.param(rigid(m03=2e5), "too_far", id="far-away"),
     ],
 )
 def test_a_bad_transform_is_refused_by_name(T: ArrayLike, says: str) -> None:
     """A transform that is not rigid never passes, and is never repaired."""
-    with pytest.raises(InputError, match=says):
+    with refused(says):
         guard_transform(T, where="registration")
 
 
 def test_a_rotation_may_be_off_by_the_digits_of_a_file_and_no_more() -> None:
     """Six written digits pass; an error of several tolerances does not."""
     guard_transform(np.round(rigid(), 6), where="x")
-    with pytest.raises(InputError, match="not a rotation"):
+    with refused("not_rigid"):
         guard_transform(rigid() @ np.diag([1 + 3 * ROTATION_TOLERANCE, 1, 1, 1]), where="x")
 
 
@@ -163,26 +161,26 @@ def test_every_rotation_passes_and_every_mirrored_one_does_not(rotvec: list[floa
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix()
     guard_transform(T, where="x")
-    with pytest.raises(InputError, match="mirrored"):
+    with refused("mirrored"):
         guard_transform(T @ np.diag([1.0, 1.0, -1.0, 1.0]), where="x")
 
 
 @pytest.mark.parametrize(
     ("points", "names", "says"),
     [
-        pytest.param([], [], "no point", id="empty"),
-        pytest.param([[0, 0, 0]], ["A", "B"], "2 names for 1 points", id="more-names-than-points"),
-        pytest.param([[0, 0, 0], [1, 1, 1]], ["A", "A"], "'A' is used 2 times", id="name-twice"),
-        pytest.param([[0, 0, 0]], ["  "], "point 1 has an empty name", id="blank-name"),
-        pytest.param([[0, 0, 0]], ["A\nB"], r"name 'A\\nB'", id="name-with-a-line-end"),
-        pytest.param([[0, 0, 0], [0, np.nan, 0]], ["A", "B"], "point 'B' is not finite", id="nan"),
-        pytest.param([[0, 0, 3e5]], ["A"], "point 'A' lies at", id="far"),
-        pytest.param([[0, 0]], ["A"], "shape", id="two-coordinates"),
+        pytest.param([], [], "empty", id="empty"),
+        pytest.param([[0, 0, 0]], ["A", "B"], "wrong_count", id="more-names-than-points"),
+        pytest.param([[0, 0, 0], [1, 1, 1]], ["A", "A"], "duplicate_name", id="name-twice"),
+        pytest.param([[0, 0, 0]], ["  "], "bad_name", id="blank-name"),
+        pytest.param([[0, 0, 0]], ["A\nB"], "bad_name A\\nB", id="name-with-a-line-end"),
+        pytest.param([[0, 0, 0], [0, np.nan, 0]], ["A", "B"], "not_finite", id="nan"),
+        pytest.param([[0, 0, 3e5]], ["A"], "too_far", id="far"),
+        pytest.param([[0, 0]], ["A"], "wrong_shape", id="two-coordinates"),
     ],
 )
 def test_bad_points_are_refused_by_name(points: ArrayLike, names: list[str], says: str) -> None:
     """The error names the point by its own name where it has one."""
-    with pytest.raises(InputError, match=says):
+    with refused(*says.split()):
         guard_points(points, names, where="markers.csv")
 
 
@@ -199,7 +197,7 @@ def test_units_and_spaces_are_parsed_or_refused_with_the_list() -> None:
     """An unknown one is refused with everything that is allowed."""
     assert [parse_unit(text, where="x").mm for text in ("mm", "cm", " m ")] == [1.0, 10.0, 1000.0]
     assert parse_space("ras", where="x") is Space.RAS and parse_unit("m", where="x") is Unit.M
-    with pytest.raises(InputError, match="unknown unit of length 'inch'; allowed: mm, cm, m"):
+    with refused("unknown_unit", "inch"):
         parse_unit("inch", where="x")
-    with pytest.raises(InputError, match="unknown space 'RPS'; allowed: LPS, RAS, local"):
+    with refused("unknown_space", "RPS"):
         parse_space("RPS", where="x")

@@ -14,6 +14,7 @@ import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings, strategies as st
 from places import DATA, TESTS
+from refusals import refused
 from scipy.spatial import cKDTree
 from slicer_files import vtk_model
 
@@ -47,9 +48,8 @@ def test_a_glb_says_nothing_of_its_axes_so_the_case_must(tmp_path: Path) -> None
         ras = read_mesh(path, unit=Unit.MM, space=Space.RAS, up=Up.Y).vertices
         assert np.array_equal(ras, turned * [-1.0, -1.0, 1.0])
     assert np.array_equal(kept, read_mesh(path, unit=Unit.MM, space=Space.LPS).vertices)
-    with pytest.raises(InputError) as error:
+    with refused("up_not_stated"):
         read_mesh(tmp_path / "mesh.glb", unit=Unit.MM, space=Space.LPS)
-    assert error.value.code == "up_not_stated"
 
 
 def same_triangles(mesh: TriangleMesh, corners: np.ndarray, tolerance: float = 1e-5) -> bool:
@@ -209,9 +209,9 @@ def test_unit_and_space_are_the_declared_ones(tmp_path: Path) -> None:
     mesh = read(tmp_path, ".stl", data, Unit.M, Space.RAS)
     assert same_triangles(mesh, BALL.triangles * [-1, -1, 1], 1e-4)
     assert mesh_warnings(mesh, "ball") == ()
-    with pytest.raises(InputError, match=r"looks like metres declared as mm"):
+    with refused("implausible_size"):
         read(tmp_path, ".stl", data, Unit.MM)
-    with pytest.raises(InputError, match=r"looks like mm declared as cm or m"):
+    with refused("implausible_size"):
         read(tmp_path, *WHOLE["obj"], Unit.M)
 
 
@@ -358,9 +358,9 @@ def test_what_slicer_states_of_the_space_is_held(tmp_path: Path, suffix: str) ->
     assert same_triangles(read_mesh(path, unit=Unit.MM, space=Space.RAS), turned)
     assert same_triangles(read_mesh(path, unit=Unit.MM, space=Space.LPS, space_is_default=True), turned)
     assert same_triangles(read_mesh(path, unit=Unit.MM, space=Space.LOCAL), BALL.triangles)
-    with pytest.raises(InputError, match=r'states SPACE=RAS, the case LPS; allowed: space = "RAS"'):
+    with refused("other_space", "SPACE=RAS", "RAS"):
         read_mesh(path, unit=Unit.MM, space=Space.LPS)
-    with pytest.raises(InputError, match=r'states SPACE=RAS, the case local; allowed: space = "local"'):
+    with refused("other_space", "SPACE=RAS"):
         read_mesh(path, unit=Unit.MM, space=Space.LOCAL, space_is_default=True)
 
 
@@ -369,7 +369,7 @@ def test_the_field_of_a_file_that_vtk_wrote_is_its_space() -> None:
     path = TESTS / "formats" / "slicer_model.vtp"
     mesh = read_mesh(path, unit=Unit.MM, space=Space.RAS, space_is_default=True)
     assert mesh.vertices.min(axis=0) == pytest.approx([-15, -50, 50], abs=1e-4)
-    with pytest.raises(InputError, match="states SPACE=LPS, the case RAS"):
+    with refused("other_space", "SPACE=LPS", "RAS"):
         read_mesh(path, unit=Unit.MM, space=Space.RAS)
 
 
@@ -458,178 +458,176 @@ element face {faces}\nproperty list uchar int vertex_indices\n{extra}end_header\
 CORNERS = "0 0 0\n9 0 0\n0 9 0\n"
 OBJ_CORNERS = b"v 0 0 0\nv 9 0 0\nv 0 9 0\n"
 BROKEN = [
-    ("any-empty-file", ".stl", b"", r"file of 0 bytes"),
-    ("any-unknown-ending", ".step", STL, r"unknown mesh format '.step'.*\.stl, \.obj"),
-    ("stl-header-cut", ".stl", STL[:50], r"shorter than its header"),
-    ("stl-cut-in-the-middle", ".stl", STL[: len(STL) // 2], r"states 80 triangles.*4084 bytes.*has 2042"),
-    ("stl-one-byte-missing", ".stl", STL[:-1], r"has 4083"),
-    ("stl-trailing-bytes", ".stl", STL + b"\0\0", r"has 4086"),
-    ("stl-count-too-low", ".stl", patched(STL, 80, struct.pack("<I", 79)), r"states 79"),
-    ("stl-count-4-billion", ".stl", patched(STL, 80, b"\xff" * 4), r"states 4294967295 triangles"),
-    ("stl-count-zero", ".stl", patched(STL, 80, b"\0" * 4)[:84], r"states 0 triangles"),
-    ("stl-nan-vertex", ".stl", patched(STL, 84 + 12, NAN), r"vertex 0 is not finite"),
-    ("stl-infinite-vertex", ".stl", patched(STL, 84 + 62, INF), r"vertex 3 is not finite"),
-    ("stl-all-zero", ".stl", patched(STL, 84, bytes(len(STL) - 84)), r"all corners in one place"),
-    ("stl-binary-garbage", ".stl", NOISE, r"header states \d+ triangles"),
-    ("stl-text-garbage", ".stl", b"lorem ipsum " * 40, r"header states \d+ triangles"),
-    ("stl-that-is-a-picture", ".stl", b"\x89PNG\r\n\x1a\n" + NOISE, r"header states"),
-    ("stl-ascii-cut", ".stl", ASCII_STL[: len(ASCII_STL) // 2], r"the file is cut"),
-    ("stl-ascii-without-end", ".stl", replaced(ASCII_STL, b"endsolid", b""), r"the file is cut"),
-    ("stl-ascii-cut-but-closed", ".stl", ASCII_STL[:5000] + b"\nendsolid\n", r"facet \d+ is not complete|instead of"),
-    ("stl-ascii-misspelt", ".stl", replaced(ASCII_STL, b"vertex", b"vertx"), r"facet 0: 'vertx' instead of 'vertex'"),
-    ("stl-ascii-facet-without-end", ".stl", replaced(ASCII_STL, b"endfacet", b""), r"facet 0: 'facet' instead of"),
-    ("stl-ascii-number-broken", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 1,5x"), r"a coordinate is no number"),
-    ("stl-ascii-4-corners", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 0 0 0\nvertex "), r"facet 0: 'vertex' in"),
-    ("stl-ascii-nan", ".stl", replaced(ASCII_STL, b"vertex -10.771933363574009", b"vertex nan"), r"0 is not finite"),
-    ("stl-ascii-no-facet", ".stl", b"solid x facet\nendsolid x\n", r"no facet"),
-    ("stl-ascii-two-solids", ".stl", ASCII_STL * 2, r"several solids"),
-    ("stl-ascii-endless-word", ".stl", replaced(ASCII_STL, b"normal", b"n" * 5000), r"'n{20}' instead of 'normal'"),
-    ("ply-endless-word", ".ply", ply_text("0 " * 8 + "9" * 5000 + "\n3 0 1 2\n"), r"a word of 5000 characters"),
-    ("stl-ascii-not-utf8", ".stl", replaced(ASCII_STL, b"loop", b"\xff\xfe"), r"byte \d+ is not text"),
-    ("obj-last-line-cut", ".obj", OBJ_CORNERS + b"f 1 2 3", r"no line end"),
-    ("obj-face-list-cut", ".obj", OBJ[: OBJ.index(b"\nf ") + 1], r"no face"),
-    ("obj-faces-cut", ".obj", OBJ[: OBJ.index(b"\n", OBJ.index(b"\nf ") + 99) + 1], r"vertices that no face uses"),
-    ("obj-fewer-than-counted", ".obj", OBJ_CORNERS + b"# Faces: 2\nf 1 2 3\n", r"count 2 faces, 1 are there"),
-    ("obj-index-too-high", ".obj", OBJ_CORNERS + b"f 1 2 4\n", r"line 4: face uses vertex 4 of 3"),
-    ("obj-index-zero", ".obj", OBJ_CORNERS + b"f 0 1 2\n", r"face uses vertex 0"),
-    ("obj-index-too-negative", ".obj", OBJ_CORNERS + b"f -4 1 2\n", r"face uses vertex -4"),
-    ("obj-index-no-number", ".obj", OBJ_CORNERS + b"f 1 2 x\n", r"face corner 'x'"),
-    ("obj-index-endless", ".obj", OBJ_CORNERS + b"f 1 2 " + b"9" * 5000 + b"\n", r"face corner '999"),
-    ("obj-two-corners", ".obj", OBJ_CORNERS + b"f 1 2\n", r"face 0 has 2 corners"),
-    ("obj-nan-vertex", ".obj", b"v nan 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", r"vertex 0 is not finite"),
-    ("obj-overflowing-number", ".obj", b"v 1e999 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", r"not finite"),
-    ("obj-two-coordinates", ".obj", b"v 1 2\n", r"line 1: vertex of 2 numbers"),
-    ("obj-decimal-comma", ".obj", b"v 1,5 2 3\n", r"line 1: vertex '1,5 2 3'"),
-    ("obj-only-vertices", ".obj", OBJ_CORNERS, r"no face"),
-    ("obj-text-garbage", ".obj", b"lorem ipsum\n", r"line 1: line starts with 'lorem'"),
-    ("obj-binary-garbage", ".obj", NOISE, r"is not text"),
-    ("obj-free-form-surface", ".obj", OBJ_CORNERS + b"surf 0 1 0 1 1 2 3\n", r"line starts with 'surf'"),
-    ("ply-cut-in-the-middle", ".ply", PLY[: len(PLY) // 2], r"face take at least|ends inside"),
-    ("ply-one-byte-missing", ".ply", PLY[:-1], r"ends inside|take at least"),
-    ("ply-header-cut", ".ply", PLY[:60], r"no complete header"),
-    ("ply-trailing-bytes", ".ply", PLY + b"xyz", r"3 bytes after the stated data"),
-    ("ply-count-too-low", ".ply", replaced(PLY, b"face 80", b"face 79"), r"13 bytes after"),
-    ("ply-count-too-high", ".ply", replaced(PLY, b"face 80", b"face 81"), r"ends inside|take at least"),
-    ("ply-count-huge", ".ply", replaced(PLY, b"vertex 42", b"vertex 4294967295"), r"4294967295 x vertex take at"),
-    ("ply-count-beyond-reason", ".ply", replaced(PLY, b"vertex 42", b"vertex " + b"9" * 40), r"header line"),
-    ("ply-no-face", ".ply", ply_text(CORNERS, faces=0), r"no face"),
-    ("ply-only-points", ".ply", replaced(ply_text(CORNERS, faces=0), b"face", b"edge"), r"none face"),
-    ("ply-index-too-high", ".ply", ply_text(CORNERS + "3 0 1 3\n"), r"uses vertex 3"),
-    ("ply-index-negative", ".ply", ply_text(CORNERS + "3 0 1 -1\n"), r"uses vertex -1"),
-    ("ply-index-fraction", ".ply", ply_text(CORNERS + "3 0 1 1.5\n"), r"not a whole number"),
-    ("ply-two-corners", ".ply", ply_text(CORNERS + "2 0 1\n"), r"has 2 corners"),
-    ("ply-negative-corners", ".ply", ply_text(CORNERS + "-3 0 1 2\n"), r"of length -3"),
-    ("ply-nan", ".ply", ply_text("nan 0 0\n9 0 0\n0 9 0\n3 0 1 2\n"), r"vertex 0 is not finite"),
-    ("ply-word", ".ply", ply_text("zero 0 0\n9 0 0\n0 9 0\n3 0 1 2\n"), r"holds no number"),
-    ("ply-ascii-cut", ".ply", ASCII_PLY[: len(ASCII_PLY) // 2], r"no line end|take at least|ends inside"),
-    ("ply-ascii-last-line-missing", ".ply", ASCII_PLY.rstrip()[:-9] + b"\n", r"ends inside|take at least"),
+    ("any-empty-file", ".stl", b"", "file_size"),
+    ("any-unknown-ending", ".step", STL, "unknown_format"),
+    ("stl-header-cut", ".stl", STL[:50], "file_cut"),
+    ("stl-cut-in-the-middle", ".stl", STL[: len(STL) // 2], "size_mismatch 80 4084 2042"),
+    ("stl-one-byte-missing", ".stl", STL[:-1], "size_mismatch 4083"),
+    ("stl-trailing-bytes", ".stl", STL + b"\0\0", "size_mismatch 4086"),
+    ("stl-count-too-low", ".stl", patched(STL, 80, struct.pack("<I", 79)), "size_mismatch 79"),
+    ("stl-count-4-billion", ".stl", patched(STL, 80, b"\xff" * 4), "size_mismatch 4294967295"),
+    ("stl-count-zero", ".stl", patched(STL, 80, b"\0" * 4)[:84], "size_mismatch"),
+    ("stl-nan-vertex", ".stl", patched(STL, 84 + 12, NAN), "not_finite"),
+    ("stl-infinite-vertex", ".stl", patched(STL, 84 + 62, INF), "not_finite"),
+    ("stl-all-zero", ".stl", patched(STL, 84, bytes(len(STL) - 84)), "implausible_size"),
+    ("stl-binary-garbage", ".stl", NOISE, "size_mismatch"),
+    ("stl-text-garbage", ".stl", b"lorem ipsum " * 40, "size_mismatch"),
+    ("stl-that-is-a-picture", ".stl", b"\x89PNG\r\n\x1a\n" + NOISE, "size_mismatch"),
+    ("stl-ascii-cut", ".stl", ASCII_STL[: len(ASCII_STL) // 2], "file_cut"),
+    ("stl-ascii-without-end", ".stl", replaced(ASCII_STL, b"endsolid", b""), "file_cut"),
+    ("stl-ascii-cut-but-closed", ".stl", ASCII_STL[:5000] + b"\nendsolid\n", "file_cut"),
+    ("stl-ascii-misspelt", ".stl", replaced(ASCII_STL, b"vertex", b"vertx"), "unknown_line vertx"),
+    ("stl-ascii-facet-without-end", ".stl", replaced(ASCII_STL, b"endfacet", b""), "unknown_line"),
+    ("stl-ascii-number-broken", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 1,5x"), "not_a_number"),
+    ("stl-ascii-4-corners", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 0 0 0\nvertex "), "unknown_line"),
+    ("stl-ascii-nan", ".stl", replaced(ASCII_STL, b"vertex -10.771933363574009", b"vertex nan"), "not_finite"),
+    ("stl-ascii-no-facet", ".stl", b"solid x facet\nendsolid x\n", "empty"),
+    ("stl-ascii-two-solids", ".stl", ASCII_STL * 2, "several_solids"),
+    ("stl-ascii-endless-word", ".stl", replaced(ASCII_STL, b"normal", b"n" * 5000), "unknown_line"),
+    ("ply-endless-word", ".ply", ply_text("0 " * 8 + "9" * 5000 + "\n3 0 1 2\n"), "word_too_long 5000"),
+    ("stl-ascii-not-utf8", ".stl", replaced(ASCII_STL, b"loop", b"\xff\xfe"), "not_text"),
+    ("obj-last-line-cut", ".obj", OBJ_CORNERS + b"f 1 2 3", "file_cut"),
+    ("obj-face-list-cut", ".obj", OBJ[: OBJ.index(b"\nf ") + 1], "empty"),
+    ("obj-faces-cut", ".obj", OBJ[: OBJ.index(b"\n", OBJ.index(b"\nf ") + 99) + 1], "unused_vertices"),
+    ("obj-fewer-than-counted", ".obj", OBJ_CORNERS + b"# Faces: 2\nf 1 2 3\n", "size_mismatch"),
+    ("obj-index-too-high", ".obj", OBJ_CORNERS + b"f 1 2 4\n", "index_out_of_range"),
+    ("obj-index-zero", ".obj", OBJ_CORNERS + b"f 0 1 2\n", "index_out_of_range"),
+    ("obj-index-too-negative", ".obj", OBJ_CORNERS + b"f -4 1 2\n", "index_out_of_range -4"),
+    ("obj-index-no-number", ".obj", OBJ_CORNERS + b"f 1 2 x\n", "not_a_number"),
+    ("obj-index-endless", ".obj", OBJ_CORNERS + b"f 1 2 " + b"9" * 5000 + b"\n", "not_a_number 999"),
+    ("obj-two-corners", ".obj", OBJ_CORNERS + b"f 1 2\n", "wrong_count"),
+    ("obj-nan-vertex", ".obj", b"v nan 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", "not_finite"),
+    ("obj-overflowing-number", ".obj", b"v 1e999 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", "not_finite"),
+    ("obj-two-coordinates", ".obj", b"v 1 2\n", "wrong_count"),
+    ("obj-decimal-comma", ".obj", b"v 1,5 2 3\n", "not_a_number"),
+    ("obj-only-vertices", ".obj", OBJ_CORNERS, "empty"),
+    ("obj-text-garbage", ".obj", b"lorem ipsum\n", "unknown_line lorem"),
+    ("obj-binary-garbage", ".obj", NOISE, "not_text"),
+    ("obj-free-form-surface", ".obj", OBJ_CORNERS + b"surf 0 1 0 1 1 2 3\n", "unknown_line surf"),
+    ("ply-cut-in-the-middle", ".ply", PLY[: len(PLY) // 2], "file_cut"),
+    ("ply-one-byte-missing", ".ply", PLY[:-1], "file_cut"),
+    ("ply-header-cut", ".ply", PLY[:60], "bad_header"),
+    ("ply-trailing-bytes", ".ply", PLY + b"xyz", "size_mismatch"),
+    ("ply-count-too-low", ".ply", replaced(PLY, b"face 80", b"face 79"), "size_mismatch 13"),
+    ("ply-count-too-high", ".ply", replaced(PLY, b"face 80", b"face 81"), "file_cut"),
+    ("ply-count-huge", ".ply", replaced(PLY, b"vertex 42", b"vertex 4294967295"), "file_cut 4294967295"),
+    ("ply-count-beyond-reason", ".ply", replaced(PLY, b"vertex 42", b"vertex " + b"9" * 40), "bad_header"),
+    ("ply-no-face", ".ply", ply_text(CORNERS, faces=0), "empty"),
+    ("ply-only-points", ".ply", replaced(ply_text(CORNERS, faces=0), b"face", b"edge"), "bad_header"),
+    ("ply-index-too-high", ".ply", ply_text(CORNERS + "3 0 1 3\n"), "index_out_of_range"),
+    ("ply-index-negative", ".ply", ply_text(CORNERS + "3 0 1 -1\n"), "index_out_of_range -1"),
+    ("ply-index-fraction", ".ply", ply_text(CORNERS + "3 0 1 1.5\n"), "not_whole"),
+    ("ply-two-corners", ".ply", ply_text(CORNERS + "2 0 1\n"), "wrong_count"),
+    ("ply-negative-corners", ".ply", ply_text(CORNERS + "-3 0 1 2\n"), "out_of_range -3"),
+    ("ply-nan", ".ply", ply_text("nan 0 0\n9 0 0\n0 9 0\n3 0 1 2\n"), "not_finite"),
+    ("ply-word", ".ply", ply_text("zero 0 0\n9 0 0\n0 9 0\n3 0 1 2\n"), "not_a_number"),
+    ("ply-ascii-cut", ".ply", ASCII_PLY[: len(ASCII_PLY) // 2], "file_cut"),
+    ("ply-ascii-last-line-missing", ".ply", ASCII_PLY.rstrip()[:-9] + b"\n", "file_cut"),
     ("ply-strips", ".ply", ply_text(CORNERS + "3 0 1 2\n3 0 1 2\n", extra="element tristrips 1\nproperty list int int"
-     " vertex_indices\n"), r"triangle strips"),
-    ("ply-no-z", ".ply", replaced(ply_text(CORNERS + "3 0 1 2\n"), b"float z", b"float w"), r"without x, y and z"),
-    ("ply-unknown-type", ".ply", replaced(PLY, b"float x", b"quad x"), r"property type 'quad'"),
-    ("ply-unknown-format", ".ply", replaced(PLY, b"binary_little_endian", b"zipped"), r"format \['zipped'\]"),
-    ("ply-garbage", ".ply", NOISE, r"no complete header"),
-    ("glb-cut-in-the-middle", ".glb", GLB[: len(GLB) // 2], r"header states \d+ bytes, but the file has"),
-    ("glb-header-cut", ".glb", GLB[:16], r"not a GLB file"),
-    ("glb-trailing-bytes", ".glb", GLB + b"\0" * 4, r"header states"),
-    ("glb-chunk-too-long", ".glb", patched(GLB, 12, b"\xff\xff\xff\x7f"), r"beyond the file's end"),
-    ("glb-version-1", ".glb", patched(GLB, 4, b"\1"), r"not a GLB file of version 2"),
-    ("glb-garbage", ".glb", NOISE, r"not a GLB file"),
-    ("glb-json-broken", ".glb", patched(GLB, 20, b"x"), r"JSON cannot be read"),
-    ("glb-json-nested-without-end", ".glb", glb({}, b"").replace(b"{}", b"[["), r"JSON cannot be read"),
-    ("glb-json-of-another-kind", ".glb", glb({"a": 1}, b""), r"'asset': Field required"),
-    ("glb-no-mesh", ".glb", broken_glb(nodes=[{}], meshes=[]), r"no mesh"),
-    ("glb-mesh-without-node", ".glb", broken_glb(nodes=[{}]), r"mesh 0 is placed by no node"),
-    ("glb-mesh-outside-of-scene", ".glb", broken_glb(scenes=[{"nodes": []}]), r"node 0 holds a mesh but is not"),
-    ("glb-node-cycle", ".glb", broken_glb(nodes=[{"mesh": 0, "children": [0]}]), r"node 0 is missing, or reached"),
-    ("glb-node-missing", ".glb", broken_glb(scenes=[{"nodes": [0, 5]}]), r"node 5 is missing"),
-    ("glb-two-scenes", ".glb", broken_glb(scene=None, scenes=[{}, {}]), r"2 scenes and none"),
-    ("glb-zero-scale", ".glb", broken_glb(nodes=[{"mesh": 0, "scale": [1, 1, 0]}]), r"determinant 0"),
-    ("glb-nan-matrix", ".glb", broken_glb(nodes=[{"mesh": 0, "matrix": [float("nan")] * 16}]), r"finite"),
-    ("glb-index-out-of-range", ".glb", glb(gltf_document(), GLTF_BINARY[:-2] + b"\3\0"), r"index 3 out of range"),
-    ("glb-nan-vertex", ".glb", glb(gltf_document(), NAN + GLTF_BINARY[4:]), r"vertex 0 is not finite"),
-    ("glb-accessor-too-long", ".glb", broken_glb(accessors=accessors(0, count=4)), r"accessor 0 takes 48 bytes"),
-    ("glb-accessor-huge", ".glb", broken_glb(accessors=accessors(1, count=2**39)), r"\d+ vertices in all places"),
-    ("glb-accessor-sparse", ".glb", broken_glb(accessors=accessors(0, sparse={})), r"accessor 0 is sparse"),
-    ("glb-accessor-missing", ".glb", broken_glb(meshes=primitive(indices=9)), r"accessor 9 of 2"),
-    ("glb-indices-of-floats", ".glb", broken_glb(accessors=accessors(1, componentType=5126)), r"indices of type 5126"),
-    ("glb-positions-of-2", ".glb", broken_glb(accessors=accessors(0, type="VEC2")), r"POSITION of type 5126 VEC2"),
-    ("glb-view-beyond-buffer", ".glb", broken_glb(buffers=[{"byteLength": 40}]), r"bufferView 1 ends at byte 42"),
-    ("glb-buffer-beyond-file", ".glb", broken_glb(buffers=[{"byteLength": 99}]), r"buffer 0 states 99 bytes"),
-    ("glb-lines", ".glb", broken_glb(meshes=primitive(mode=1)), r"primitive mode 1"),
-    ("glb-strip", ".glb", broken_glb(meshes=primitive(mode=5)), r"primitive mode 5"),
-    ("glb-without-position", ".glb", broken_glb(meshes=primitive(attributes={})), r"no POSITION"),
-    ("glb-morph-targets", ".glb", broken_glb(meshes=primitive(targets=[{"POSITION": 0}])), r"morph targets"),
-    ("glb-skinned", ".glb", broken_glb(nodes=[{"mesh": 0, "skin": 0}]), r"bent by a skin"),
-    ("glb-draco", ".glb", broken_glb(extensionsRequired=["KHR_draco_mesh_compression"]), r"needs the extension"),
-    ("glb-reads-other-files", ".glb", broken_glb(buffers=[{"byteLength": 42, "uri": "x.bin"}]), r"outside of the BIN"),
-    ("vtp-cut-in-the-middle", ".vtp", VTP[: len(VTP) // 2], r"XML cannot be read"),
-    ("vtp-raw-cut", ".vtp", RAW_VTP[: len(RAW_VTP) * 3 // 4], r"the file is cut"),
-    ("vtp-raw-bytes-missing", ".vtp", RAW_VTP[:-300] + RAW_VTP[-40:], r"array data end at byte|array of \d+ bytes"),
-    ("vtp-garbage", ".vtp", NOISE, r"XML cannot be read"),
-    ("vtp-other-xml", ".vtp", b"<svg/>", r"svg of type None"),
-    ("vtp-other-vtk", ".vtp", replaced(VTP, b'"PolyData"', b'"ImageData"'), r"VTKFile of type ImageData"),
-    ("vtp-no-polygon", ".vtp", vtp(PENTAGON, POLYGONS, n_polys="0"), r"no polygon"),
-    ("vtp-strips", ".vtp", vtp(PENTAGON, POLYGONS, n_strips="2"), r"triangle strips"),
-    ("vtp-points-too-many", ".vtp", vtp(PENTAGON, POLYGONS, n_points="7"), r"18 numbers instead of 21"),
-    ("vtp-points-huge", ".vtp", vtp(PENTAGON, POLYGONS, n_points="99999999999"), r"99999999999 points"),
-    ("vtp-polygons-too-many", ".vtp", vtp(PENTAGON, POLYGONS, "raw", n_polys="4"), r"array of 24 bytes instead of 32"),
-    ("vtp-points-negative", ".vtp", vtp(PENTAGON, POLYGONS, n_points="-6"), r"NumberOfPoints is '-6'"),
-    ("vtp-index-too-high", ".vtp", vtp(PENTAGON, [[0, 1, 6]]), r"vertex indices 0 to 6"),
-    ("vtp-index-negative", ".vtp", vtp(PENTAGON, [[0, 1, -1]]), r"vertex indices -1 to 1"),
-    ("vtp-two-corners", ".vtp", vtp(PENTAGON, [[0, 1, 2], [0, 1]]), r"offsets do not rise"),
-    ("vtp-nan", ".vtp", vtp(PENTAGON * np.nan, POLYGONS), r"vertex 0 is not finite"),
-    ("vtp-word", ".vtp", replaced(vtp(PENTAGON, POLYGONS), b"15.0 10.0", b"wide 1"), r"no number of type float64"),
-    ("vtp-two-components", ".vtp", replaced(VTP, b'Components="3"', b'Components="2"'), r"2 components"),
-    ("vtp-float-indices", ".vtp", replaced(VTP, b'"Int64" Name="conn', b'"Float64" Name="conn'), r"of type float64"),
-    ("vtp-no-connectivity", ".vtp", replaced(VTP, b"connectivity", b"something"), r"0 arrays Polys"),
-    ("vtp-unknown-order", ".vtp", replaced(VTP, b"LittleEndian", b"MiddleEndian"), r"byte_order 'MiddleEndian'"),
+     " vertex_indices\n"), "unsupported_feature"),
+    ("ply-no-z", ".ply", replaced(ply_text(CORNERS + "3 0 1 2\n"), b"float z", b"float w"), "bad_header"),
+    ("ply-unknown-type", ".ply", replaced(PLY, b"float x", b"quad x"), "unknown_type quad"),
+    ("ply-unknown-format", ".ply", replaced(PLY, b"binary_little_endian", b"zipped"), "unsupported_feature zipped"),
+    ("ply-garbage", ".ply", NOISE, "bad_header"),
+    ("glb-cut-in-the-middle", ".glb", GLB[: len(GLB) // 2], "size_mismatch"),
+    ("glb-header-cut", ".glb", GLB[:16], "wrong_format"),
+    ("glb-trailing-bytes", ".glb", GLB + b"\0" * 4, "size_mismatch"),
+    ("glb-chunk-too-long", ".glb", patched(GLB, 12, b"\xff\xff\xff\x7f"), "file_cut"),
+    ("glb-version-1", ".glb", patched(GLB, 4, b"\1"), "wrong_format"),
+    ("glb-garbage", ".glb", NOISE, "wrong_format"),
+    ("glb-json-broken", ".glb", patched(GLB, 20, b"x"), "not_json"),
+    ("glb-json-nested-without-end", ".glb", glb({}, b"").replace(b"{}", b"[["), "not_json"),
+    ("glb-json-of-another-kind", ".glb", glb({"a": 1}, b""), "bad_value asset Field"),
+    ("glb-no-mesh", ".glb", broken_glb(nodes=[{}], meshes=[]), "mesh_not_placed"),
+    ("glb-mesh-without-node", ".glb", broken_glb(nodes=[{}]), "mesh_not_placed"),
+    ("glb-mesh-outside-of-scene", ".glb", broken_glb(scenes=[{"nodes": []}]), "mesh_not_placed"),
+    ("glb-node-cycle", ".glb", broken_glb(nodes=[{"mesh": 0, "children": [0]}]), "not_a_tree"),
+    ("glb-node-missing", ".glb", broken_glb(scenes=[{"nodes": [0, 5]}]), "not_a_tree"),
+    ("glb-two-scenes", ".glb", broken_glb(scene=None, scenes=[{}, {}]), "several_scenes"),
+    ("glb-zero-scale", ".glb", broken_glb(nodes=[{"mesh": 0, "scale": [1, 1, 0]}]), "not_invertible"),
+    ("glb-nan-matrix", ".glb", broken_glb(nodes=[{"mesh": 0, "matrix": [float("nan")] * 16}]), "not_json"),
+    ("glb-index-out-of-range", ".glb", glb(gltf_document(), GLTF_BINARY[:-2] + b"\3\0"), "index_out_of_range"),
+    ("glb-nan-vertex", ".glb", glb(gltf_document(), NAN + GLTF_BINARY[4:]), "not_finite"),
+    ("glb-accessor-too-long", ".glb", broken_glb(accessors=accessors(0, count=4)), "size_mismatch 48"),
+    ("glb-accessor-huge", ".glb", broken_glb(accessors=accessors(1, count=2**39)), "too_many"),
+    ("glb-accessor-sparse", ".glb", broken_glb(accessors=accessors(0, sparse={})), "unsupported_feature"),
+    ("glb-accessor-missing", ".glb", broken_glb(meshes=primitive(indices=9)), "index_out_of_range"),
+    ("glb-indices-of-floats", ".glb", broken_glb(accessors=accessors(1, componentType=5126)), "wrong_type 5126"),
+    ("glb-positions-of-2", ".glb", broken_glb(accessors=accessors(0, type="VEC2")), "wrong_type 5126 VEC2"),
+    ("glb-view-beyond-buffer", ".glb", broken_glb(buffers=[{"byteLength": 40}]), "size_mismatch 42"),
+    ("glb-buffer-beyond-file", ".glb", broken_glb(buffers=[{"byteLength": 99}]), "size_mismatch 99"),
+    ("glb-lines", ".glb", broken_glb(meshes=primitive(mode=1)), "unsupported_feature"),
+    ("glb-strip", ".glb", broken_glb(meshes=primitive(mode=5)), "unsupported_feature"),
+    ("glb-without-position", ".glb", broken_glb(meshes=primitive(attributes={})), "unsupported_feature"),
+    ("glb-morph-targets", ".glb", broken_glb(meshes=primitive(targets=[{"POSITION": 0}])), "unsupported_feature"),
+    ("glb-skinned", ".glb", broken_glb(nodes=[{"mesh": 0, "skin": 0}]), "unsupported_feature"),
+    ("glb-draco", ".glb", broken_glb(extensionsRequired=["KHR_draco_mesh_compression"]), "unsupported_feature"),
+    ("glb-reads-other-files", ".glb", broken_glb(buffers=[{"byteLength": 42, "uri": "x.bin"}]), "data_elsewhere"),
+    ("vtp-cut-in-the-middle", ".vtp", VTP[: len(VTP) // 2], "xml_damaged"),
+    ("vtp-raw-cut", ".vtp", RAW_VTP[: len(RAW_VTP) * 3 // 4], "file_cut"),
+    ("vtp-raw-bytes-missing", ".vtp", RAW_VTP[:-300] + RAW_VTP[-40:], "file_cut"),
+    ("vtp-garbage", ".vtp", NOISE, "xml_damaged"),
+    ("vtp-other-xml", ".vtp", b"<svg/>", "wrong_format"),
+    ("vtp-other-vtk", ".vtp", replaced(VTP, b'"PolyData"', b'"ImageData"'), "wrong_format ImageData"),
+    ("vtp-no-polygon", ".vtp", vtp(PENTAGON, POLYGONS, n_polys="0"), "empty"),
+    ("vtp-strips", ".vtp", vtp(PENTAGON, POLYGONS, n_strips="2"), "unsupported_feature"),
+    ("vtp-points-too-many", ".vtp", vtp(PENTAGON, POLYGONS, n_points="7"), "size_mismatch 18 21"),
+    ("vtp-points-huge", ".vtp", vtp(PENTAGON, POLYGONS, n_points="99999999999"), "too_many 99999999999"),
+    ("vtp-polygons-too-many", ".vtp", vtp(PENTAGON, POLYGONS, "raw", n_polys="4"), "size_mismatch 24 32"),
+    ("vtp-points-negative", ".vtp", vtp(PENTAGON, POLYGONS, n_points="-6"), "not_whole -6"),
+    ("vtp-index-too-high", ".vtp", vtp(PENTAGON, [[0, 1, 6]]), "index_out_of_range"),
+    ("vtp-index-negative", ".vtp", vtp(PENTAGON, [[0, 1, -1]]), "index_out_of_range -1"),
+    ("vtp-two-corners", ".vtp", vtp(PENTAGON, [[0, 1, 2], [0, 1]]), "bad_offsets"),
+    ("vtp-nan", ".vtp", vtp(PENTAGON * np.nan, POLYGONS), "not_finite"),
+    ("vtp-word", ".vtp", replaced(vtp(PENTAGON, POLYGONS), b"15.0 10.0", b"wide 1"), "not_a_number float64"),
+    ("vtp-two-components", ".vtp", replaced(VTP, b'Components="3"', b'Components="2"'), "wrong_shape"),
+    ("vtp-float-indices", ".vtp", replaced(VTP, b'"Int64" Name="conn', b'"Float64" Name="conn'), "wrong_type float64"),
+    ("vtp-no-connectivity", ".vtp", replaced(VTP, b"connectivity", b"something"), "wrong_count Polys"),
+    ("vtp-unknown-order", ".vtp", replaced(VTP, b"LittleEndian", b"MiddleEndian"), "unsupported_feature MiddleEndian"),
     ("vtp-offset-beyond", ".vtp", replaced(RAW_VTP, b'offset="0"', b'offset="9"').replace(
         b'Float64" Name="Points" NumberOfComponents="3" format="appended" offset="', b'Float64" Name="Points" '
-        b'NumberOfComponents="3" format="appended" offset="99999'), r"offset '99999\d+'"),
-    ("vtp-lz4", ".vtp", replaced(WHOLE["vtp-raw-zlib"][1], b"vtkZLib", b"vtkLZ4"), r"compressor 'vtkLZ4Data"),
-    ("vtp-base64-damaged", ".vtp", replaced(WHOLE["vtp-base64"][1], b" _", b" _@@"), r"base64 data is damaged"),
-    ("vtp-zlib-damaged", ".vtp", WHOLE["vtp-raw-zlib"][1].replace(b"x\x9c", b"x\x9d"), r"block is damaged"),
+        b'NumberOfComponents="3" format="appended" offset="99999'), "index_out_of_range"),
+    ("vtp-lz4", ".vtp", replaced(WHOLE["vtp-raw-zlib"][1], b"vtkZLib", b"vtkLZ4"), "unsupported_feature vtkLZ4Data"),
+    ("vtp-base64-damaged", ".vtp", replaced(WHOLE["vtp-base64"][1], b" _", b" _@@"), "file_damaged"),
+    ("vtp-zlib-damaged", ".vtp", WHOLE["vtp-raw-zlib"][1].replace(b"x\x9c", b"x\x9d"), "file_damaged"),
     ("vtp-space", ".vtp", replaced(VTP, b"<PolyData>", b'<PolyData><FieldData><Array type="String" Name="SPACE" '
-        b'NumberOfTuples="1" format="ascii">82 65 73 0</Array></FieldData>'), r"field SPACE is b'RAI"),
-    ("vtk-no-header", ".vtk", VTK[1:], r"no header of a legacy VTK file"),
-    ("vtk-grid", ".vtk", replaced(VTK, b"POLYDATA", b"UNSTRUCTURED_GRID"), r"no POLYDATA"),
-    ("vtk-other-form", ".vtk", replaced(VTK, b"ASCII", b"UTF-8"), r"no header"),
-    ("vtk-fewer-points", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 7"), r"no number.*POLYGONS"),
-    ("vtk-more-points", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 4"), r"18 numbers instead of 12"),
-    ("vtk-huge", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 999999999999"), r"count '999999999999'"),
-    ("vtk-points-of-int", ".vtk", replaced(VTK, b"6 float", b"6 int"), r"points of type 'int'"),
-    ("vtk-word", ".vtk", replaced(VTK, b"15 10", b"wide 1"), r"no number"),
-    ("vtk-nan", ".vtk", vtk_model(PENTAGON * np.nan, POLYGONS, binary=False), r"vertex 0 is not finite"),
-    ("vtk-index-too-high", ".vtk", vtk_model(PENTAGON, [[0, 1, 6]]), r"vertex indices 0 to 6"),
-    ("vtk-index-negative", ".vtk", vtk_model(PENTAGON, [[0, 1, -1]]), r"vertex indices -1 to 1"),
-    ("vtk-two-corners", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [0, 1]]), r"face 1 has 2 corners"),
-    ("vtk-cells-too-many", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 4 15"), r"cell 3 is cut"),
-    ("vtk-cells-too-few", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 2 15"), r"cells of 10 numbers instead"),
-    ("vtk-strips", ".vtk", replaced(VTK, b"POLYGONS", b"TRIANGLE_STRIPS"), r"triangle strips"),
-    ("vtk-9-offsets", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [], [3, 4, 5]], version="5.1"), r"offsets that do not"),
-    ("vtk-unknown-line", ".vtk", vtk_model(PENTAGON, POLYGONS, extra="SURPRISE 1\n"), r"unknown line 'SURPRISE 1'"),
-    ("vtp-entities", ".vtp", replaced(VTP, b"<VTKFile", b'<!DOCTYPE x [<!ENTITY a "b">]><VTKFile'), r"document type"),
+        b'NumberOfTuples="1" format="ascii">82 65 73 0</Array></FieldData>'), "unknown_space RAI"),
+    ("vtk-no-header", ".vtk", VTK[1:], "wrong_format"),
+    ("vtk-grid", ".vtk", replaced(VTK, b"POLYDATA", b"UNSTRUCTURED_GRID"), "wrong_format"),
+    ("vtk-other-form", ".vtk", replaced(VTK, b"ASCII", b"UTF-8"), "wrong_format"),
+    ("vtk-fewer-points", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 7"), "not_a_number"),
+    ("vtk-more-points", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 4"), "size_mismatch 18 12"),
+    ("vtk-huge", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 999999999999"), "out_of_range 999999999999"),
+    ("vtk-points-of-int", ".vtk", replaced(VTK, b"6 float", b"6 int"), "unknown_type"),
+    ("vtk-word", ".vtk", replaced(VTK, b"15 10", b"wide 1"), "not_a_number"),
+    ("vtk-nan", ".vtk", vtk_model(PENTAGON * np.nan, POLYGONS, binary=False), "not_finite"),
+    ("vtk-index-too-high", ".vtk", vtk_model(PENTAGON, [[0, 1, 6]]), "index_out_of_range"),
+    ("vtk-index-negative", ".vtk", vtk_model(PENTAGON, [[0, 1, -1]]), "index_out_of_range -1"),
+    ("vtk-two-corners", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [0, 1]]), "wrong_count"),
+    ("vtk-cells-too-many", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 4 15"), "file_cut"),
+    ("vtk-cells-too-few", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 2 15"), "size_mismatch 10"),
+    ("vtk-strips", ".vtk", replaced(VTK, b"POLYGONS", b"TRIANGLE_STRIPS"), "unsupported_feature"),
+    ("vtk-9-offsets", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [], [3, 4, 5]], version="5.1"), "bad_offsets"),
+    ("vtk-unknown-line", ".vtk", vtk_model(PENTAGON, POLYGONS, extra="SURPRISE 1\n"), "unknown_line SURPRISE"),
+    ("vtp-entities", ".vtp", replaced(VTP, b"<VTKFile", b'<!DOCTYPE x [<!ENTITY a "b">]><VTKFile'), "xml_doctype"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("suffix", "data", "says"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
 def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, suffix: str, data: bytes, says: str) -> None:
     """One line that names the file, the place and what is allowed."""
-    with pytest.raises(InputError, match=says) as caught:
+    with refused(*says.split(), tmp_path / f"mesh{suffix}"):
         read(tmp_path, suffix, data)
-    assert str(caught.value).startswith(str(tmp_path / f"mesh{suffix}")) and "; allowed: " in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:
     """What is not a file is named as such, by its path."""
-    with pytest.raises(InputError, match=r"liver\.stl: no such file"):
+    with refused("no_such_file", "liver.stl"):
         read_mesh(tmp_path / "liver.stl", unit=Unit.MM, space=Space.LPS)
     (tmp_path / "folder.stl").mkdir()
-    with pytest.raises(InputError, match="not a file but a directory"):
+    with refused("not_a_file"):
         read_mesh(tmp_path / "folder.stl", unit=Unit.MM, space=Space.LPS)
-    with pytest.raises(InputError, match=r"cannot be read|no such file"):
+    with refused("no_such_file"):
         read_mesh(tmp_path / "a\0b.stl", unit=Unit.MM, space=Space.LPS)
 
 
@@ -640,7 +638,7 @@ def test_glb_buffers_in_other_places_are_refused(tmp_path: Path, uri: str) -> No
     """A surface that lies in a second file has no hash of its own: one line says to make it one file."""
     (tmp_path / "beside.bin").write_bytes(GLTF_BINARY)
     document = gltf_document(buffers=[{"byteLength": 42, "uri": uri}])
-    with pytest.raises(InputError, match=r"the buffer lies outside of the BIN chunk .* one whole GLB file"):
+    with refused("data_elsewhere"):
         read(tmp_path, ".glb", glb(document, GLTF_BINARY))
 
 
@@ -649,7 +647,7 @@ def test_a_mesh_placed_too_often_is_refused_before_it_is_built(tmp_path: Path) -
     nodes = [{"mesh": 0}] * 1000
     long = accessors(1, count=3 * 30_000)
     document = gltf_document(nodes=nodes, scenes=[{"nodes": list(range(1000))}], accessors=long)
-    with pytest.raises(InputError, match="30000000 triangles"):
+    with refused("too_many", "30000000"):
         read(tmp_path, ".glb", glb(document, GLTF_BINARY))
 
 

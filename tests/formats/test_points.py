@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from places import DATA
+from refusals import refused
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.guard import guard_points
@@ -153,99 +154,97 @@ def one_point(**changes: Any) -> str:
 
 HEADER = "name,x_mm,y_mm,z_mm\n"
 BROKEN: list[tuple[str, str, str | bytes, str]] = [
-    ("any-empty", ".csv", "", r"file of 0 bytes"),
-    ("any-unknown-ending", ".json", markups(), r"unknown point file 'markers\.json'; allowed: \.csv, \.mrk\.json"),
-    ("csv-only-white-space", ".csv", " \n\n", r"no line"),
-    ("csv-only-header", ".csv", HEADER, r"no point"),
-    ("csv-no-header", ".csv", "A,1,2,3\n", r"header: column 'A'"),
-    ("csv-no-unit", ".csv", CSV.replace("_mm", ""), r"no unit of length; allowed: x_mm"),
-    ("csv-unknown-unit", ".csv", CSV.replace("_mm", "_inch"), r"header: unknown unit of length 'inch'.*mm, cm, m"),
-    ("csv-mixed-units", ".csv", CSV.replace("x_mm", "x_m"), r"mixed units \['m', 'mm'\]"),
-    ("csv-unknown-column", ".csv", "name,x_mm,y_mm,z_mm,weight\nA,1,2,3,4\n", r"column 'weight'"),
-    ("csv-column-twice", ".csv", "name,x_mm,x_mm,z_mm\nA,1,2,3\n", r"columns \["),
-    ("csv-axis-in-two-units", ".csv", "name,x_mm,x_m,y_mm,z_mm\nA,1,1,2,3\n", r"columns \["),
-    ("csv-no-z", ".csv", "name,x_mm,y_mm\nA,1,2\n", r"columns \["),
-    ("csv-no-name", ".csv", "x_mm,y_mm,z_mm\n1,2,3\n", r"columns \["),
-    ("csv-semicolons", ".csv", CSV.replace(",", ";"), r"column 'name;x_mm"),
-    ("csv-too-few-fields", ".csv", CSV + "C,1,2\n", r"line 4: 3 fields instead of 4"),
-    ("csv-too-many-fields", ".csv", HEADER + "A,1,2,3,4\n", r"line 2: 5 fields instead of 4"),
-    ("csv-decimal-comma", ".csv", HEADER + "A,1,5,2,5,3,5\n", r"line 2: 7 fields"),
-    ("csv-quoted-decimal-comma", ".csv", HEADER + 'A,"1,5",2,3\n', r"line 2: '1,5' is not a number"),
-    ("csv-word", ".csv", HEADER + "A,1,2,3\nB,1,two,3\n", r"line 3: 'two' is not a number"),
-    ("csv-no-number", ".csv", HEADER + "A,1,,3\n", r"line 2: '' is not a number"),
-    ("csv-underscore", ".csv", HEADER + "A,1_0,2,3\n", r"line 2: '1_0' is not a number"),
-    ("csv-nan", ".csv", HEADER + "A,1,nan,3\n", r"line 2: 'nan' is not finite"),
-    ("csv-infinite", ".csv", HEADER + "A,1,2,-inf\n", r"line 2: '-inf' is not finite"),
-    ("csv-overflow", ".csv", HEADER + "A,1,2,1e999\n", r"line 2: '1e999' is not finite"),
-    ("csv-overflow-by-unit", ".csv", "name,x_m,y_m,z_m\nA,1e308,2,3\n", r"point 'A' is not finite"),
-    ("csv-far-away", ".csv", HEADER + "A,1,2,1e6\n", r"point 'A' lies at"),
-    ("csv-mm-said-to-be-m", ".csv", CSV.replace("_mm", "_m"), r"point 'A' lies at \[10000.0.*within 100000 mm"),
-    ("csv-empty-name", ".csv", HEADER + " ,1,2,3\n", r"line 2: empty name"),
-    ("csv-name-twice", ".csv", HEADER + "A,1,2,3\nA,4,5,6\n", r"the name 'A' is used 2 times"),
-    ("csv-open-quote", ".csv", HEADER + '"A,1,2,3\n', r"line 2: unexpected end"),
-    ("csv-not-utf8", ".csv", HEADER.encode() + b"\xe4,1,2,3\n", r"byte 20 is not text"),
-    ("csv-of-an-image", ".csv", b"\x89PNG\r\n\x1a\n\0\0", r"is not text"),
-    ("csv-with-nul", ".csv", HEADER + "A\0,1,2,3\n", r"name 'A\\x00'|NUL"),
-    ("markups-cut", ".mrk.json", markups()[:200], r"JSON cannot be read"),
-    ("markups-nested-without-end", ".mrk.json", "[" * 100_000, r"JSON cannot be read"),
-    ("markups-key-twice", ".mrk.json", markups().replace('"locked"', '"coordinateSystem"'), r"stands twice"),
-    ("markups-of-another-kind", ".mrk.json", "[1, 2]", r"not exactly one entry"),
-    ("markups-two-lists", ".mrk.json", '{"markups": [{}, {}]}', r"not exactly one entry"),
-    ("markups-curve", ".mrk.json", markups(type="Curve"), r"markup of type 'Curve'"),
-    ("markups-no-points", ".mrk.json", markups(points=[]), r"no control point"),
-    ("markups-no-space", ".mrk.json", markups(coordinateSystem=None), r"coordinate system 'None'.*LPS or RAS"),
-    ("markups-unknown-space", ".mrk.json", markups(coordinateSystem="IJK"), r"coordinate system 'IJK'"),
-    ("markups-space-2", ".mrk.json", markups(coordinateSystem=2), r"coordinate system '2'"),
-    ("markups-space-true", ".mrk.json", markups(coordinateSystem=True), r"coordinate system 'True'"),
-    ("markups-in-um", ".mrk.json", markups(coordinateUnits="um"), r"unit of length 'um'; allowed: mm, cm, m"),
-    ("markups-line-of-one", ".mrk.json", markups(type="Line", points=[{}]), r"a line of 1 control points"),
-    ("markups-line-of-three", ".mrk.json", markups(type="Line", points=[{}] * 3), r"a line of 3 control points"),
-    ("markups-unknown-unit", ".mrk.json", markups(coordinateUnits=["[in_i]", "UCUM"]), r"unit of length '\[in_i\]'"),
-    ("markups-unit-of-numbers", ".mrk.json", markups(coordinateUnits=3), r"coordinateUnits '3'"),
-    ("markups-no-label", ".mrk.json", one_point(label=None), r"control point 1: label 'None'"),
-    ("markups-empty-label", ".mrk.json", one_point(label=" "), r"control point 1: label ' '"),
-    ("markups-half-a-letter", ".mrk.json", one_point(label="\ud800"), r"name '\\ud800'"),
-    ("markups-label-twice", ".mrk.json", markups().replace('"B"', '"A"'), r"the name 'A' is used 2 times"),
-    ("markups-undefined", ".mrk.json", one_point(positionStatus="undefined"), r"positionStatus is 'undefined'"),
-    ("markups-preview", ".mrk.json", one_point(positionStatus="preview"), r"positionStatus is 'preview'"),
-    ("markups-no-position", ".mrk.json", one_point(position=None), r"control point 1: position 'None'"),
-    ("markups-two-numbers", ".mrk.json", one_point(position=[1, 2]), r"position '\[1, 2\]'"),
-    ("markups-text-numbers", ".mrk.json", one_point(position=["1", 2, 3]), r"allowed: three numbers"),
-    ("markups-nan", ".mrk.json", one_point(position=[float("nan"), 2, 3]), r"NaN is not a finite number"),
-    ("markups-point-no-object", ".mrk.json", markups(points=[3]), r"control point 1: label"),  # type: ignore[list-item]  # the fault
-    ("fcsv-no-space", ".fcsv", FCSV.replace("# CoordinateSystem = LPS\n", ""), r"coordinate system 'None'"),
-    ("fcsv-unknown-space", ".fcsv", FCSV.replace("LPS", "2"), r"coordinate system '2'"),
-    ("fcsv-no-columns", ".fcsv", FCSV.replace("# columns", "# c"), r"columns \[\]"),
-    ("fcsv-no-point", ".fcsv", "\n".join(FCSV.splitlines()[:3]), r"no point"),
-    ("fcsv-line-cut", ".fcsv", FCSV[:-20], r"line 5: \d+ fields instead of 14|unexpected end"),
-    ("fcsv-not-defined", ".fcsv", FCSV.replace(",,\n", ",,,1,0\n"), r"line 4: position status '1'"),
-    ("fcsv-one-more", ".fcsv", FCSV.replace(",,\n", ",,,2\n"), r"line 4: 15 fields instead of 14"),
-    ("fcsv-nan", ".fcsv", FCSV.replace("147", "nan"), r"line 4: 'nan' is not finite"),
+    ("any-empty", ".csv", "", "file_size"),
+    ("any-unknown-ending", ".json", markups(), "unknown_format markers.json mrk.json"),
+    ("csv-only-white-space", ".csv", " \n\n", "empty"),
+    ("csv-only-header", ".csv", HEADER, "empty"),
+    ("csv-no-header", ".csv", "A,1,2,3\n", "unknown_column"),
+    ("csv-no-unit", ".csv", CSV.replace("_mm", ""), "unit_not_stated"),
+    ("csv-unknown-unit", ".csv", CSV.replace("_mm", "_inch"), "unknown_unit inch"),
+    ("csv-mixed-units", ".csv", CSV.replace("x_mm", "x_m"), "mixed_units"),
+    ("csv-unknown-column", ".csv", "name,x_mm,y_mm,z_mm,weight\nA,1,2,3,4\n", "unknown_column weight"),
+    ("csv-column-twice", ".csv", "name,x_mm,x_mm,z_mm\nA,1,2,3\n", "wrong_columns"),
+    ("csv-axis-in-two-units", ".csv", "name,x_mm,x_m,y_mm,z_mm\nA,1,1,2,3\n", "wrong_columns"),
+    ("csv-no-z", ".csv", "name,x_mm,y_mm\nA,1,2\n", "wrong_columns"),
+    ("csv-no-name", ".csv", "x_mm,y_mm,z_mm\n1,2,3\n", "wrong_columns"),
+    ("csv-semicolons", ".csv", CSV.replace(",", ";"), "unknown_column"),
+    ("csv-too-few-fields", ".csv", CSV + "C,1,2\n", "ragged_row"),
+    ("csv-too-many-fields", ".csv", HEADER + "A,1,2,3,4\n", "ragged_row"),
+    ("csv-decimal-comma", ".csv", HEADER + "A,1,5,2,5,3,5\n", "ragged_row"),
+    ("csv-quoted-decimal-comma", ".csv", HEADER + 'A,"1,5",2,3\n', "not_a_number"),
+    ("csv-word", ".csv", HEADER + "A,1,2,3\nB,1,two,3\n", "not_a_number"),
+    ("csv-no-number", ".csv", HEADER + "A,1,,3\n", "not_a_number"),
+    ("csv-underscore", ".csv", HEADER + "A,1_0,2,3\n", "not_a_number 1_0"),
+    ("csv-nan", ".csv", HEADER + "A,1,nan,3\n", "not_finite nan"),
+    ("csv-infinite", ".csv", HEADER + "A,1,2,-inf\n", "not_finite -inf"),
+    ("csv-overflow", ".csv", HEADER + "A,1,2,1e999\n", "not_finite 1e999"),
+    ("csv-overflow-by-unit", ".csv", "name,x_m,y_m,z_m\nA,1e308,2,3\n", "not_finite"),
+    ("csv-far-away", ".csv", HEADER + "A,1,2,1e6\n", "too_far"),
+    ("csv-mm-said-to-be-m", ".csv", CSV.replace("_mm", "_m"), "too_far [10000.0 100000"),
+    ("csv-empty-name", ".csv", HEADER + " ,1,2,3\n", "bad_name"),
+    ("csv-name-twice", ".csv", HEADER + "A,1,2,3\nA,4,5,6\n", "duplicate_name"),
+    ("csv-open-quote", ".csv", HEADER + '"A,1,2,3\n', "not_csv"),
+    ("csv-not-utf8", ".csv", HEADER.encode() + b"\xe4,1,2,3\n", "not_text 20"),
+    ("csv-of-an-image", ".csv", b"\x89PNG\r\n\x1a\n\0\0", "not_text"),
+    ("csv-with-nul", ".csv", HEADER + "A\0,1,2,3\n", "bad_name A\\x00"),
+    ("markups-cut", ".mrk.json", markups()[:200], "not_json"),
+    ("markups-nested-without-end", ".mrk.json", "[" * 100_000, "not_json"),
+    ("markups-key-twice", ".mrk.json", markups().replace('"locked"', '"coordinateSystem"'), "not_json"),
+    ("markups-of-another-kind", ".mrk.json", "[1, 2]", "wrong_count"),
+    ("markups-two-lists", ".mrk.json", '{"markups": [{}, {}]}', "wrong_count"),
+    ("markups-curve", ".mrk.json", markups(type="Curve"), "unknown_type Curve"),
+    ("markups-no-points", ".mrk.json", markups(points=[]), "empty"),
+    ("markups-no-space", ".mrk.json", markups(coordinateSystem=None), "unknown_space"),
+    ("markups-unknown-space", ".mrk.json", markups(coordinateSystem="IJK"), "unknown_space IJK"),
+    ("markups-space-2", ".mrk.json", markups(coordinateSystem=2), "unknown_space"),
+    ("markups-space-true", ".mrk.json", markups(coordinateSystem=True), "unknown_space True"),
+    ("markups-in-um", ".mrk.json", markups(coordinateUnits="um"), "unknown_unit um"),
+    ("markups-line-of-one", ".mrk.json", markups(type="Line", points=[{}]), "wrong_count"),
+    ("markups-line-of-three", ".mrk.json", markups(type="Line", points=[{}] * 3), "wrong_count"),
+    ("markups-unknown-unit", ".mrk.json", markups(coordinateUnits=["[in_i]", "UCUM"]), "unknown_unit [in_i]"),
+    ("markups-unit-of-numbers", ".mrk.json", markups(coordinateUnits=3), "unknown_unit"),
+    ("markups-no-label", ".mrk.json", one_point(label=None), "bad_name"),
+    ("markups-empty-label", ".mrk.json", one_point(label=" "), "bad_name"),
+    ("markups-half-a-letter", ".mrk.json", one_point(label="\ud800"), "bad_name \\ud800"),
+    ("markups-label-twice", ".mrk.json", markups().replace('"B"', '"A"'), "duplicate_name"),
+    ("markups-undefined", ".mrk.json", one_point(positionStatus="undefined"), "point_undefined undefined"),
+    ("markups-preview", ".mrk.json", one_point(positionStatus="preview"), "point_undefined preview"),
+    ("markups-no-position", ".mrk.json", one_point(position=None), "not_a_number"),
+    ("markups-two-numbers", ".mrk.json", one_point(position=[1, 2]), "not_a_number [1 2]"),
+    ("markups-text-numbers", ".mrk.json", one_point(position=["1", 2, 3]), "not_a_number"),
+    ("markups-nan", ".mrk.json", one_point(position=[float("nan"), 2, 3]), "not_json"),
+    ("markups-point-no-object", ".mrk.json", markups(points=[3]), "bad_name"),  # type: ignore[list-item]  # the fault
+    ("fcsv-no-space", ".fcsv", FCSV.replace("# CoordinateSystem = LPS\n", ""), "unknown_space"),
+    ("fcsv-unknown-space", ".fcsv", FCSV.replace("LPS", "2"), "unknown_space"),
+    ("fcsv-no-columns", ".fcsv", FCSV.replace("# columns", "# c"), "wrong_columns"),
+    ("fcsv-no-point", ".fcsv", "\n".join(FCSV.splitlines()[:3]), "empty"),
+    ("fcsv-line-cut", ".fcsv", FCSV[:-20], "ragged_row 14"),
+    ("fcsv-not-defined", ".fcsv", FCSV.replace(",,\n", ",,,1,0\n"), "point_undefined"),
+    ("fcsv-one-more", ".fcsv", FCSV.replace(",,\n", ",,,2\n"), "ragged_row 15 14"),
+    ("fcsv-nan", ".fcsv", FCSV.replace("147", "nan"), "not_finite nan"),
 ]
 
 
 @pytest.mark.parametrize(("ending", "data", "says"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
 def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, ending: str, data: str | bytes, says: str) -> None:
     """One line that names the file, the line or point, and what is allowed."""
-    with pytest.raises(InputError, match=says) as caught:
+    with refused(*says.split(), tmp_path / f"markers{ending}") as caught:
         read(tmp_path, ending, data, default_space=Space.LPS)
-    assert str(caught.value).startswith(str(tmp_path / f"markers{ending}")) and "; allowed: " in str(caught.value)
-    assert "\n" not in str(caught.value)
     str(caught.value).encode("utf-8")  # can be printed
 
 
 def test_a_patient_space_contradicts_a_local_frame(tmp_path: Path) -> None:
     """A Slicer file in LPS cannot give points of a carton's own frame."""
-    with pytest.raises(InputError, match="points in LPS, but the case has a local frame"):
+    with refused("local_space"):
         read(tmp_path, ".mrk.json", markups(), default_space=Space.LOCAL)
 
 
 def test_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:
     """What is not a file is named as such, by its path."""
-    with pytest.raises(InputError, match=r"markers\.csv: no such file"):
+    with refused("no_such_file", "markers.csv"):
         read_points(tmp_path / "markers.csv")
     (tmp_path / "folder.csv").mkdir()
-    with pytest.raises(InputError, match="not a file but a directory"):
+    with refused("not_a_file"):
         read_points(tmp_path / "folder.csv")
 
 
@@ -273,13 +272,12 @@ def test_written_points_read_back_exactly(tmp_path: Path, names: list[str], data
 
 
 def test_points_that_cannot_be_written_leave_nothing_behind(tmp_path: Path) -> None:
-    """A missing folder, or a folder in the file's place, is an input error; no part of a file stays."""
+    """A folder in the file's place is an input error; no part of a file stays."""
     points = read(tmp_path, ".csv", CSV)
     (tmp_path / "folder.csv").mkdir()
     before = sorted(tmp_path.iterdir())
-    for path in (tmp_path / "missing" / "out.csv", tmp_path / "folder.csv"):
-        with pytest.raises(InputError, match="cannot be written"):
-            write_points(path, points)
+    with refused("unwritable", "folder.csv"):
+        write_points(tmp_path / "folder.csv", points)
     assert sorted(tmp_path.iterdir()) == before
 
 

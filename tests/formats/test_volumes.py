@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
 from hypothesis import HealthCheck, given, settings, strategies as st
+from refusals import refused
 
 from puncture_twin.planning.anatomy.scan import nearest
 from puncture_twin.planning.base.errors import InputError
@@ -250,7 +251,7 @@ def test_members_and_padding_of_gzip_data(tmp_path: Path) -> None:
     for end in (b"", bytes(1000)):
         assert np.array_equal(read_volume(write(tmp_path, "a.nii.gz", b"".join(cut) + end)).values, VALUES)
     for end in (b"x", bytes(1000) + b"x", cut[0]):
-        with pytest.raises(InputError, match="damaged|longer"):
+        with pytest.raises(InputError):
             read_volume(write(tmp_path, "a.nii.gz", b"".join(cut) + end))
 
 
@@ -294,66 +295,66 @@ WHOLE = nifti_bytes()
 PACKED = gzip.compress(WHOLE)
 Q = {"codes": (1, 0)}
 BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
-    "empty": ("a.nii", b"", "file of 0 bytes"),
-    "cut in the header": ("a.nii", WHOLE[:200], "ends inside the header"),
-    "cut in the data": ("a.nii", WHOLE[:-1], "cut short"),
-    "data missing": ("a.nii", WHOLE[:352], "cut short"),
-    "too long": ("a.nii", WHOLE + b"\0", "longer than its header"),
-    "gz cut": ("a.nii.gz", PACKED[:-12], "damaged or cut short|not a readable gzip"),
-    "gz cut in the data only": ("a.nii.gz", gzip.compress(WHOLE[:-1]), "cut short"),
-    "gz with a wrong checksum": ("a.nii.gz", PACKED[:-8] + b"\1\2\3\4" + PACKED[-4:], "incorrect data check"),
-    "gz bomb": ("a.nii.gz", gzip.compress(WHOLE + bytes(50_000_000)), "longer than its header"),
-    "gz that is plain": ("a.nii.gz", WHOLE, "not a readable gzip"),
-    "plain that is gz": ("a.nii", PACKED, "ends inside the header|no NIfTI-1 header"),
-    "garbage": ("a.nii", bytes(range(256)) * 4, "no NIfTI-1 header"),
-    "wrong magic": ("a.nii", nifti_bytes(magic=b"ni1\0"), "no NIfTI-1 header"),
-    "terabytes": ("a.nii", nifti_bytes(dim=(3, 32767, 32767, 32767, 1, 1, 1, 1), data=b""), "voxels"),
+    "empty": ("a.nii", b"", "file_size"),
+    "cut in the header": ("a.nii", WHOLE[:200], "file_cut"),
+    "cut in the data": ("a.nii", WHOLE[:-1], "size_mismatch"),
+    "data missing": ("a.nii", WHOLE[:352], "size_mismatch"),
+    "too long": ("a.nii", WHOLE + b"\0", "size_mismatch"),
+    "gz cut": ("a.nii.gz", PACKED[:-12], "file_damaged"),
+    "gz cut in the data only": ("a.nii.gz", gzip.compress(WHOLE[:-1]), "size_mismatch"),
+    "gz with a wrong checksum": ("a.nii.gz", PACKED[:-8] + b"\1\2\3\4" + PACKED[-4:], "file_damaged"),
+    "gz bomb": ("a.nii.gz", gzip.compress(WHOLE + bytes(50_000_000)), "size_mismatch"),
+    "gz that is plain": ("a.nii.gz", WHOLE, "file_damaged"),
+    "plain that is gz": ("a.nii", PACKED, "file_cut"),
+    "garbage": ("a.nii", bytes(range(256)) * 4, "wrong_format"),
+    "wrong magic": ("a.nii", nifti_bytes(magic=b"ni1\0"), "wrong_format"),
+    "terabytes": ("a.nii", nifti_bytes(dim=(3, 32767, 32767, 32767, 1, 1, 1, 1), data=b""), "too_many"),
     "gigabytes in a tiny gz": (
         "a.nii.gz",
         gzip.compress(nifti_bytes(dim=(3, 900, 900, 900, 1, 1, 1, 1))),
-        "cannot hold",
+        "size_mismatch",
     ),
-    "negative size": ("a.nii", nifti_bytes(dim=(3, -4, 5, 6, 1, 1, 1, 1)), "size"),
-    "zero size": ("a.nii", nifti_bytes(dim=(3, 0, 5, 6, 1, 1, 1, 1)), "size"),
-    "4D": ("a.nii", nifti_bytes(dim=(4, 4, 5, 3, 2, 1, 1, 1)), r"4 dimensions, sizes \(4, 5, 3, 2\)"),
-    "8D": ("a.nii", nifti_bytes(dim=(8, 4, 5, 6, 1, 1, 1, 1)), "8 dimensions"),
-    "colour": ("a.nii", nifti_bytes(datatype=(128, 24)), "datatype 128"),
-    "bits contradict the type": ("a.nii", nifti_bytes(datatype=(4, 32)), "datatype 4"),
-    "NaN affine": ("a.nii", nifti_bytes(sform=SFORM * NAN), "NaN"),
-    "infinite affine": ("a.nii", nifti_bytes(sform=np.full((3, 4), np.inf)), "NaN or infinity"),
-    "zero affine": ("a.nii", nifti_bytes(sform=SFORM * 0), "zero or singular"),
-    "parallel axes": ("a.nii", nifti_bytes(sform=[[2, 3, 0, 0], [0, 0, 0, 0], [0, 0, 4, 0]]), "singular"),
+    "negative size": ("a.nii", nifti_bytes(dim=(3, -4, 5, 6, 1, 1, 1, 1)), "wrong_dimension"),
+    "zero size": ("a.nii", nifti_bytes(dim=(3, 0, 5, 6, 1, 1, 1, 1)), "wrong_dimension"),
+    "4D": ("a.nii", nifti_bytes(dim=(4, 4, 5, 3, 2, 1, 1, 1)), "wrong_dimension"),
+    "8D": ("a.nii", nifti_bytes(dim=(8, 4, 5, 6, 1, 1, 1, 1)), "wrong_dimension"),
+    "colour": ("a.nii", nifti_bytes(datatype=(128, 24)), "unknown_type 128"),
+    "bits contradict the type": ("a.nii", nifti_bytes(datatype=(4, 32)), "unknown_type"),
+    "NaN affine": ("a.nii", nifti_bytes(sform=SFORM * NAN), "not_finite"),
+    "infinite affine": ("a.nii", nifti_bytes(sform=np.full((3, 4), np.inf)), "not_finite"),
+    "zero affine": ("a.nii", nifti_bytes(sform=SFORM * 0), "implausible_spacing"),
+    "parallel axes": ("a.nii", nifti_bytes(sform=[[2, 3, 0, 0], [0, 0, 0, 0], [0, 0, 4, 0]]), "sheared"),
     "sheared affine": ("a.nii", nifti_bytes(sform=[[2, 0.03, 0, 0], [0, 3, 0, 0], [0, 0, 4, 0]]), "sheared"),
-    "huge affine": ("a.nii", nifti_bytes(sform=SFORM * 1e37), "pixdim|spacing"),
-    "far origin": ("a.nii", nifti_bytes(sform=np.add(SFORM, [0, 0, 0, 1e8])), "origin"),
-    "affines disagree": ("a.nii", nifti_bytes(codes=(1, 1), qoffset=(10, 20, 31)), "apart"),
-    "no affine": ("a.nii", nifti_bytes(codes=(0, 0)), "does not say its space"),
-    "quaternion too long": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(1, 1, 0)), "quaternion"),
-    "NaN quaternion": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(NAN, 0, 0)), "quaternion"),
-    "negative pixdim": ("a.nii", nifti_bytes(pixdim=(1, -2, 3, 4, 0, 0, 0, 0), codes=(1, 0)), "pixdim"),
-    "pixdim against sform": ("a.nii", nifti_bytes(pixdim=(1, 2, 3, 5, 0, 0, 0, 0)), "pixdim says"),
+    "huge affine": ("a.nii", nifti_bytes(sform=SFORM * 1e37), "geometry_contradicted"),
+    "far origin": ("a.nii", nifti_bytes(sform=np.add(SFORM, [0, 0, 0, 1e8])), "too_far"),
+    "affines disagree": ("a.nii", nifti_bytes(codes=(1, 1), qoffset=(10, 20, 31)), "geometry_contradicted"),
+    "no affine": ("a.nii", nifti_bytes(codes=(0, 0)), "space_not_stated"),
+    "quaternion too long": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(1, 1, 0)), "not_unit"),
+    "NaN quaternion": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(NAN, 0, 0)), "not_unit"),
+    "negative pixdim": ("a.nii", nifti_bytes(pixdim=(1, -2, 3, 4, 0, 0, 0, 0), codes=(1, 0)), "not_positive"),
+    "pixdim against sform": ("a.nii", nifti_bytes(pixdim=(1, 2, 3, 5, 0, 0, 0, 0)), "geometry_contradicted"),
     "metres called mm": (
         "a.nii",
         nifti_bytes(sform=SFORM / 1000, pixdim=(1, 0.002, 0.003, 0.004, 0, 0, 0, 0)),
-        "spacing",
+        "implausible_spacing",
     ),
-    "unknown unit": ("a.nii", nifti_bytes(units=5), "unit code"),
-    "offset inside the header": ("a.nii", nifti_bytes(vox_offset=0), "vox_offset"),
-    "NaN offset": ("a.nii", nifti_bytes(vox_offset=NAN), "vox_offset"),
-    "offset past the end": ("a.nii", nifti_bytes(vox_offset=1e9), "cut short"),
-    "NaN slope": ("a.nii", nifti_bytes(slope=NAN), "scl_slope"),
-    "slope of zero": ("a.nii", nifti_bytes(slope=0.0)[:116] + struct.pack("<f", 7.0) + WHOLE[120:], "some programs"),
-    "slope next to zero": ("a.nii", nifti_bytes(slope=1e-17), "some programs"),
+    "unknown unit": ("a.nii", nifti_bytes(units=5), "unknown_unit"),
+    "offset inside the header": ("a.nii", nifti_bytes(vox_offset=0), "out_of_range"),
+    "NaN offset": ("a.nii", nifti_bytes(vox_offset=NAN), "out_of_range"),
+    "offset past the end": ("a.nii", nifti_bytes(vox_offset=1e9), "size_mismatch"),
+    "NaN slope": ("a.nii", nifti_bytes(slope=NAN), "not_finite"),
+    "slope of zero": (
+        "a.nii",
+        nifti_bytes(slope=0.0)[:116] + struct.pack("<f", 7.0) + WHOLE[120:],
+        "scaling_ambiguous",
+    ),
+    "slope next to zero": ("a.nii", nifti_bytes(slope=1e-17), "scaling_ambiguous"),
     "infinite voxel after scaling": (
         "a.nii",
         nifti_bytes(datatype=(16, 32), slope=1e30, data=np.full(120, 1e30, dtype="<f4").tobytes()),
-        "voxel is NaN or infinite",
+        "not_finite",
     ),
-    "NaN voxel": (
-        "a.nii",
-        nifti_bytes(datatype=(16, 32), data=np.full(120, NAN, dtype="<f4").tobytes()),
-        "voxel is NaN",
-    ),
+    "NaN voxel": ("a.nii", nifti_bytes(datatype=(16, 32), data=np.full(120, NAN, dtype="<f4").tobytes()), "not_finite"),
 }
 SIZED = ("sizes", "sizes: 30000 30000 30000")
 
@@ -384,9 +385,8 @@ def test_labels_that_lost_their_grid_are_refused(shift: float, turned: bool) -> 
     T[:3, 3] += shift
     image, start = VolumeGrid(SHAPE, T, {}), np.diag([2.0, 3.0, 4.0, 1.0])
     if shift:
-        with pytest.raises(InputError) as caught:
+        with refused("grid_lost"):
             refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
-        assert caught.value.code == "grid_lost"
     else:
         refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
     refuse_lost_grid(VolumeGrid((4, 5, 7), start, {}), image, where=Path("labels.nii"))
@@ -397,62 +397,70 @@ def test_labels_that_lost_their_grid_are_refused(shift: float, turned: bool) -> 
 FOUR_D = (("dimension", "dimension: 4"), ("sizes", "sizes: 2 4 5 3"))
 UNNAMED = nrrd_bytes(("space:", "space dimension: 3"))
 BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
-    "empty": ("a.nrrd", b"", "file of 0 bytes"),
-    "garbage": ("a.nrrd", b"\xff\xfe" * 600, "no NRRD header"),
-    "wrong magic": ("a.nrrd", nrrd_bytes().replace(b"NRRD0004", b"NRRD0009"), "no NRRD header"),
-    "not text": ("a.nrrd", nrrd_bytes(("kinds", "kinds: \u00e9")).replace(b"\xc3\xa9", b"\xff"), "not text"),
-    "header only": ("a.nrrd", "\n".join(NRRD_LINES).encode(), "ends inside the header"),
-    "cut data": ("a.nrrd", nrrd_bytes(data=bytes(239)), "cut short"),
-    "too much data": ("a.nrrd", nrrd_bytes(data=bytes(241)), "longer than its header"),
-    "terabytes": ("a.nrrd", nrrd_bytes(SIZED), "voxels"),
+    "empty": ("a.nrrd", b"", "file_size"),
+    "garbage": ("a.nrrd", b"\xff\xfe" * 600, "wrong_format"),
+    "wrong magic": ("a.nrrd", nrrd_bytes().replace(b"NRRD0004", b"NRRD0009"), "wrong_format"),
+    "not text": ("a.nrrd", nrrd_bytes(("kinds", "kinds: \u00e9")).replace(b"\xc3\xa9", b"\xff"), "not_text"),
+    "header only": ("a.nrrd", "\n".join(NRRD_LINES).encode(), "file_cut"),
+    "cut data": ("a.nrrd", nrrd_bytes(data=bytes(239)), "size_mismatch"),
+    "too much data": ("a.nrrd", nrrd_bytes(data=bytes(241)), "size_mismatch"),
+    "terabytes": ("a.nrrd", nrrd_bytes(SIZED), "too_many"),
     "gz cut": (
         "a.nrrd",
         nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(bytes(range(240)))[:-9]),
-        "cut short",
+        "file_damaged",
     ),
     "gz bomb": (
         "a.nrrd",
         nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(bytes(30_000_000))),
-        "longer than its header",
+        "size_mismatch",
     ),
-    "points at another folder": ("a.nhdr", nrrd_bytes(("data", "data file: ../a.raw"), data=b""), "data file"),
-    "points at the host": ("a.nhdr", nrrd_bytes(("data", "data file: /etc/passwd"), data=b""), "data file"),
-    "points nowhere": ("a.nhdr", nrrd_bytes(("data", "data file: b.raw"), data=b""), "is not there"),
-    "points at itself": ("a.nhdr", nrrd_bytes(("data", "datafile: a.nhdr"), data=b""), "header itself"),
-    "a list of files": ("a.nhdr", nrrd_bytes(("data", "data file: LIST"), data=b"/etc/passwd\n"), "data file"),
-    "a pattern of files": ("a.nhdr", nrrd_bytes(("data", "data file: a%d.raw 1 6 1"), data=b""), "data file"),
-    "an attached file that points": ("a.nrrd", nrrd_bytes(("data", "Data File: /etc/passwd")), "data file"),
-    "layers of segments": ("a.seg.nrrd", nrrd_bytes(*FOUR_D), "overlap"),
-    "two spaces": ("a.nrrd", nrrd_bytes(("x", "space dimension: 3")), "both space and space dimension"),
-    "a plane": ("a.nrrd", nrrd_bytes(("space:", "space dimension: 2")), "space dimension '2'"),
-    "no space": ("a.nrrd", nrrd_bytes(("space:", None)), "no field 'space'"),
-    "scanner space": ("a.nrrd", nrrd_bytes(("space:", "space: scanner-xyz")), "not patient space"),
-    "no origin": ("a.nrrd", nrrd_bytes(("space origin", None)), "no field 'spaceorigin'"),
+    "points at another folder": ("a.nhdr", nrrd_bytes(("data", "data file: ../a.raw"), data=b""), "outside_folder"),
+    "points at the host": ("a.nhdr", nrrd_bytes(("data", "data file: /etc/passwd"), data=b""), "outside_folder"),
+    "points nowhere": ("a.nhdr", nrrd_bytes(("data", "data file: b.raw"), data=b""), "no_such_file"),
+    "points at itself": ("a.nhdr", nrrd_bytes(("data", "datafile: a.nhdr"), data=b""), "data_elsewhere"),
+    "a list of files": ("a.nhdr", nrrd_bytes(("data", "data file: LIST"), data=b"/etc/passwd\n"), "outside_folder"),
+    "a pattern of files": ("a.nhdr", nrrd_bytes(("data", "data file: a%d.raw 1 6 1"), data=b""), "outside_folder"),
+    "an attached file that points": ("a.nrrd", nrrd_bytes(("data", "Data File: /etc/passwd")), "outside_folder"),
+    "layers of segments": ("a.seg.nrrd", nrrd_bytes(*FOUR_D), "wrong_dimension"),
+    "two spaces": ("a.nrrd", nrrd_bytes(("x", "space dimension: 3")), "stated_twice"),
+    "a plane": ("a.nrrd", nrrd_bytes(("space:", "space dimension: 2")), "wrong_dimension"),
+    "no space": ("a.nrrd", nrrd_bytes(("space:", None)), "missing_key"),
+    "scanner space": ("a.nrrd", nrrd_bytes(("space:", "space: scanner-xyz")), "unknown_space"),
+    "no origin": ("a.nrrd", nrrd_bytes(("space origin", None)), "missing_key"),
     "NaN direction": (
         "a.nrrd",
         nrrd_bytes(("space directions", "space directions: (nan,0,0) (0,3,0) (0,0,4)")),
-        "NaN",
+        "not_finite",
     ),
-    "no direction": ("a.nrrd", nrrd_bytes(("space directions", "space directions: none (0,3,0) (0,0,4)")), "none"),
-    "sheared": ("a.nrrd", nrrd_bytes(("space directions", "space directions: (2,0,0) (1,3,0) (0,0,4)")), "shear"),
-    "in metres": ("a.nrrd", nrrd_bytes(("space units", 'space units: "m" "m" "m"')), "spaceunits"),
-    "unknown field": ("a.nrrd", nrrd_bytes(("surprise", "surprise: 1")), "unknown header line"),
-    "field twice": ("a.nrrd", nrrd_bytes(("x", "Sizes: 4 5 6")), "stands twice"),
-    "no byte order": ("a.nrrd", nrrd_bytes(("endian", None)), "byte order"),
-    "skips": ("a.nrrd", nrrd_bytes(("byte skip", "byte skip: -1")), "byteskip"),
-    "bzip2": ("a.nrrd", nrrd_bytes(("encoding", "encoding: bzip2")), "encoding"),
-    "words as ascii": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"one " * 120), "numbers"),
-    "too few numbers": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"1 " * 119), "cut short"),
-    "several values per voxel": ("a.nrrd", nrrd_bytes(("kinds", "kinds: vector domain domain")), "kinds"),
-    "two kinds": ("a.nrrd", nrrd_bytes(("kinds", "kinds: domain domain")), "kinds"),
-    "placed twice": ("a.nrrd", nrrd_bytes(("x", "axis mins: 1 2 3")), "axismins"),
+    "no direction": (
+        "a.nrrd",
+        nrrd_bytes(("space directions", "space directions: none (0,3,0) (0,0,4)")),
+        "not_a_number",
+    ),
+    "sheared": ("a.nrrd", nrrd_bytes(("space directions", "space directions: (2,0,0) (1,3,0) (0,0,4)")), "sheared"),
+    "in metres": ("a.nrrd", nrrd_bytes(("space units", 'space units: "m" "m" "m"')), "unknown_unit"),
+    "unknown field": ("a.nrrd", nrrd_bytes(("surprise", "surprise: 1")), "unknown_line"),
+    "field twice": ("a.nrrd", nrrd_bytes(("x", "Sizes: 4 5 6")), "duplicate_key"),
+    "no byte order": ("a.nrrd", nrrd_bytes(("endian", None)), "missing_key"),
+    "skips": ("a.nrrd", nrrd_bytes(("byte skip", "byte skip: -1")), "unsupported_feature"),
+    "bzip2": ("a.nrrd", nrrd_bytes(("encoding", "encoding: bzip2")), "unsupported_feature"),
+    "words as ascii": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"one " * 120), "not_a_number"),
+    "too few numbers": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"1 " * 119), "size_mismatch"),
+    "several values per voxel": ("a.nrrd", nrrd_bytes(("kinds", "kinds: vector domain domain")), "unsupported_feature"),
+    "two kinds": ("a.nrrd", nrrd_bytes(("kinds", "kinds: domain domain")), "unsupported_feature"),
+    "placed twice": ("a.nrrd", nrrd_bytes(("x", "axis mins: 1 2 3")), "stated_twice"),
     "numbers out of range": (
         "a.nrrd",
         nrrd_bytes(("encoding", "encoding: ascii"), data=b"40000 " * 120),
-        "no number of their type",
+        "not_a_number",
     ),
-    "halves as whole numbers": ("a.nrrd", nrrd_bytes(("encoding", "encoding: ascii"), data=b"1-2 " * 120), "no number"),
-    "block type": ("a.nrrd", nrrd_bytes(("type", "type: block")), "type"),
+    "halves as whole numbers": (
+        "a.nrrd",
+        nrrd_bytes(("encoding", "encoding: ascii"), data=b"1-2 " * 120),
+        "not_a_number",
+    ),
+    "block type": ("a.nrrd", nrrd_bytes(("type", "type: block")), "unknown_type"),
 }
 
 
@@ -460,19 +468,18 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
 def test_damaged_and_hostile_files_are_refused_by_name(tmp_path: Path, case: tuple[str, bytes, str]) -> None:
     """Each is an ``InputError`` that names the file and what is wrong."""
     name, content, match = case
-    with pytest.raises(InputError, match=match) as caught:
+    with refused(*match.split(), name):
         read_volume(write(tmp_path, name, content))
-    assert name in str(caught.value)
 
 
 def test_paths_that_are_no_volume_files(tmp_path: Path) -> None:
     """A folder, nothing at all, and an unknown ending are refused."""
     (tmp_path / "folder.nii").mkdir()
-    with pytest.raises(InputError, match="is a folder"):
+    with refused("no_such_file"):
         read_volume(tmp_path / "folder.nii")
-    with pytest.raises(InputError, match="is not there"):
+    with refused("no_such_file"):
         read_volume(tmp_path / "none.nii.gz")
-    with pytest.raises(InputError, match="unknown file ending"):
+    with refused("unknown_format"):
         read_volume(write(tmp_path, "a.img", WHOLE))
 
 
@@ -480,7 +487,7 @@ def test_a_link_beside_a_nrrd_may_not_lead_away(tmp_path: Path) -> None:
     """A data file that is a link into another folder is refused."""
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.raw").symlink_to(write(tmp_path, "a.raw", VALUES.tobytes(order="F")))
-    with pytest.raises(InputError, match="link to another folder"):
+    with refused("outside_folder"):
         read_volume(write(tmp_path / "in", "a.nhdr", nrrd_bytes(("data", "data file: a.raw"), data=b"")))
 
 

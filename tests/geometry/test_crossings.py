@@ -286,7 +286,7 @@ def test_the_first_crossing_is_the_way_out_or_nothing_is_settled(solids, ways, s
     found, adds_up = settled_crossings(mesh, np.zeros(3), directions)
     assert mesh.closed and mesh.wound_alike
     assert adds_up.tolist() == [settled] * 2
-    assert found.way.tolist() == [-way if turned else way for way in ways] * 2
+    assert found.sense.tolist() == [-way if turned else way for way in ways] * 2
 
 
 @pytest.mark.parametrize("height", [0.0, 1e-15, 1e-14, 1e-13, 1e-12, 1e-11])

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.formats.mesh_guard import guard_mesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined, spread_on
 
 VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
@@ -78,3 +79,24 @@ def test_what_is_known_of_a_mesh_is_not_looked_for_again() -> None:
     assert CLOSED.closed and CLOSED.wound_alike and not OPEN.closed and not OPEN.wound_alike
     told = TriangleMesh(VERTICES, FACES).known(closed=False, wound_alike=False)
     assert not told.closed and not told.wound_alike
+
+
+def test_areas_and_volume_are_those_of_the_cross_products(rng: np.random.Generator) -> None:
+    """To the bit, so that points are spread as before; flat triangles in front do not hide the rest."""
+    vertices, faces = rng.normal(size=(50, 3)), rng.integers(0, 50, (300, 3))
+    faces[:20] = 7
+    mesh = TriangleMesh(vertices, faces)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    assert np.array_equal(mesh.areas, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2.0)
+    middle = mesh.bounds.mean(axis=0)
+    assert mesh.volume == pytest.approx(np.einsum("ij,ij->", a - middle, np.cross(b - middle, c - middle)) / 6.0)
+    assert np.array_equal(guard_mesh(vertices, faces, where="test").areas, mesh.areas)
+
+
+def test_points_are_spread_by_area() -> None:
+    """As many on each triangle as its part of the area, to one; normals are its own."""
+    mesh = TriangleMesh([[0, 0, 0], [3, 0, 0], [0, 2, 0], [3, 0, 1.0]], [[0, 1, 2], [0, 0, 1], [0, 3, 1]])
+    found = spread_on(mesh, 900)
+    up = np.abs(found.normals[:, 2]) == 1.0
+    assert up.sum() == pytest.approx(600, abs=1) and (~up).sum() == pytest.approx(300, abs=1)
+    assert np.all(found.points[up, 2] == 0.0) and np.all(np.abs(found.points[~up, 1]) < 1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy
 
-from puncture_twin.planning.formats.labels.label_surface import field_surface, mask_surface
+from puncture_twin.planning.formats.labels.label_surface import frame, framed_surface, mask_surface
 from puncture_twin.planning.geometry.voxelize import mark_inside, voxels_inside
 
 WHERE = Path("made")
@@ -43,4 +43,7 @@ def test_a_masks_surface_is_that_of_its_field(blobs):
     """To the byte, although only its box is looked at."""
     blobs[:5], blobs[:, :, -4:] = False, False
     boxed = mask_surface(blobs, T_CT_INDEX, where=WHERE)
-    assert boxed.digest == field_surface(blobs - 0.5, T_CT_INDEX, where=WHERE).digest
+    framed, field = frame(blobs.shape)
+    framed[:], field[:] = np.nan, blobs - 0.5  # the frame is written, whatever it held
+    assert boxed.digest == framed_surface(framed, T_CT_INDEX, where=WHERE).digest
+    assert np.array_equal(framed, np.pad(blobs - 0.5, 1, constant_values=-0.5))

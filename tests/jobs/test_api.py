@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import puncture_twin as pt
 from puncture_twin.meshes import folder
@@ -92,7 +93,7 @@ def test_rerank_refuses_a_cost_that_orders_nothing(context, cost):
     candidates = pt.search(context)
     if isinstance(cost, str):
         cost = np.full(len(candidates), np.nan if cost == "nan" else 1.0 + 2.0j)
-    with pytest.raises(pt.InputError, match=r"rerank: a cost of shape .*; allowed: shape"):
+    with refused("wrong_shape"):
         pt.rerank(candidates, cost)
 
 
@@ -104,22 +105,22 @@ def test_register_takes_two_lists_and_no_case():
     found = pt.register(ct, base, target_ct=(10, 10, 10), fle_mm=0.5)
     assert np.allclose(found.T_base_ct[:3, :3], R)
     assert np.allclose(found.T_base_ct[:3, 3], (5, 6, 7))
-    with pytest.raises(pt.InputError, match="missing on the"):
+    with refused("markers_missing"):
         pt.register(ct, {"a": (0, 0, 0), "b": (100, 0, 0), "x": (0, 80, 0)}, target_ct=(0, 0, 0))
 
 
 def test_register_refuses_a_method_that_is_none():
     """It is not taken for another one."""
     good = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
-    with pytest.raises(pt.InputError, match="method 'magic'; allowed: triad, rigid"):
+    with refused("unknown_method", "magic"):
         pt.register(good, good, target_ct=(0, 0, 0), method="magic")
 
 
 def test_register_refuses_points_that_are_none():
     """Two coordinates, or something that is no number, is one line, not a traceback."""
     good = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
-    for bad in ((0, 0), (0, 0, "x"), (0, 0, float("nan"))):
-        with pytest.raises(pt.InputError):
+    for bad, code in (((0, 0), "not_a_number"), ((0, 0, "x"), "not_a_number"), ((0, 0, float("nan")), "not_finite")):
+        with refused(code):
             pt.register({**good, "c": bad}, good, target_ct=(0, 0, 0))
 
 
@@ -132,9 +133,9 @@ def test_files_are_read_and_written_under_the_one_name(tmp_path):
     assert read.points.tolist() == [list(point) for point in points.values()]
     liver = folder() / "abdomen" / "liver.ply"
     assert np.array_equal(pt.read_mesh(liver, unit="cm").vertices, 10.0 * pt.read_mesh(liver).vertices)
-    with pytest.raises(pt.InputError, match="unit 'inch'"):
+    with refused("unknown_choice", "inch"):
         pt.read_mesh(liver, unit="inch")
-    with pytest.raises(pt.InputError, match="register_mesh|is not there|no such file"):
+    with refused("no_such_file"):
         pt.read_mesh(tmp_path / "none.stl")
     assert pt.check_folder(tmp_path) == ("manifest.json is missing",)
 
@@ -142,13 +143,15 @@ def test_files_are_read_and_written_under_the_one_name(tmp_path):
 @pytest.mark.parametrize("angles", [(400.0, 10.0), (-1.0, 0.0), (10.0, 361.0), (float("nan"), 10.0)])
 def test_check_refuses_an_angle_outside_of_its_range(context, angles):
     """400 degrees would be explained as 40: the command line refuses it, and so does the library."""
-    with pytest.raises(pt.InputError, match="allowed: theta_deg 0 to 180, beta_deg 0 to 360"):
+    with refused("out_of_range"):
         pt.check(context, *angles)
 
 
-@pytest.mark.parametrize("target", [(0, 0), (0, 0, float("nan")), "abc"])
-def test_register_refuses_a_target_that_is_no_point(target):
+@pytest.mark.parametrize(
+    ("target", "code"), [((0, 0), "wrong_shape"), ((0, 0, float("nan")), "not_finite"), ("abc", "not_a_number")]
+)
+def test_register_refuses_a_target_that_is_no_point(target, code):
     """One line that names the target, not NumPy's complaint."""
     markers = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
-    with pytest.raises(pt.InputError, match="target"):
+    with refused(code, "target"):
         pt.register(markers, markers, target_ct=target, fle_mm=0.5)

@@ -14,6 +14,7 @@ SAYS = {
     "03": "safe for the organs",
     "04": "the tip ended",
     "05": "verified",
+    "06": "# checked against its case",
 }
 
 

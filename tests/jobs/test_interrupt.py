@@ -220,7 +220,7 @@ def test_an_interruption_while_a_refusal_is_printed_ends_the_command():
             signal.raise_signal(signal.SIGINT)
 
     def command():
-        raise InputError("no such file", where="joints.csv", allowed="a readable file")
+        raise InputError("no such file", where="joints.csv", allowed="a readable file", code="no_such_file")
 
     assert exit_code_of(command, print_line) == INTERRUPTED
     assert len(said) == 2 and said[0].startswith("joints.csv: ") and said[1] == "interrupted"

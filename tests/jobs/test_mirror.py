@@ -9,13 +9,13 @@ import sys
 
 import numpy as np
 import pytest
+from refusals import refused, refused_command
 from rtde_server import PERIOD_S, START_S, rtde_server
 
 from puncture_twin import run_twin
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.collision.checker import CellChecker
@@ -91,7 +91,7 @@ def test_a_live_arm_is_read_until_its_time_is_over(drive):
 @pytest.mark.parametrize("rows", [[[0.0] * 5], [[0.0] * 5 + [np.nan]]])
 def test_joint_angles_that_are_none_are_refused(rows):
     """Five of them, or one that is no number."""
-    with pytest.raises(InputError, match="six finite angles"):
+    with refused("joints"):
         next(mirror.live_states(FakeArm(rows), period_s=0.0, seconds=None))
 
 
@@ -115,13 +115,13 @@ class SilentArm(FakeArm):
         return self.connected
 
 
-@pytest.mark.parametrize(("connected", "match"), [(False, "hung up, 7.500 s"), (True, "tells nothing new, 7.500 s")])
+@pytest.mark.parametrize(("connected", "match"), [(False, "7.500"), (True, "7.500")])
 def test_an_old_state_is_not_shown_again(monkeypatch, connected, match):
     """The last word of a robot that is gone must not look like an arm that stands still."""
     monkeypatch.setattr(mirror, "SILENCE_S", 0.05)
     states = mirror.live_states(SilentArm(connected), period_s=0.001, seconds=None)
     assert next(states).time_s == 7.5
-    with pytest.raises(InputError, match=match):
+    with refused("robot_silent", match):
         next(states)
 
 
@@ -166,14 +166,14 @@ def test_a_controller_is_mirrored_as_its_recording_is(rows, tmp_path, capfd):
 
 
 @needs_the_extra
-@pytest.mark.parametrize(("order", "match"), [("hang up", "hung up"), ("hang", "tells nothing new")])
+@pytest.mark.parametrize(("order", "match"), [("hang up", "robot_silent"), ("hang", "robot_silent")])
 def test_a_controller_that_stops_ends_the_mirror(rows, order, match):
     """Whether it closes the line or leaves it open."""
     with rtde_server(HOST, rows) as controller:
         states = mirror.live_states(mirror.connect(HOST), period_s=0.02, seconds=None)
         assert len(list(itertools.islice(states, 3))) == 3
         controller.order(order)
-        with pytest.raises(InputError, match=match):
+        with refused(match):
             list(states)
 
 
@@ -208,17 +208,17 @@ def test_a_recording_is_mirrored(drive, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("time_s,q1_rad\n0,0\n", "lacks q2_rad"),
-        ("time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n0,0,0,x,0,0,0\n", "row 1"),
+        ("time_s,q1_rad\n0,0\n", "missing_column q2_rad"),
+        ("time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n0,0,0,x,0,0,0\n", "not_a_number"),
     ],
 )
 def test_recordings_that_cannot_be_read_are_refused(tmp_path, text, match):
     """By column, by row, by file."""
     path = tmp_path / "joints.csv"
     path.write_text(text)
-    with pytest.raises(InputError, match=match):
+    with refused(*match.split()):
         list(mirror.RecordedJoints.read(path).states())
-    with pytest.raises(InputError, match="no such file"):
+    with refused("no_such_file"):
         list(mirror.RecordedJoints.read(tmp_path / "none.csv").states())
 
 
@@ -244,15 +244,12 @@ def test_an_rtde_recording_is_mirrored_if_it_is_of_the_case_s_arm(drive, tmp_pat
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):
     """Exit code 2."""
     monkeypatch.setitem(sys.modules, "rtde_receive", None)
-    assert run_twin.main(["mirror", "192.0.2.1", "--case", str(ABDOMEN)]) == 2
-    said = capsys.readouterr().err.strip()
-    assert "the extra 'mirror'" in said and len(said.splitlines()) == 1
+    refused_command(["mirror", "192.0.2.1", "--case", ABDOMEN], capsys, "missing_extra", "mirror")
 
 
 def test_one_arm_at_a_time(capsys):
     """A host or a recording."""
-    assert run_twin.main(["mirror", "--case", str(ABDOMEN)]) == 2
-    assert "either HOST or --from" in capsys.readouterr().err
+    refused_command(["mirror", "--case", ABDOMEN], capsys, "conflicting_options")
 
 
 def test_only_the_receiving_half_is_ever_named():

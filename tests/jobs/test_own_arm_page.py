@@ -12,6 +12,7 @@ import trimesh
 from case_world import NEEDLE, SKIN, case_text, structure, write_case
 from own_arms import JOINTS, LENGTHS, write_own_arm
 from places import ROOT
+from refusals import refused_command
 
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.run_twin import main
@@ -87,8 +88,8 @@ def test_a_plan_is_refused_once_a_mesh_has_changed(folder, said, capsys):
     try:
         mesh.write_bytes(b"y" + before[1:])
         plan, case = str(folder / "out/plan/plan.json"), str(folder / "my-case")
-        assert main(["export", plan, "--case", case, "--format", "csv", "--out", str(folder / "out/no")]) == 2
-        assert "input 'urdf mesh (arm/ulna.stl)' is not the one" in capsys.readouterr().err
+        command = ["export", plan, "--case", case, "--format", "csv", "--out", folder / "out/no"]
+        refused_command(command, capsys, "input_changed", "arm/ulna.stl")
         assert load_case(case).robot.model.name == "toy"
     finally:
         mesh.write_bytes(before)

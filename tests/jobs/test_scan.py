@@ -6,13 +6,14 @@ import json
 
 import numpy as np
 import pytest
+from refusals import refused_command
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.formats.points import read_points
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.experiment.scan_job import Control, _needle_lines, control_summary
+from puncture_twin.twin.jobs.experiment.scan_job import Control, _needle_rows, control_summary
 from puncture_twin.twin.plant.scanner.case_scene import TrueRod
 
 CARTON = folder() / "carton" / "case_m.toml"
@@ -110,18 +111,17 @@ def test_a_needle_is_read_in_a_control_ct(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--marker", "cross"), "marker 'cross' is not known"),
-        (("--fov", "30"), "marker A is not seen in the image"),
-        (("--fov", "30", "--marker", "none", "--length", "6", "--spacing", "10"), "voxels"),
-        (("--spacing", "0.3", "--pixel", "0.2"), "200,000,000 at most"),
-        (("--rehearsal", "nowhere.json"), "nowhere.json"),
+        (("--marker", "cross"), "unknown_choice cross"),
+        (("--fov", "30"), "marker_not_seen"),
+        (("--fov", "30", "--marker", "none", "--length", "6", "--spacing", "10"), "out_of_range"),
+        (("--spacing", "0.3", "--pixel", "0.2"), "out_of_range 200,000,000"),
+        (("--rehearsal", "nowhere.json"), "no_such_file nowhere.json"),
     ],
 )
 def test_what_cannot_be_scanned_is_refused_and_leaves_nothing(arguments, said, tmp_path, capsys):
     """One line, exit code 2."""
     out = tmp_path / "out"
-    assert main(["scan", str(CARTON), "--out", str(out), *COARSE, *arguments]) == 2
-    assert said in capsys.readouterr().err
+    refused_command(["scan", CARTON, "--out", out, *COARSE, *arguments], capsys, *said.split())
     assert not out.exists()
 
 
@@ -139,4 +139,4 @@ def test_a_needle_that_cannot_be_read_is_no_reason_for_no_scan():
     summary = control_summary(Control(true, None, np.zeros(3), why))
     assert summary["found"] is None and summary["why_not"] == why
     assert summary["true"]["depth_mm"] == pytest.approx(-2.0)
-    assert _needle_lines(summary) == [f"  needle         not read: {why}"]
+    assert _needle_rows(summary) == [("needle", f"not read: {why}")]

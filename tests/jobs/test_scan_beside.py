@@ -9,6 +9,7 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from refusals import refused_command
 
 from benchmarks.beside.judge import passed
 from benchmarks.beside.scene import Asked, judged
@@ -93,13 +94,10 @@ def _joined(point):
 
 @pytest.mark.parametrize(
     ("flags", "said"),
-    [
-        (("--bed", "flat"), "--bed: the case has what stands in the scanner: table"),
-        (("--lines", "13"), "--lines"),
-    ],
+    [(("--bed", "flat"), "two_beds table"), (("--lines", "13"), "command_line --lines")],
 )
 def test_what_cannot_lie_beside_is_refused_and_leaves_nothing(flags, said, tmp_path, capsys):
     """One line, exit code 2; a case with a table has one already."""
-    assert main(["scan", str(folder() / "abdomen"), "--out", str(tmp_path / "out"), *flags]) == 2
-    assert said in capsys.readouterr().err
+    command = ["scan", folder() / "abdomen", "--out", tmp_path / "out", *flags]
+    refused_command(command, capsys, *said.split())
     assert not (tmp_path / "out").exists()

@@ -12,6 +12,7 @@ import sys
 import numpy as np
 import pytest
 from places import DATA
+from refusals import refused_command
 
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
@@ -28,24 +29,24 @@ READ = ["labels_off_1e-5", "labels_off_1e-2", "labels_4d", "label_ignore", "mesh
 """Equal to what is right but for their writing."""
 
 REFUSED = {
-    "real_shift_y15": (REAL, "own grid, whose matrix it has: moved by (0.0, 15.0, 0.0) mm"),
-    "real_scaled": (REAL, "scaled by 1.11"),
-    "reversed_y": (T2, "mirrored in y"),
-    "reversed_z": (T2, "mirrored in z"),
-    "mesh_mirrored_y": (T2, "mirrored in y"),
-    "mesh_mirrored_z": (T2, "mirrored in z"),
-    "mesh_lps_as_ras": (T1, "x and y negated"),
-    "labels_grid_lost": (T1, "where its voxels lie was lost"),
-    "mesh_glb_y_up": (T1, "--up y"),
-    "mask_link_dangles": (T2, "portal_vein.nii.gz"),
-    "ct_offset_1024": (T1, "-1024"),
-    "labels_blended": (T1, "interpolation"),
-    "label_without_name": (T1, "labels.csv lacks 9"),
-    "labels_of_regions": (T1, "'liver' is a list of labels"),
-    "dicom_big_endian": (T1, "Big Endian"),
-    "dicom_no_rescale": (T1, "RescaleSlope"),
+    "real_shift_y15": (REAL, "labels_beside_image 15.0"),
+    "real_scaled": (REAL, "labels_beside_image 1.11"),
+    "reversed_y": (T2, "labels_beside_image y"),
+    "reversed_z": (T2, "labels_beside_image z"),
+    "mesh_mirrored_y": (T2, "labels_beside_image"),
+    "mesh_mirrored_z": (T2, "labels_beside_image"),
+    "mesh_lps_as_ras": (T1, "labels_beside_image"),
+    "labels_grid_lost": (T1, "grid_lost"),
+    "mesh_glb_y_up": (T1, "up_not_stated --up"),
+    "mask_link_dangles": (T2, "entries_not_read portal_vein.nii.gz"),
+    "ct_offset_1024": (T1, "no_ct -1024"),
+    "labels_blended": (T1, "labels_blended"),
+    "label_without_name": (T1, "labels_without_names labels.csv 9"),
+    "labels_of_regions": (T1, "labels_without_names liver"),
+    "dicom_big_endian": (T1, "transfer_syntax"),
+    "dicom_no_rescale": (T1, "no_rescale RescaleSlope"),
 }
-"""Target, and what of the cause the line must hold."""
+"""Target, and the code of the cause, with what the line must name."""
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +72,8 @@ def made(tmp_path_factory):
 
 
 def init(folder, target):
-    """The exit code of `init` on a folder."""
-    return main(["init", str(folder), "--space", "RAS", "--force", "--target", target, "--hit-radius", "5"])
+    """The command `init` on a folder."""
+    return ["init", str(folder), "--space", "RAS", "--force", "--target", target, "--hit-radius", "5"]
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -80,30 +81,28 @@ def test_what_is_wrong_is_refused_by_its_cause(made, capsys, name):
     """Exit code 2, one line, nothing written."""
     target, cause = REFUSED[name]
     folder = made(name)
-    assert init(folder, target) == 2
-    assert cause in capsys.readouterr().err
+    refused_command(init(folder, target), capsys, *cause.split())
     assert not (folder / "case.toml").exists()
 
 
 def test_frames_of_a_seg_that_lie_elsewhere_are_refused(made, capsys):
     """By 12 mm, which the line says."""
-    assert init(made("seg_off_12mm"), "25,25,-36") == 2
-    assert "12." in capsys.readouterr().err
+    refused_command(init(made("seg_off_12mm"), "25,25,-36"), capsys, "labels_beside_image", "12.")
 
 
 @pytest.mark.parametrize("name", ["trunk", *READ])
 def test_what_is_right_is_read(made, name):
     """And one direction gets an answer."""
     folder = made(name)
-    assert init(folder, T1) == 0
+    assert main(init(folder, T1)) == 0
     assert main(["check", str(folder), "--no-arm", "--theta", "40", "--beta", "90"]) in (0, 1)
 
 
 @pytest.mark.parametrize("name", ["mask_npz", "mask_part", "mask_zst", "mask_subfolder"])
 def test_a_mask_that_is_not_read_is_named(made, capsys, name):
     """The vessel in the path was passed over in silence."""
-    assert main(["check", str(made(name)), "--no-arm", "--theta", "0", "--beta", "0"]) == 2
-    assert "vessel" in capsys.readouterr().err
+    command = ["check", made(name), "--no-arm", "--theta", "0", "--beta", "0"]
+    refused_command(command, capsys, "entries_not_read", "vessel")
 
 
 def test_what_a_device_cannot_read_is_refused(made, capsys):

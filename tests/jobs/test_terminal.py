@@ -1,5 +1,6 @@
 """At the terminal: help, a reader who goes away, folders that name themselves, widths and colours."""
 
+import errno
 import os
 import re
 import subprocess
@@ -72,6 +73,61 @@ def test_a_pipe_that_broke_elsewhere_is_a_failure(capsys):
 
     assert exit_code_of(broken, print) == PROGRAM_FAILED
     assert "BrokenPipeError" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [None, "out/table"])
+def test_a_disk_that_takes_no_more_is_told_in_one_line(name, capsys):
+    """Of whatever file, one that a library writes too: exit code 3, and no traceback."""
+
+    def full():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), name)
+
+    said = []
+    assert exit_code_of(full, said.append) == PROGRAM_FAILED
+    (line,) = said
+    assert "No space left" in line and (name or "kernels") in line
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        (["se"], {"search", "selfcal", "servo"}),
+        (["batch", "co"], {"compare"}),
+        (["check", "--th"], {"--theta"}),
+        (["export", "--c"], {"--case"}),
+        (["--i"], {"--install-completion"}),
+    ],
+)
+def test_a_shell_completes_commands_and_options(words, completed):
+    """As bash asks for it, by typer's own rule; nothing else is said."""
+    asked = {
+        "_RUN_TWIN_COMPLETE": "complete_bash",
+        "COMP_WORDS": " ".join(["run-twin", *words]),
+        "COMP_CWORD": str(len(words)),
+    }
+    done = run_as_installed(asked)
+    assert (done.returncode, done.stderr, set(done.stdout.split())) == (0, "", completed)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_each_shell_is_told_how_to_ask(shell):
+    """The script that --install-completion installs names the variable by which it asks."""
+    done = run_as_installed({"_RUN_TWIN_COMPLETE": f"source_{shell}"})
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"_RUN_TWIN_COMPLETE=complete_{shell}" in done.stdout
+
+
+def run_as_installed(environment):
+    """The command under the name that is installed."""
+    return subprocess.run(
+        [sys.executable, "-c", f"import sys\nsys.argv[0] = 'run-twin'\n{PROGRAM}"],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+    )
 
 
 @pytest.mark.parametrize(

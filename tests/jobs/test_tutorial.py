@@ -13,7 +13,7 @@ COMMANDS = re.findall(r"^python run_twin\.py (.+)$", PAGE.read_text(encoding="ut
 
 SAID = {
     "reproduce chen2019": "every number holds",
-    "reproduce chen2019 --experiment": "2.99 ->  1.28 mm",
+    "reproduce chen2019 --experiment": "2.99 -> 1.28 mm",
     "scan": "standard dev.  0.29 in the plane, 1.44 along the bed",
     "touch": "5 markers touched in 6",
     "register": "1.8 degrees out of square, y against z",

@@ -101,7 +101,6 @@ def test_a_cantilever_bends_as_euler_says():
     found = beam.bent(np.zeros(100), straight(100), tip_load=0.5)
     assert found.deflection[-1] == pytest.approx(0.5 * 200**3 / (3 * beam.stiffness), rel=1e-6)
     assert found.slope[-1] == pytest.approx(0.5 * 200**2 / (2 * beam.stiffness), rel=1e-6)
-    assert found.deflection[-1] == pytest.approx(0.5 / SOLID_18.tip_stiffness_n_mm, rel=1e-6)
 
 
 @pytest.mark.parametrize("k", [0.01, 0.1, 0.4])

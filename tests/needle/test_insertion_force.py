@@ -12,12 +12,17 @@ LIVER = Tissue(0.1, cutting_n=0.9, friction_n_mm=0.02, capsule_n=2.0, capsule_mm
 PATH = [Layer(0.0, 8.0, SKIN), Layer(8.0, 25.0, FAT), Layer(25.0, 80.0, LIVER)]
 
 
+def work_n_mm(found):
+    """Work of the arm: the force integrated over the samples."""
+    return float(np.trapezoid(found.total_n, found.depth_mm))
+
+
 def test_the_arms_work_goes_into_rupture_cutting_and_friction():
     """To 1 %: the sampled force integrated, beside the three integrals in closed form; and it converges."""
     found = insertion_force(PATH)
-    assert found.work_n_mm == pytest.approx(sum(found.energy_n_mm), rel=0.01)
+    assert work_n_mm(found) == pytest.approx(sum(found.energy_n_mm), rel=0.01)
     finer = insertion_force(PATH, 0.01)
-    assert abs(finer.work_n_mm - sum(finer.energy_n_mm)) < 0.2 * abs(found.work_n_mm - sum(found.energy_n_mm))
+    assert abs(work_n_mm(finer) - sum(finer.energy_n_mm)) < 0.2 * abs(work_n_mm(found) - sum(found.energy_n_mm))
     for part, energy in zip((finer.capsule_n, finer.cutting_n, finer.friction_n), finer.energy_n_mm, strict=True):
         assert np.trapezoid(part, finer.depth_mm) == pytest.approx(energy, rel=0.01)
 
@@ -33,7 +38,7 @@ def test_layers_at_random_keep_the_balance(rng):
             layers.append(Layer(start, float(end), Tissue(0.1, *numbers, *capsule)))
             start = float(end)
         found = insertion_force(layers, 0.01)
-        assert found.work_n_mm == pytest.approx(sum(found.energy_n_mm), rel=0.01)
+        assert work_n_mm(found) == pytest.approx(sum(found.energy_n_mm), rel=0.01)
 
 
 @pytest.mark.parametrize(

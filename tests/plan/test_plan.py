@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from case_world import coarse_carton
+from refusals import refused
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import SpeedLimits, flange_pose, tip_speeds
@@ -44,7 +45,7 @@ def test_a_plan_whose_own_configuration_breaks_a_limit_is_refused(carton, planne
     _check_limits(planned.plan, carton, "plan.json")
     case = replace(carton.case, search=replace(carton.case.search, **limit))
     strict = replace(carton, case=case, chance=replace(carton.chance, case=case))
-    with pytest.raises(InputError, match="does not keep search.min_hit and max_touch"):
+    with refused("limits_not_kept"):
         _check_limits(planned.plan, strict, "plan.json")
 
 
@@ -55,7 +56,7 @@ def test_plan_case_and_candidates_show_themselves(carton, found, planned):
     assert f"θ {np.degrees(planned.plan.theta):g}°" in shown["plan"]
     assert "bolt_m" in shown["case"]
     assert f"{len(found):,} candidates" in shown["all"]
-    assert "<svg" in shown["all"]
+    assert "data:image/png" in shown["all"]
     hostile = replace(planned.plan, case_name="<script>")._repr_html_()
     assert "<script>" not in hostile
     assert "&lt;script&gt;" in hostile
@@ -172,53 +173,50 @@ def nearest_branch(branches, q):
 
 
 BROKEN = {
-    "another version": (lambda d: {"version": 7}, "version 7"),
-    "no T_base_ct": (lambda d: {"T_base_ct": None}, "T_base_ct"),
-    "a mirrored T_base_ct": (lambda d: {"T_base_ct": (np.diag([1, 1, -1, 1]) @ d["T_base_ct"]).tolist()}, "T_base_ct"),
-    "a target elsewhere": (lambda d: {"target_ct_mm": [0, 0, 0]}, "straight path|off the stored pose"),
-    "two coordinates": (lambda d: {"target_ct_mm": [0, 0]}, "does not fit"),
-    "text for a number": (lambda d: {"standoff_mm": "150"}, "is no number"),
-    "another standoff": (lambda d: {"standoff_mm": d["standoff_mm"] + 1}, "tip at standoff is 1 mm off"),
-    "a gap between the phases": (lambda d: {"approach": _moved(d["approach"], -1, 0, 0.01)}, "does not start where"),
-    "a joint off at the target": (
-        lambda d: {"insertion": _moved(d["insertion"], -1, 1, 0.01)},
-        "leaves the straight path",
+    "another version": (lambda d: {"version": 7}, "unknown_version"),
+    "no T_base_ct": (lambda d: {"T_base_ct": None}, "wrong_type T_base_ct"),
+    "a mirrored T_base_ct": (
+        lambda d: {"T_base_ct": (np.diag([1, 1, -1, 1]) @ d["T_base_ct"]).tolist()},
+        "mirrored T_base_ct",
     ),
-    "a detour on the way in": (
-        lambda d: {"insertion": _moved(d["insertion"], 40, 1, 0.01)},
-        "leaves the straight path",
-    ),
+    "a target elsewhere": (lambda d: {"target_ct_mm": [0, 0, 0]}, "not_straight"),
+    "two coordinates": (lambda d: {"target_ct_mm": [0, 0]}, "bad_value"),
+    "text for a number": (lambda d: {"standoff_mm": "150"}, "bad_value"),
+    "another standoff": (lambda d: {"standoff_mm": d["standoff_mm"] + 1}, "plan_contradicted"),
+    "a gap between the phases": (lambda d: {"approach": _moved(d["approach"], -1, 0, 0.01)}, "phases_not_joined"),
+    "a joint off at the target": (lambda d: {"insertion": _moved(d["insertion"], -1, 1, 0.01)}, "not_straight"),
+    "a detour on the way in": (lambda d: {"insertion": _moved(d["insertion"], 40, 1, 0.01)}, "not_straight"),
     "a dive past the target": (
         lambda d: _with_rows(d, lambda rows: [*rows, *_shifted(d, rows[-1], -30.0)]),
-        "goes beyond standoff and target by 30|turns back by 30",
+        "not_straight 30",
     ),
-    "only the two ends of the insertion": (lambda d: _two_rows(d), "leaves the straight path by|swings out"),
+    "only the two ends of the insertion": (lambda d: _two_rows(d), "not_straight"),
     "a thousand times as fast": (
         lambda d: {"approach": {**d["approach"], "times_s": [t / 1000 for t in d["approach"]["times_s"]]}},
-        "the approach drives the tip at .* mm/s",
+        "tip_too_fast",
     ),
     "a jolt on the way": (
         lambda d: {"approach": _moved(d["approach"], len(d["approach"]["q_rad"]) // 2, 2, 0.01)},
-        "the approach (has .* times the acceleration that a joint may have|drives the tip)",
+        "tip_too_fast",
     ),
     "an insertion at ten times the speed": (
         lambda d: {"insertion": {**d["insertion"], "times_s": [t / 10 for t in d["insertion"]["times_s"]]}},
-        "drives the tip at .* mm/s",
+        "tip_too_fast",
     ),
     "times that fall": (
         lambda d: {"insertion": {**d["insertion"], "times_s": d["insertion"]["times_s"][::-1]}},
-        "times do not rise",
+        "times_not_rising",
     ),
     "five joints": (
         lambda d: {"insertion": {**d["insertion"], "q_rad": [row[:5] for row in d["insertion"]["q_rad"]]}},
-        "does not fit",
+        "bad_value",
     ),
     "a jerk that is not its own": (
         lambda d: {"approach": {**d["approach"], "peaks": {**d["approach"]["peaks"], "jerk_rad_s3": [0.0] * 6}}},
-        "peaks of the approach",
+        "plan_contradicted",
     ),
-    "other limits": (lambda d: {"limits": {**d["limits"], "speed_rad_s": [9.0] * 6}}, "the limits are not"),
-    "an unknown arm": (lambda d: {"robot": "ur99"}, "ur99"),
+    "other limits": (lambda d: {"limits": {**d["limits"], "speed_rad_s": [9.0] * 6}}, "plan_contradicted"),
+    "an unknown arm": (lambda d: {"robot": "ur99"}, "unknown_robot ur99"),
 }
 
 
@@ -227,31 +225,31 @@ def test_a_plan_that_contradicts_itself_is_refused(name, document):
     """Whatever was changed is named."""
     change, message = BROKEN[name]
     content, write = document
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         read_plan(write(**change(content)))
 
 
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "file of 0 bytes"),
-        (b'{"version": 3', "JSON cannot be read"),
-        (b'{"version": 3}', "is missing"),
-        (b'{"version": 2}', "version 2; allowed: .* plan again"),
-        (b'{"version": 1}', "version 1"),
-        (b"[1, 2]", "version None"),
-        (b'{"version": 3, "x": NaN}', "NaN is not a finite number"),
-        (b'{"version": 3, "x": 1e999}', "1e999 is not a finite number"),
-        (b'{"version": 3, "seed": 1, "seed": 2}', "key 'seed' stands twice"),
-        (b"\xff\xfe\x00", "JSON cannot be read"),
-        (b"[" * 100_000, "JSON cannot be read"),
+        (b"", "file_size"),
+        (b'{"version": 3', "not_json"),
+        (b'{"version": 3}', "missing_key"),
+        (b'{"version": 2}', "unknown_version"),
+        (b'{"version": 1}', "unknown_version"),
+        (b"[1, 2]", "unknown_version None"),
+        (b'{"version": 3, "x": NaN}', "not_json"),
+        (b'{"version": 3, "x": 1e999}', "not_json"),
+        (b'{"version": 3, "seed": 1, "seed": 2}', "not_json seed"),
+        (b"\xff\xfe\x00", "not_json"),
+        (b"[" * 100_000, "not_json"),
     ],
 )
 def test_what_is_no_plan_is_refused(data, message, tmp_path):
     """Garbage, half a file, deep nesting: one line."""
     path = tmp_path / "plan.json"
     path.write_bytes(data)
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         read_plan(path)
 
 
@@ -260,7 +258,7 @@ def test_a_plan_of_other_inputs_is_refused(carton, document):
     content, write = document
     changed = [one | {"sha256": "0" * 64} if one["path"] == "touch.csv" else one for one in content["inputs"]]
     path = write(inputs=changed)
-    with pytest.raises(InputError, match=r"input 'markers_base \(touch.csv\)' is not the one"):
+    with refused("input_changed", "markers_base", "touch.csv"):
         check_plan(read_plan(path), carton, path)
 
 
@@ -268,7 +266,7 @@ def test_a_plan_for_another_patient_pose_is_refused(carton, planned):
     """T_base_ct must be the case's own, bit for bit."""
     moved = np.array(planned.plan.T_base_ct)
     moved[0, 3] += 1e-6
-    with pytest.raises(InputError, match="T_base_ct is not the case's"):
+    with refused("plan_of_another"):
         check_plan(replace(planned.plan, T_base_ct=moved), carton, "plan.json")
 
 
@@ -285,7 +283,7 @@ def test_a_plan_for_another_patient_pose_is_refused(carton, planned):
 )
 def test_a_plan_that_flatters_itself_is_refused(carton, planned, key, value):
     """Numbers that people read are computed again, and a plan that states others is refused."""
-    with pytest.raises(InputError, match="the case gives"):
+    with refused("plan_of_another"):
         check_plan(replace(planned.plan, **{key: value}), carton, "plan.json")
 
 
@@ -297,7 +295,7 @@ def test_a_plan_states_the_warnings_of_its_case(carton, document):
     for other in (stood[1:], [*stood, "another"]):
         assert "its warnings are not those of the case" in refusal(write(warnings=other), carton)
     for wrong in ("none", [1], None):
-        with pytest.raises(InputError, match="warnings"):
+        with refused("bad_value"):
             read_plan(write(warnings=wrong))
 
 
@@ -383,7 +381,7 @@ def test_an_unsafe_direction_is_refused_on_loading(carton, planned):
     """A plan whose direction goes through bolt H is refused by the search, whatever its motion says."""
     theta, beta = np.radians(45), np.radians(270)
     outward_ct = carton.check(theta, beta).outward_ct[0]
-    with pytest.raises(InputError, match=r"its direction is rejected: too_close \(bolt_h\)"):
+    with refused("direction_rejected", "too_close", "bolt_h"):
         check_plan(replace(planned.plan, theta=theta, beta=beta, outward_ct=outward_ct), carton, "plan.json")
 
 
@@ -401,6 +399,6 @@ def test_no_safe_candidate_means_no_plan(carton, found):
         verdict=replace(found.verdict, reason=np.full(len(found), Reason.TOO_CLOSE.value)),
         ranking=Ranking.none(len(found)),
     )
-    with pytest.raises(NoAnswerError, match="no candidate is safe") as caught:
+    with refused("no_plan", by=NoAnswerError) as caught:
         make_plan(carton, none, seed=0)
     assert caught.value.counts == {"too_close": len(found)}

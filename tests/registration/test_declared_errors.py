@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.special import chdtri
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.fits import (
     ReadingNoise,
@@ -15,8 +15,8 @@ from puncture_twin.planning.registration.fits import (
     least_squares_map,
 )
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import NoiseTest, noise_test
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import NoiseTest, noise_test
 
 T_TRUE = pose(exp_rotation(np.array([0.4, -0.2, 1.1])), np.array([300.0, -200.0, 100.0]))
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147], [0, 80, 60]])
@@ -119,17 +119,17 @@ def test_residuals_far_beyond_the_declaration_are_refused_and_can_be_accepted():
     base = apply(T_TRUE, MARKERS) + np.random.default_rng(0).normal(0, 4.0, MARKERS.shape)
     pairs = MarkerPairs(tuple("ABCDEF"), MARKERS, base)
     settings = {"method": "weighted", "target_ct": np.array([50.0, 130.0, 63.0]), "noise": noise(6)}
-    with pytest.raises(InputError, match="do not agree with the declared errors"):
+    with refused("residuals_too_large"):
         register(pairs, **settings)
     found = register(pairs, **settings, accept_residuals=True)
     assert found.uncertainty.test.scaled
     assert found.uncertainty.test.scale > 2
-    assert any("declared errors" in flag for flag in found.flags)
+    assert any(flag.code == "residuals_unexplained" for flag in found.flags)
     assert found.fle_interval_mm.low < found.fle_mm < found.fle_interval_mm.high
 
 
 def test_weights_need_a_declaration():
     """Method weighted without errors is refused."""
     pairs = MarkerPairs(tuple("ABCDEF"), MARKERS, apply(T_TRUE, MARKERS))
-    with pytest.raises(InputError, match="weighs by declared errors"):
+    with refused("method_without_errors"):
         register(pairs, method="weighted", target_ct=np.zeros(3))

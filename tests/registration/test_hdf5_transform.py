@@ -9,9 +9,9 @@ import h5py
 import numpy as np
 import pytest
 import SimpleITK
+from refusals import refused
 from registration.test_stated_transform import FLIP, POINTS, T_BASE_CT, slicer_file, stating
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.formats.itk_transform import HEAP_HEAD_BYTES, parse_transform
 from puncture_twin.planning.geometry.rigid import apply
@@ -187,40 +187,35 @@ def stored_outside(parent, _):
 
 
 BAD = [
-    ("affine", scaled, "not a rotation"),
-    ("affine", sheared, "not a rotation"),
-    ("affine", lambda parent, _: parent["0"].pop("TransformType"), "/TransformGroup/0 without TransformType"),
-    ("affine", lambda parent, file: file.pop("TransformGroup"), "HDF5 without TransformGroup"),
-    ("affine", lambda parent, _: parent.pop("0"), "0 transforms"),
-    (
-        "affine",
-        set_to("TransformType", "BSplineTransform_double_3_3"),
-        "type 'BSplineTransform_double_3_3'",
-    ),
-    ("affine", set_to("TransformType", "AffineTransform_double_2_2"), "transform of type 'AffineTransform_double_2_2'"),
-    ("affine", set_to("TransformType", [1.0]), "TransformType is no text"),
-    ("affine", set_to("TransformParameters", np.arange(12)), "TransformParameters of int64"),
-    ("affine", set_to("TransformParameters", np.ones((3, 4))), r"TransformParameters of float64 with shape \(3, 4\)"),
-    ("affine", set_to("TransformParameters", np.ones(13)), "13 Parameters; allowed: 12 numbers"),
-    ("affine", set_to("TransformParameters", np.full(12, np.nan)), "not finite"),
-    ("affine", set_to("TransformFixedParameters", np.ones(2)), "2 FixedParameters; allowed: 3 numbers"),
-    ("affine", set_to("TranformParameters", np.ones(12)), "with TransformParameters and TranformParameters"),
-    ("affine", linked_outside, "TransformParameters is a link"),
-    ("affine", stored_outside, "TransformParameters lies in another file"),
-    ("versor", set_to("TransformParameters", np.array([1.0, 0.1, 0, 0, 0, 0])), "a versor of length 1.00498756"),
-    ("euler", set_to("TransformParameters", np.array([np.inf, 0, 0, 0, 0, 0])), "not finite"),
-    ("composite", renumbered, "TransformGroup with 0, 1, 3, 4"),
-    ("composite", no_composite, "several transforms"),
-    ("composite", set_to("TransformType", "SyNTransform_double_3_3"), "transform of type 'SyNTransform_double_3_3'"),
+    ("affine", scaled, "not_rigid"),
+    ("affine", sheared, "not_rigid"),
+    ("affine", lambda parent, _: parent["0"].pop("TransformType"), "missing_key /TransformGroup/0"),
+    ("affine", lambda parent, file: file.pop("TransformGroup"), "wrong_format"),
+    ("affine", lambda parent, _: parent.pop("0"), "wrong_count"),
+    ("affine", set_to("TransformType", "BSplineTransform_double_3_3"), "unknown_type BSplineTransform_double_3_3"),
+    ("affine", set_to("TransformType", "AffineTransform_double_2_2"), "unknown_type AffineTransform_double_2_2"),
+    ("affine", set_to("TransformType", [1.0]), "wrong_type"),
+    ("affine", set_to("TransformParameters", np.arange(12)), "wrong_type int64"),
+    ("affine", set_to("TransformParameters", np.ones((3, 4))), "wrong_type float64"),
+    ("affine", set_to("TransformParameters", np.ones(13)), "wrong_count 13 12"),
+    ("affine", set_to("TransformParameters", np.full(12, np.nan)), "not_finite"),
+    ("affine", set_to("TransformFixedParameters", np.ones(2)), "wrong_count"),
+    ("affine", set_to("TranformParameters", np.ones(12)), "stated_twice"),
+    ("affine", linked_outside, "wrong_format"),
+    ("affine", stored_outside, "data_elsewhere"),
+    ("versor", set_to("TransformParameters", np.array([1.0, 0.1, 0, 0, 0, 0])), "not_unit 1.00498756"),
+    ("euler", set_to("TransformParameters", np.array([np.inf, 0, 0, 0, 0, 0])), "not_finite"),
+    ("composite", renumbered, "wrong_format"),
+    ("composite", no_composite, "several_transforms"),
+    ("composite", set_to("TransformType", "SyNTransform_double_3_3"), "unknown_type SyNTransform_double_3_3"),
 ]
 
 
 @pytest.mark.parametrize(("kind", "change", "says"), BAD)
 def test_what_is_not_one_rigid_transform_is_refused(tmp_path, kind, change, says):
     """Stretched, sheared, of another kind, incomplete, pointing elsewhere: named, in one line."""
-    with pytest.raises(InputError, match=says) as caught:
+    with refused(*says.split(), tmp_path / "b.h5"):
         read(rewritten(tmp_path, kind, change))
-    assert "\n" not in str(caught.value) and str(tmp_path / "b.h5") in str(caught.value)
 
 
 def test_every_truncation_is_refused(tmp_path):
@@ -229,7 +224,7 @@ def test_every_truncation_is_refused(tmp_path):
     SimpleITK.WriteTransform(random_transform("composite", np.random.default_rng(3)), str(file))
     whole = file.read_bytes()
     for length in range(0, len(whole), 97):
-        with pytest.raises(InputError, match="no whole HDF5 file"):
+        with refused("file_damaged"):
             parse_transform(whole[:length], file)
 
 
@@ -275,7 +270,7 @@ def test_a_heap_on_which_hdf5_never_ends_is_refused(tmp_path):
     data = bytearray(file.read_bytes())
     object_of_type = data.index(b"AffineTransform_double_3_3\0") - HEAP_HEAD_BYTES
     data[object_of_type : object_of_type + HEAP_HEAD_BYTES] = struct.pack("<HH4xQ", 7, 0, 0)
-    with pytest.raises(InputError, match=r"no whole HDF5 file \(a text is not in its heap\)"):
+    with refused("file_damaged"):
         parse_transform(bytes(data), file)
 
 
@@ -289,5 +284,5 @@ def test_a_text_elsewhere_is_refused(tmp_path, at, layout, value):
     with h5py.File(file) as whole:
         place = whole["TransformGroup/0/TransformType"].id.get_offset()
     struct.pack_into(layout, data, place + at, value)
-    with pytest.raises(InputError, match="no whole HDF5 file"):
+    with refused("file_damaged"):
         parse_transform(bytes(data), file)

@@ -6,8 +6,8 @@ import pytest
 from benchmarks.one_insertion import T, held, markers_of
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import leverage
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import leverage
 from puncture_twin.planning.uncertainty.hit import hit_in_ball, radius_for_chance
 
 

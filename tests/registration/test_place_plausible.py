@@ -4,8 +4,8 @@ import json
 
 import pytest
 from case_world import CASE, MARKERS, changed, registration_section, write_case, write_markers
+from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 
@@ -50,7 +50,7 @@ def test_with_the_arm_a_base_in_the_patient_is_refused(tmp_path, way):
     """Other places that hardly can be are told as without it."""
     (inside, far, _) = PLACES.values()
     key = "registration" if way == "markers" else "robot.mount"
-    with pytest.raises(InputError, match=f"case.toml: {key}: the robot's base stands in the patient"):
+    with refused("base_in_patient", "case.toml", key):
         prepare(stating(tmp_path, way, inside), arm=True)
     assert len(said(stating(tmp_path, way, far), arm=True)) == 1
 

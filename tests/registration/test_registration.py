@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits import fit_affine, fit_rigid, fit_triad
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
-from puncture_twin.planning.registration.noise_test import conditioning, leverage
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import conditioning, leverage
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2, TABLE_4
 
 TARGET = np.array([50.0, 130.0, 63.0])
@@ -139,16 +139,16 @@ def test_match_by_name_takes_the_order_of_use():
 @pytest.mark.parametrize(
     ("ct", "base", "use", "message"),
     [
-        ("abcd", "abc", None, "d missing on the base side"),
-        ("abc", "abce", None, "e missing on the CT side"),
-        ("abc", "abc", ("a", "b", "z"), "z missing on the CT side"),
-        ("abc", "abc", ("a", "b", "b"), "names repeat"),
+        ("abcd", "abc", None, "markers_missing"),
+        ("abc", "abce", None, "markers_missing"),
+        ("abc", "abc", ("a", "b", "z"), "markers_missing"),
+        ("abc", "abc", ("a", "b", "b"), "duplicate_name"),
     ],
 )
 def test_unmatched_names_are_refused_by_name(ct, base, use, message):
     """A name that one side lacks is an error that says which and where."""
     points = np.random.default_rng(0).uniform(0, 100, (4, 3))
-    with pytest.raises(InputError, match=message):
+    with refused(message):
         match(named(ct, points[: len(ct)]), named(base, points[: len(base)]), use=use)
 
 
@@ -165,32 +165,32 @@ def _with_nan(points):
 @pytest.mark.parametrize(
     ("ct", "base", "message"),
     [
-        (MARKERS[:2], MARKERS[:2], "2 markers"),
-        (np.outer([0, 1, 2.5, 4], [30.0, 40, 50]), MARKERS, "collinear on the CT side"),
-        (MARKERS, np.outer([0, 1, 2.5, 4], [30.0, 40, 50]), "collinear on the base side"),
-        (MARKERS, np.tile(MARKERS[0], (4, 1)), "collinear on the base side"),
-        (MARKERS, MARKERS * [-1, 1, 1], "match only mirrored"),
-        (MARKERS, MARKERS / 1000, "mm/cm/m slip"),
-        (MARKERS * 10, MARKERS, "mm/cm/m slip"),
-        (MARKERS, _swapped(MARKERS), "marker .* misses by .* mm: swapped"),
-        (_with_nan(MARKERS), MARKERS, "marker m2 is not finite"),
+        (MARKERS[:2], MARKERS[:2], "too_few_markers"),
+        (np.outer([0, 1, 2.5, 4], [30.0, 40, 50]), MARKERS, "markers_collinear"),
+        (MARKERS, np.outer([0, 1, 2.5, 4], [30.0, 40, 50]), "markers_collinear"),
+        (MARKERS, np.tile(MARKERS[0], (4, 1)), "markers_collinear"),
+        (MARKERS, MARKERS * [-1, 1, 1], "markers_mirrored"),
+        (MARKERS, MARKERS / 1000, "wrong_unit"),
+        (MARKERS * 10, MARKERS, "wrong_unit"),
+        (MARKERS, _swapped(MARKERS), "marker_misses"),
+        (_with_nan(MARKERS), MARKERS, "not_finite m2"),
     ],
 )
 def test_markers_that_cannot_be_trusted_are_refused_by_name(ct, base, message):
     """Too few, collinear, mirrored, slipped, swapped, NaN: each has its own words."""
-    with pytest.raises(InputError, match=message):
+    with refused(*message.split()):
         register(pairs(ct, base), method="rigid", target_ct=TARGET)
 
 
 def test_affine_is_refused_for_planning():
     """Bending the patient is no registration."""
-    with pytest.raises(InputError, match="affine"):
+    with refused("method_bends"):
         register(pairs(MARKERS, MARKERS), method="affine", target_ct=TARGET)
 
 
 def test_triad_takes_three():
     """A triad of four markers would silently ignore one."""
-    with pytest.raises(InputError, match="triad takes 3"):
+    with refused("wrong_count"):
         register(pairs(MARKERS, MARKERS), method="triad", target_ct=TARGET)
 
 

@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.method import rigid_rss
-from puncture_twin.planning.registration.noise_test import DOUBT, MIN_FLE_MM, ResidualTest
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import MIN_FLE_MM, REJECT_LEVEL, ResidualTest
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2
 
 TARGET = np.array([50.0, 130.0, 63.0])
@@ -56,7 +56,7 @@ def test_honest_noise_is_refused_once_in_a_thousand(count):
     """Of 20,000 registrations with the declared noise 0.1 % are refused, to four standard errors of the draws."""
     limit = ResidualTest(count, 0.0, FLE_MM).limit_mm
     refused = np.mean(drawn_fre(count, FLE_MM, np.random.default_rng(count)) > limit)
-    assert refused == pytest.approx(DOUBT, abs=4 * np.sqrt(DOUBT / DRAWS))
+    assert refused == pytest.approx(REJECT_LEVEL, abs=4 * np.sqrt(REJECT_LEVEL / DRAWS))
 
 
 @pytest.mark.parametrize(("count", "power"), [(3, 0.797), (4, 0.966), (5, 0.995), (6, 0.9993)])
@@ -64,7 +64,7 @@ def test_noise_four_times_the_declared_is_refused(count, power):
     """The refusals are what chi-squared says: 80 % with three markers, 97 % with four, over 99 % from five on."""
     limit = ResidualTest(count, 0.0, FLE_MM).limit_mm
     refused = np.mean(drawn_fre(count, 4 * FLE_MM, np.random.default_rng(count)) > limit)
-    assert power == pytest.approx(chi2.sf(chi2.isf(DOUBT, 3 * count - 6) / 16, 3 * count - 6), abs=0.001)
+    assert power == pytest.approx(chi2.sf(chi2.isf(REJECT_LEVEL, 3 * count - 6) / 16, 3 * count - 6), abs=0.001)
     assert refused == pytest.approx(power, abs=0.012)
 
 
@@ -82,21 +82,21 @@ def test_the_interval_of_the_estimated_noise_holds_the_truth_in_95_percent(count
 
 def test_residuals_of_11_mm_are_refused():
     """Without a declared noise an FRE above 5 mm passes no more."""
-    with pytest.raises(InputError, match=r"FRE 10\.\d+ mm exceeds the 5 mm .*accept_residuals = true"):
+    with refused("residuals_too_large"):
         register(pairs(MARKERS[:4], missing_by(11.0)), method="rigid", target_ct=TARGET)
 
 
 def test_accepted_residuals_are_flagged():
     """The user's word lets them pass, and the registration says so."""
     found = register(pairs(MARKERS[:4], missing_by(11.0)), method="rigid", target_ct=TARGET, accept_residuals=True)
-    assert any("exceeds the 5 mm" in flag and "accepted" in flag for flag in found.flags)
+    assert any(flag.code == "residuals_unexplained" for flag in found.flags)
     assert found.fle_mm > 10.0
 
 
 def test_a_declared_noise_that_does_not_explain_the_residuals_is_refused_or_scaled():
     """Chi-squared beyond its 99.9 % point: refused; accepted, the noise is s times the declared, and so the error."""
     base = missing_by(3.0)
-    with pytest.raises(InputError, match=r"fle_mm = 0.5 does not explain FRE .* 6 degrees of freedom"):
+    with refused("residuals_too_large", "0.5"):
         register(pairs(MARKERS[:4], base), method="rigid", target_ct=TARGET, fle_mm=0.5)
     found = register(pairs(MARKERS[:4], base), method="rigid", target_ct=TARGET, fle_mm=0.5, accept_residuals=True)
     s = np.sqrt(np.sum(found.residuals**2) / (0.5**2 / 3) / 6)
@@ -105,7 +105,7 @@ def test_a_declared_noise_that_does_not_explain_the_residuals_is_refused_or_scal
     low, high = found.expected_tre_interval_mm(TARGET)
     assert low < found.expected_tre_mm(TARGET[None])[0] < high
     assert f"scaled by {s:.2f}" in found.fle_source
-    assert any("does not explain" in flag for flag in found.flags)
+    assert any(flag.code == "residuals_unexplained" for flag in found.flags)
 
 
 def test_a_declared_noise_that_explains_the_residuals_stays_as_declared():

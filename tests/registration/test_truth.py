@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import ROOT
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.case import Case, view_frame
 from puncture_twin.planning.case.named_files import CaseVolumes
@@ -19,8 +19,8 @@ from puncture_twin.planning.case.tables import MarkerSection, RankingSection, Re
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
-from puncture_twin.planning.registration.noise_test import leverage
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.planning.registration.residuals import leverage
 from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
 
 MESHES = ROOT / "meshes"
@@ -171,13 +171,17 @@ def test_target_lies_exactly_where_the_file_says(tmp_path):
 
 @pytest.mark.parametrize(
     ("names", "rows", "said"),
-    [(("A", "M"), (0, 5), "A, M"), (("P", "Q", "R"), (0, 1, 2), "none"), (("A", "B", "D"), (0, 0, 0), "line")],
+    [
+        (("A", "M"), (0, 5), "too_few_points"),
+        (("P", "Q", "R"), (0, 1, 2), "too_few_points"),
+        (("A", "B", "D"), (0, 0, 0), "points_collinear"),
+    ],
 )
 def test_too_few_or_collinear_true_points_are_refused(tmp_path, names, rows, said):
     """A file that cannot fix a pose is an input error that names what it has."""
     every = apply(pose(9), np.vstack([MARKERS, TARGET]))[list(rows)] + np.arange(len(rows))[:, None] * [1.0, 2.0, 3.0]
     write_points(tmp_path / "true.csv", names, every)
-    with pytest.raises(InputError, match=said):
+    with refused(said):
         draw_truth(case(tmp_path, truth_base="true.csv"), pose(0))
 
 

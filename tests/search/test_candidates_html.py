@@ -1,12 +1,15 @@
 """What a search's candidates show in a notebook: every cell of the grid is drawn, whatever its step."""
 
+import base64
+import io
 import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from puncture_twin.planning.base.reasons import SAFE, css
+from puncture_twin.planning.base.reasons import SAFE
 from puncture_twin.planning.search.candidates import candidates_html
 
 
@@ -30,9 +33,12 @@ def grid(step_deg):
 
 @pytest.mark.parametrize("step_deg", [1.0, 2.0, 5.0, 12.0])
 def test_a_safe_cap_is_one_whole_disc(step_deg):
-    """Every ring of the map is drawn all around: four sectors for each ring."""
+    """Every pixel of it: no other colour but white beyond, and circles and axes over both."""
     shown = candidates_html(grid(step_deg))
-    outline = re.search(rf'fill="{css(SAFE)}"[^>]* d="([^"]*)"', shown)[1]
-    rings = round((60.0 + step_deg / 2) / (step_deg / 2))
-    assert outline.count("M") == 4 * rings
+    data = base64.b64decode(re.search(r'base64,([^"]+)"', shown)[1])
+    picture = np.asarray(Image.open(io.BytesIO(data))).astype(int)
+    inside = np.hypot(*np.meshgrid(*2 * [(np.arange(640) - 319.5) / 320])) < 1
+    lined = np.round(np.array(SAFE) * 0.55)
+    assert ((picture == SAFE) | (picture == lined)).all(axis=2)[inside].all()
+    assert (picture == SAFE).all(axis=2)[inside].mean() > 0.95
     assert "no skin entry" not in shown

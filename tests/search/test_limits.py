@@ -6,10 +6,10 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 import trimesh
+from refusals import refused
 from scipy.special import ndtr
 from uncertainty_world import MOUNT, ball
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.search import candidate_chances
 from puncture_twin.planning.search.candidate_chances import limited
 from puncture_twin.planning.search.context import prepare
@@ -27,16 +27,16 @@ NO_ARM = "link_mm = 0\ntwist_deg = 0\njoint_deg = 0\ntip_offset_mm = 0\n"
 def test_limits_without_the_arm_are_refused(tmp_path):
     """Without a configuration there is no error of the needle, so that no limit can be kept."""
     context = prepare(ball(tmp_path, search=LIMITS), arm=False)
-    with pytest.raises(InputError, match="cannot be checked"):
+    with refused("no_needle_error"):
         context.search()
-    with pytest.raises(InputError, match="cannot be checked"):
+    with refused("no_needle_error"):
         context.check(0.35, 0.0)
 
 
 @pytest.mark.parametrize("base", [MOUNT, ""])
 def test_limits_without_markers_are_refused(tmp_path, base):
     """A stated mount has no errors of its own, and no base at all has no arm."""
-    with pytest.raises(InputError, match="cannot be checked"):
+    with refused("no_needle_error"):
         prepare(ball(tmp_path, search=LIMITS, base=base)).search()
 
 
@@ -49,7 +49,7 @@ def test_without_limits_the_same_cases_are_searched(tmp_path):
 @pytest.mark.parametrize("name", ["ribb", "organ", "skin"])
 def test_a_limit_of_a_structure_that_none_is_judged_by_is_refused(tmp_path, name):
     """A name that is mistyped, and structures that may be touched."""
-    with pytest.raises(InputError, match=f"'{name}' is no structure that must not be touched"):
+    with refused("unknown_structure", name):
         prepare(ball(tmp_path, search=f"max_touch_of = {{ {name} = 0.001 }}")).search()
 
 
@@ -88,13 +88,13 @@ def test_limits_are_kept_in_a_configuration_or_not_as_the_search_says(tmp_path, 
 @pytest.mark.parametrize("across", [0, 1])
 def test_readings_without_any_error_are_refused(tmp_path, across):
     """A covariance that has no inverse weighs nothing, along an oblique axis too."""
-    with pytest.raises(InputError, match="without any"):
+    with refused("no_marker_noise"):
         prepare(ball(tmp_path, errors=NO_READING.format(across=across) + NO_ARM))
 
 
 def test_noise_is_not_found_in_computed_readings(tmp_path):
     """Residuals of rounding alone say that one side was made from the other, not that nothing errs."""
-    with pytest.raises(InputError, match="hold none"):
+    with refused("no_marker_noise"):
         prepare(ball(tmp_path, errors='marker_noise = "found"', noise=0.0))
     assert prepare(ball(tmp_path, errors='marker_noise = "found"')).chance is not None
 
@@ -104,7 +104,7 @@ def test_a_structure_with_the_name_of_another_column_is_refused(tmp_path, name):
     """Its chance would be lost beside the sum's."""
     path = ball(tmp_path)
     path.write_text(path.read_text().replace('name = "rib"', f'name = "{name}"'))
-    with pytest.raises(InputError, match="is another column"):
+    with refused("reserved_name"):
         prepare(path)
 
 
@@ -134,7 +134,7 @@ def test_an_open_target_has_no_chance_to_be_hit(tmp_path):
     """A sheet holds no tip; a radius says what a hit is."""
     sheet = trimesh.Trimesh([[-8, -8, -6], [8, -8, -6], [8, 8, -6], [-8, 8, -6]], [[0, 1, 2], [0, 2, 3]])
     path = ball(tmp_path, organ=sheet)
-    with pytest.raises(InputError, match="is open"):
+    with refused("open_mesh"):
         prepare(path)
     path.write_text(path.read_text().replace('structure = "organ"', 'structure = "organ"\nhit_radius_mm = 2.0', 1))
     assert prepare(path).chance is not None

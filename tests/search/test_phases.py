@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from case_world import ORGAN, SKIN, ball, case_text, structure, write_balls
+from refusals import refused
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin import skin_paths
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.certify.subdivision import certify
@@ -151,7 +151,7 @@ def test_what_is_safe_says_when_and_never_that_a_needle_may_stay(patient):
 
 def test_a_weight_for_the_targets_own_structure_is_refused_unless_it_is_one(patient):
     """The amplitude is the target's; a pattern for all does not mean it."""
-    with pytest.raises(InputError, match="'organ' holds the target"):
+    with refused("breathing_weight"):
         searched(patient, breathing(weights=ByName({**WEIGHTS, "organ": 0.5})))
     rest = searched(patient, breathing(weights=ByName({"*": 0.0})))
     stated = searched(patient, breathing(weights=ByName({"*": 0.0, "organ": 1.0})))
@@ -181,14 +181,14 @@ def test_where_nothing_is_safe_before_the_breath_nothing_is_safe_with_it(patient
 
 def test_a_certificate_refuses_a_body_that_moves(patient):
     """It proves directions for the surfaces where the CT shows them."""
-    with pytest.raises(InputError, match="a body that does not move"):
+    with refused("not_certifiable"):
         certify(replace(patient.case, breathing=breathing()), patient.anatomy, size=0.1)
 
 
 def test_a_search_that_cannot_be_certified_searches_nothing(patient, tmp_path):
     """The refusal comes first, and leaves no file."""
     context = replace(patient, case=replace(patient.case, breathing=breathing()))
-    with pytest.raises(InputError, match="a body that does not move"):
+    with refused("not_certifiable"):
         search_case(context, tmp_path / "out", certify=CertifyOptions(1.0, None))
     assert not (tmp_path / "out").exists()
 

@@ -90,7 +90,7 @@ def _lists(slip_of, rng, folder, slip):
     def call():
         found = register(MarkerPairs(names, points_ct, points_base), method="rigid", target_ct=target)
         if found.flags:
-            return Answer(WARNED, found.flags[0][:40])
+            return Answer(WARNED, found.flags[0].code)
         miss = np.linalg.norm(apply(found.T_base_ct, target[None])[0] - apply(T, target[None])[0])
         limit = 3.0 * found.expected_tre_mm(target[None])[0]
         return Answer(RIGHT if miss < limit or not slip else SILENT)

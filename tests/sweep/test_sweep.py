@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 from places import ROOT
+from refusals import refused
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.case.tables import RehearsalSection
 from puncture_twin.planning.search.choice import Choice
@@ -103,18 +104,18 @@ def test_a_box_on_the_way_stops_the_arm(context, plan):
 
 def test_a_start_that_is_rejected_gives_no_sweep(context):
     """With its reason."""
-    with pytest.raises(NoAnswerError, match=r"no sweep: theta 20.0 deg, beta 40.0 deg is rejected"):
+    with refused("sweep_stops", "20.0", "40.0", by=NoAnswerError):
         plan_sweep(context, tuple(np.radians([20.0, 40.0])), tuple(END), seed=1, progress=quiet)
 
 
 def test_a_sweep_to_its_start_is_refused(context):
     """Nothing would move."""
-    with pytest.raises(InputError, match="a sweep to where it starts"):
+    with refused("no_motion"):
         plan_sweep(context, tuple(START), tuple(START), seed=1, progress=quiet)
 
 
 @pytest.mark.parametrize("text", ["20", "20,30,40", "200,10", "20,400", "a,b"])
 def test_angles_are_two_numbers_in_range(text):
     """Of --to."""
-    with pytest.raises(InputError, match="--to"):
+    with refused("not_a_number"):
         parse_angles(text)

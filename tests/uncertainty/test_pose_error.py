@@ -9,8 +9,8 @@ from uncertainty_world import NO_ARM, SLICES, declared, world
 
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import leverage
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import leverage
 from puncture_twin.planning.uncertainty.pose_error import error_budget
 from puncture_twin.twin.rehearsal.trials import draw_trials
 

@@ -5,6 +5,7 @@ What a wrong command line may say instead.
 
 from __future__ import annotations
 
+import errno
 import sys
 import traceback
 import warnings
@@ -157,6 +158,8 @@ def _exit_code_of(command: Callable[[], object], print_line: PrintLine, as_json:
 
 def _unread(error: BaseException) -> int:
     """The code where nobody reads stdout; a pipe that broke elsewhere, such as a worker's, is a failure."""
+    if isinstance(error, SystemExit) and not error.code:  # typer has completed a shell's word, or said how
+        return OK
     in_help = traceback.extract_tb(error.__traceback__)[-1].name == "on_broken_pipe"  # rich; stdout goes nowhere then
     if not (in_help or reader_is_gone(sys.stdout)):
         traceback.print_exc()
@@ -166,13 +169,16 @@ def _unread(error: BaseException) -> int:
 
 
 def _failed(error: Exception, print_line: PrintLine) -> int:
-    """What broke is shown whole, unless it is that stdout takes nothing, as where its disk is full."""
+    """What broke is shown whole, unless it is that stdout takes nothing, or a disk no more."""
     why = refusal_of(sys.stdout) if isinstance(error, OSError) else None
-    if why is None:
-        traceback.print_exc()
-    else:
+    if why is not None:
         leave_unread(sys.stdout)
         print_line(f"stdout: {why}; allowed: a place that takes it")
+    elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        place = error.filename or "a file of --out, of a cache (kernels are kept in one) or in $TMPDIR"
+        print_line(f"{place}: {error.strerror}; allowed: room on that disk")
+    else:
+        traceback.print_exc()
     return PROGRAM_FAILED
 
 
@@ -190,10 +196,8 @@ def _answered(command: Callable[[], object]) -> object:
     try:
         return command()
     except (PlanningError, ClickException) as error:
-        codes = {InputError: "bad_input", NoAnswerError: "no_answer", PlanningError: "program_failed"}
-        code = next((code for kind, code in codes.items() if isinstance(error, kind)), "command_line")
         document = {
-            "code": getattr(error, "code", "") or code,
+            "code": getattr(error, "code", "command_line"),
             "sentence": getattr(error, "what", _line_and_code(error)[0]),
             "where": getattr(error, "where", ""),
             "allowed": getattr(error, "allowed", ""),

@@ -239,6 +239,11 @@ def write_result(summary: Mapping[str, Any], path: Path, out: Path) -> None:
         path: The JSON to write.
         out: The folder in which they lie.
     """
-    document = {**summary, "files": [os.path.relpath(file, out) for file in summary["files"]]}
+    write_json({**summary, "files": [os.path.relpath(file, out) for file in summary["files"]]}, path)
+
+
+def write_json(document: Mapping[str, Any], path: Path) -> Path:
+    """Write a document, whole or not at all; returns its path."""
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    return path

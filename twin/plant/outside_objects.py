@@ -86,7 +86,7 @@ SIDES = (("left", 1.0), ("right", -1.0))
 
 
 def arms(outline: Outline, kind: Arms, at_mm: float, rng: np.random.Generator) -> Iterator[Part]:
-    """Both arms of a patient: flesh with skin, and bones.
+    """Solids of a patient's both arms: flesh with skin, and bones.
 
     Args:
         outline: Of the trunk.
@@ -368,7 +368,6 @@ def loft(rings: Floats) -> TriangleMesh:
 
 
 def _sides(count: int, around: int) -> np.ndarray:
-    """Triangles between neighbouring rings."""
     i, j = np.arange(around), np.roll(np.arange(around), -1)
     band = np.concatenate([np.stack([i, j, j + around], axis=1), np.stack([i, j + around, i + around], axis=1)])
     return np.concatenate([band + k * around for k in range(count - 1)])

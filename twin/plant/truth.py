@@ -18,7 +18,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import ErringArm
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.tables import MarkerSection
 from puncture_twin.planning.formats.points import NamedPoints, parse_points
@@ -40,7 +40,7 @@ class MarkerNoise(NamedTuple):
     ct_mm: float
     """Where a marker is found in the CT."""
     touch_mm: float
-    """Where the robot says it touched it."""
+    """Position of the touch that the robot reports."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,11 +152,11 @@ def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "
     allowed = "3 or more points by the names of the markers and the target, not on a line"
     named = ", ".join(points.names) or "none"
     if len(points) < MIN_MARKERS:
-        raise InputError(f"names in common with the CT: {named}", where=where, allowed=allowed)
+        refuse(f"names in common with the CT: {named}", where, allowed, "too_few_points")
     for side in (points.points_ct, points.points_base):
         spread = np.linalg.svd(side - side.mean(axis=0), compute_uv=False)
         if spread[1] <= COLLINEAR * spread[0]:
-            raise InputError(f"{named} lie on a line", where=where, allowed=allowed)
+            refuse(f"{named} lie on a line", where, allowed, "points_collinear")
     T = np.array(fit_rigid(points.points_ct, points.points_base))
     if target_name in points.names:
         row = points.names.index(target_name)

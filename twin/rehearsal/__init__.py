@@ -1,1 +1,1 @@
-"""A plan executed in the twin, and what it says: where the tip ended, what was touched."""
+"""A plan executed in the twin, and its results: where the tip ended, what was touched."""

@@ -10,15 +10,15 @@ from scipy.special import chdtri
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.geometry.containment import inside_each
-from puncture_twin.planning.reach.standoff import own_lengths
+from puncture_twin.planning.reach.standoff import case_axis_lengths
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touches
-from puncture_twin.planning.registration.noise_test import INTERVAL, NoiseTest
+from puncture_twin.planning.registration.residuals import INTERVAL, NoiseTest
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances
@@ -195,7 +195,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(case, registration)
     if error is None or registration is None:
-        raise InputError("no rooms can be drawn", where=case.path, allowed=ALLOWED)
+        refuse("no rooms can be drawn", case.path, ALLOWED, "no_markers")
     q_touch = touches(case, registration.markers)
     bend = bend_along(context, outward_ct)
     believed = replace(_as_rehearsed(error, q_touch), bend=bend)
@@ -220,7 +220,7 @@ def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
 
 
 def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
-    """The pose error of trials: touches as there, and errors of the estimated size taken as declared."""
+    """The pose error of trials: touches as the trials draw them, errors of the estimated size as if declared."""
     errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
     noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
     test = NoiseTest(fit.test.count, float(fit.test.freedom))
@@ -262,7 +262,9 @@ def _measured(context: CaseContext, query: _Query, trials: Trials, off: Floats, 
 def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:
     """Deviation of each structure's surface as a whole where the needle passes it; of the target's anywhere; mm."""
     checked, outward_ct = model.anatomy.checked, puncture.outward_ct[None]
-    axes = model.engine.measure(puncture.target_ct, outward_ct, own_lengths(model.case, model.anatomy, outward_ct))
+    axes = model.engine.measure(
+        puncture.target_ct, outward_ct, case_axis_lengths(model.case, model.anatomy, outward_ct)
+    )
     normals = normals_of(model.engine.triangles, puncture.target_ct, outward_ct, axes)[0]
     covs = [truth.surface_cov_ct(one.voxel_ct) for one in checked]
     passed = np.nan_to_num(np.sqrt(np.einsum("ka,kab,kb->k", normals, np.array(covs), normals)))
@@ -297,7 +299,7 @@ def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: F
     """
     case, checked = context.case, context.anatomy.checked
     columns, outward_ct = demanding(checked), puncture.outward_ct[None]
-    lengths = own_lengths(case, context.anatomy, outward_ct)[0]
+    lengths = case_axis_lengths(case, context.anatomy, outward_ct)[0]
     distance = context.engine.measure(case.target_ct, outward_ct, lengths).distance[0]
     shift = np.linalg.norm(trials.tip_ct - case.target_ct, axis=1)
     turn = np.linalg.norm(trials.outward_ct - puncture.outward_ct, axis=1)

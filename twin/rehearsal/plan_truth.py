@@ -114,9 +114,8 @@ def spread_rows(found: Distribution, count: int) -> Ints:
 
 def _of_drawn(found: Distribution, row: int, source: str) -> Truth:
     if len(found) == 0:
-        raise NoAnswerError(
-            f"in none of {found.unreached} rooms did the arm reach the pose that its registration asked for"
-        )
+        what = f"in none of {found.unreached} rooms did the arm reach the pose that its registration asked for"
+        raise NoAnswerError(what, code="out_of_reach")
     return drawn_truth(found.puncture, found.trials, row, found.seed, source)
 
 

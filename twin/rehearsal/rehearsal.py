@@ -1,9 +1,9 @@
-"""A plan executed in the twin: the approach by motors, a pause, and the insertion, the patient at their true place.
+"""A plan executed in the twin: the approach by motors, a pause, and the insertion, the patient at their true pose.
 
 What is modelled: rigid bodies, gravity, motor lag and torque limits, joint offsets, a registration that errs; the
 insertion by a spring at the tip, or by the motors (``[rehearsal] control``); where ``[tissue]`` is declared, its force
-on the needle from the skin on, and how far the needle bends, in where the patient lies. What is not: tissue that moves,
-breathing.
+on the needle from the skin on, and the needle's deflection (as a displacement of the patient). What is not: tissue that
+moves, breathing.
 """
 
 from __future__ import annotations
@@ -50,21 +50,22 @@ class TipError:
 
 
 def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsal:
-    """Execute a plan where the truth differs from the belief. The same plan and truth give the same numbers.
+    """Execute a plan where the ground truth differs from the belief; no randomness but that in ``truth``.
 
     Args:
         plan: What was planned on the belief.
         case: The case of the plan.
         anatomy: Its structures.
-        truth: Where the patient lies and what the joints do; all randomness is in it.
+        truth: The patient's pose and the joints' offsets, already drawn.
 
     Raises:
         InputError: The twin has no body of this arm, or its base stands in the patient.
     """
     T_base_ct = truth.T_base_ct_true
     model = plan.model
-    seen = executed(plan, case, anatomy, truth)
-    done, phase = seen.execution, seen.phase
+    # 1. The simulator executes; 2. the true tip follows from its flange poses; 3. tip error, clearances, contacts.
+    measured = executed(plan, case, anatomy, truth)
+    done, phase = measured.execution, measured.phase
     times = done.times_s
     T_ct_flange = np.linalg.inv(T_base_ct) @ done.T_base_flange
     forward_ct = T_ct_flange[:, :3, 2]
@@ -94,8 +95,8 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
         target_true_ct=target_ct.copy(),
         truth_is_belief=bool(np.array_equal(T_base_ct, plan.T_base_ct)),
         control=case.rehearsal.control,
-        off_path_mm=seen.off_path_mm,
-        tissue_force=seen.tissue_force,
+        off_path_mm=measured.off_path_mm,
+        tissue_force=measured.tissue_force,
     )
 
 
@@ -113,7 +114,7 @@ def split_error(tip: Floats, forward: Floats, target: Floats) -> TipError:
 
 
 def _clearance_samples(phase: NDArray[np.str_]) -> NDArray[np.int64]:
-    """Rows of records spread over the insertion, and the last of all."""
+    """Rows of the records at which clearance is measured: spread over the insertion, and the last of all."""
     candidates = np.append(np.flatnonzero(phase == "insertion"), len(phase) - 1)
     spread = np.round(np.linspace(0, len(candidates) - 1, CLEARANCE_SAMPLES)).astype(np.int64)
     return np.unique(candidates[spread])
@@ -122,7 +123,7 @@ def _clearance_samples(phase: NDArray[np.str_]) -> NDArray[np.int64]:
 def _clearances(
     plan: Plan, case: Case, anatomy: Anatomy, tips_ct: Floats, forward_ct: Floats
 ) -> MappingProxyType[str, Floats]:
-    """FCL's distance of the needle's axis to every structure, at every sample, minus the radius."""
+    """Clearance of the needle from every structure at every sample, by FCL: axis distance minus radius, mm."""
     meshes = [structure.mesh for structure in anatomy.structures]
     bounds = [mesh.bounds for mesh in meshes]
     distance = np.empty((len(tips_ct), len(meshes)))
@@ -142,19 +143,19 @@ def _clearances(
 def _contacts(
     case: Case, anatomy: Anatomy, truth: Truth, done: Execution, times_s: Floats, phase: NDArray[np.str_]
 ) -> tuple[RehearsalContact, ...]:
-    """Contacts by the physics at every step, and by FCL at every record, arm and patient at their true places.
+    """Contacts by the physics at every step, and by FCL at every record, arm and patient at their true poses.
 
-    The physics lets the needle pass the skin and the arm pass itself, and rounds large skins; FCL says the first
-    contact of a record only.
+    Two sources, because each misses some: the physics lets the needle pass the skin and the arm pass itself, and
+    simplifies large skins; FCL gives only the first contact of a record.
     """
-    seen = [RehearsalContact(t.time_s, t.link, t.body, t.depth_mm) for t in done.touches]
+    contacts = [RehearsalContact(t.time_s, t.link, t.body, t.depth_mm) for t in done.touches]
     checker = case_checker(case, anatomy, truth.T_base_ct_true)
     inside = (phase == "insertion") | (phase == "hold")
     for time, q, may_touch in zip(times_s.tolist(), done.q + truth.joint_offsets, inside.tolist(), strict=True):
         hit = checker.contact(q, needle_may_touch_patient=may_touch)
         if hit is not None:
-            seen.append(RehearsalContact(time, hit.body, hit.other, float("nan")))
-    return _merged(seen)
+            contacts.append(RehearsalContact(time, hit.body, hit.other, float("nan")))
+    return _merged(contacts)
 
 
 def _merged(contacts: Iterable[RehearsalContact]) -> tuple[RehearsalContact, ...]:
@@ -185,8 +186,8 @@ class Executed:
     Attributes:
         execution: Its records.
         phase: Shape (m,), of each record: "approach", "settle", "insertion" or "hold".
-        off_path_mm: Of the tip from its commanded path, by the encoders, at most from the insertion on.
-        tissue_force: The greatest forces of the tissue; None where none was declared.
+        off_path_mm: Largest distance of the tip from its commanded path, by the encoders, from the insertion on.
+        tissue_force: The greatest forces of the tissue; None where none is declared.
     """
 
     execution: Execution
@@ -204,10 +205,11 @@ def executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executed
     before = np.concatenate([approach, np.repeat(approach[-1:], round(SETTLE_S / TIME_STEP_S), axis=0)])
     start_s = TIME_STEP_S * len(before)
     with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as workcell:
+        # Joint position motors to the standoff and until they are still, then the insertion and its dwell.
         approached = execute(workcell, before, truth.joint_offsets)
         insertion = Insertion(model, tool, T_base_ct[:3, :3] @ down_ct, plan.insertion, DWELL_S)
-        how = case.rehearsal.control
-        inserted = insert(workcell, insertion, how, truth.joint_offsets, start_s=start_s, resistance=tissue)
+        control = case.rehearsal.control
+        inserted = insert(workcell, insertion, control, truth.joint_offsets, start_s=start_s, resistance=tissue)
     done = joined(approached, inserted.execution)
     ends = np.cumsum([len(approach), len(before) - len(approach), len(steps(plan.insertion))])
     row = np.floor(done.times_s / TIME_STEP_S + ROUNDING).astype(np.int64)
@@ -217,20 +219,13 @@ def executed(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Executed
 
 
 def steps(trajectory: Trajectory) -> Floats:
-    """A trajectory at every step of the position motors, shape (n, 6), its end included."""
+    """A trajectory's joints at every step of the position motors, shape (n, 6), rad, its end included."""
     count = int(np.ceil(trajectory.duration_s / TIME_STEP_S)) + 1
     return trajectory.at(TIME_STEP_S * np.arange(count, dtype=np.float64))
 
 
 def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueTissue | None:
-    """The declared tissue on the true axis of the plan's needle; None without tissue, or where it passes none.
-
-    Args:
-        plan: What is executed.
-        case: The case of the plan.
-        anatomy: Its structures.
-        truth: Where the patient lies.
-    """
+    """The declared tissue along the true axis of the needle; None where none is declared or the needle passes none."""
     if case.bending is None:
         return None
     T_base_flange = flange_pose(plan.model, plan.insertion.q[-1] + truth.joint_offsets)
@@ -253,7 +248,7 @@ class Swept:
 
     Attributes:
         times_s: Shape (m,).
-        off_mm: Shape (m,): of the virtual TCP from its point.
+        off_mm: Shape (m,): distance of the virtual TCP from its point.
         contacts: Bodies that touched, such as ("forearm", "patient").
     """
 

@@ -196,7 +196,7 @@ class TouchReading(NamedTuple):
 
 
 class FailedTouch(NamedTuple):
-    """A marker that was not read, the arm back at its standoff: the reason, and the time."""
+    """A marker that was not read, with the reason and the time; the arm is back at its standoff."""
 
     why: str
     seconds: float

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.twin.report.palette import PNG_LEVEL
 
 PIXEL_DPI = 72
@@ -40,8 +42,39 @@ def halo(width: float, colour: str = "white") -> list[Any]:
     return [withStroke(linewidth=width, foreground=colour)]
 
 
+def picture_axes(
+    figure: Figure, image: NDArray[np.uint8], at: tuple[float, float, float, float] = (0, 0, 1, 1)
+) -> Axes:
+    """Axes in an image's own pixels (right, down; 0 is its upper left corner) that hold it.
+
+    Args:
+        figure: Where.
+        image: Shape (h, w) or (h, w, 3).
+        at: Left, lower edge, width and height, of the figure's.
+    """
+    axes, (high, wide) = figure.add_axes(at), image.shape[:2]
+    axes.set_axis_off()
+    axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, wide, high, 0), interpolation="lanczos", aspect="auto")
+    axes.set_autoscale_on(False)
+    return axes
+
+
+def ring(axes: Axes, at: Any, radius: float, colour: Rgb, text: str = "", width: float = 2.0) -> None:
+    """A ring of so many pixels about a point, with words beside it."""
+    axes.plot(
+        *at, "o", markersize=2 * radius, markerfacecolor="none", markeredgecolor=css(colour), markeredgewidth=width
+    )
+    look: dict[str, Any] = {"color": css(colour), "fontsize": 15, "va": "center", "path_effects": halo(3)}
+    axes.annotate(text, at, (radius + 4, 0), textcoords="offset points", **look)
+
+
+def cross(axes: Axes, at: Any, size: float, colour: Rgb, shape: str = "+") -> None:
+    """A cross of so many pixels to each side."""
+    axes.plot(*at, shape, ms=2 * size, mec=css(colour), mew=2)
+
+
 def pixels(figure: Figure) -> NDArray[np.uint8]:
-    """What a figure shows, shape (h, w, 4), RGB and opacity."""
+    """A figure's pixels, shape (h, w, 4), RGB and opacity."""
     buffer, (width, height) = FigureCanvasAgg(figure).print_to_buffer()  # type: ignore[no-untyped-call]  # no types
     return np.frombuffer(bytes(buffer), dtype=np.uint8).reshape(height, width, 4)
 

@@ -43,9 +43,6 @@ RING_SLACK = 1e-7
 HALF_CELL_SLACK = 1e-6
 """Share by which rounding may widen half a cell."""
 
-CLEAR = 1e-9
-"""rad; a direction this far within a cell is in it whatever rounding did."""
-
 
 class RimLabel(NamedTuple):
     """A body direction at the rim: its text and its angle on the picture, counter-clockwise from the right."""
@@ -176,17 +173,14 @@ class MapCells:
     def rows(self, theta: Floats, beta: Floats) -> NDArray[np.int64]:
         """The candidate at each direction (rad, β in 0..2π), -1 outside the grid; same shape as ``theta``."""
         theta, beta = np.asarray(theta, dtype=float), np.asarray(beta, dtype=float)
-        found = _find_rows(*self._arrays, theta.ravel(), beta.ravel())  # type: ignore[call-arg]  # numba infers
+        cells = self.rows_in_order, self.beta, self.starts, self.heights, self.half_theta, self.half_beta
+        found = _find_rows(*cells, theta.ravel(), beta.ravel())
         return np.asarray(found).reshape(theta.shape)
 
     def picture(self, view: MapView, size: int) -> NDArray[np.int64]:
         """The candidate under the middle of each pixel of a square picture of the disc, shape (size, size)."""
-        found = _find_picture(*self._arrays, view.turn, view.theta_max, size)  # type: ignore[call-arg]  # numba infers
-        return np.asarray(found)
-
-    @property
-    def _arrays(self) -> Any:
-        return self.rows_in_order, self.beta, self.starts, self.heights, self.half_theta, self.half_beta
+        middles = (np.arange(size) + 0.5) / size * 2 - 1
+        return self.rows(*view.angles_at(np.stack(np.meshgrid(middles, -middles), axis=-1)))
 
 
 @nb.njit(cache=True)
@@ -196,58 +190,6 @@ def _find_rows(rows, betas, starts, heights, half_theta, half_beta, theta, beta)
         cell = _find_cell(betas, starts, heights, half_theta, half_beta, theta[i], beta[i])
         found[i] = rows[cell] if cell >= 0 else -1
     return found
-
-
-@nb.njit(cache=True)
-def _find_picture(rows, betas, starts, heights, half_theta, half_beta, turn, theta_max, size):  # type: ignore[no-untyped-def]  # numba infers
-    """Most pixels are well within the cell of the pixel before: only for the others is it searched for."""
-    insides = _insides(betas, starts, heights, half_theta, half_beta, turn)
-    found = np.empty((size, size), dtype=np.int64)
-    for line in range(size):
-        y, cell = 1.0 - (line + 0.5) / size * 2, -1
-        for column in range(size):
-            x = (column + 0.5) / size * 2 - 1
-            if cell < 0 or not _well_within(insides, cell, x, y, theta_max):
-                theta = np.hypot(x, y) * theta_max
-                if theta > heights[-1] + half_theta + CLEAR:
-                    cell = -1
-                else:
-                    beta = np.mod(np.arctan2(y, x) - turn, 2 * np.pi)
-                    cell = _find_cell(betas, starts, heights, half_theta, half_beta, theta, beta)
-            found[line, column] = rows[cell] if cell >= 0 else -1
-    return found
-
-
-@nb.njit(cache=True)
-def _insides(betas, starts, heights, half_theta, half_beta, turn):  # type: ignore[no-untyped-def]  # numba infers
-    """Where each cell lies, and how far from its middle a direction is in it for sure, shape (n, 5).
-
-    Its θ, half its height, cosine and sine of its azimuth on the picture, sine of half its width, less ``CLEAR``.
-    """
-    insides = np.empty((len(betas), 5))
-    for ring in range(len(heights)):
-        high = half_theta
-        if ring > 0:
-            high = min(high, (heights[ring] - heights[ring - 1]) / 2)
-        if ring + 1 < len(heights):
-            high = min(high, (heights[ring + 1] - heights[ring]) / 2)
-        begin, end = starts[ring], starts[ring + 1]
-        for i in range(begin, end):
-            before = betas[i - 1] if i > begin else betas[end - 1] - 2 * np.pi
-            after = betas[i + 1] if i + 1 < end else betas[begin] + 2 * np.pi
-            wide = min(half_beta[ring], (betas[i] - before) / 2, (after - betas[i]) / 2, np.pi / 2)
-            insides[i, 0], insides[i, 1], insides[i, 4] = heights[ring], high - CLEAR, np.sin(wide - CLEAR)
-            insides[i, 2], insides[i, 3] = np.cos(betas[i] + turn), np.sin(betas[i] + turn)
-    return insides
-
-
-@nb.njit(cache=True)
-def _well_within(insides, cell, x, y, theta_max):  # type: ignore[no-untyped-def]  # numba infers
-    """Whether a place (x right, y up) in the disc lies within a cell, and not so near its border that this may err."""
-    radius, cosine, sine = np.sqrt(x * x + y * y), insides[cell, 2], insides[cell, 3]
-    if abs(radius * theta_max - insides[cell, 0]) >= insides[cell, 1]:
-        return False
-    return cosine * x + sine * y > 0.0 and abs(cosine * y - sine * x) < radius * insides[cell, 4]
 
 
 @nb.njit(cache=True)
@@ -270,7 +212,7 @@ def _find_cell(betas, starts, heights, half_theta, half_beta, theta, beta):  # t
 
 @nb.njit(cache=True)
 def _first_not_below(values, begin, end, value):  # type: ignore[no-untyped-def]  # numba infers
-    """Where in ``values[begin:end]``, which ascend, the first stands that is not below a value; ``end`` if none is."""
+    """Index of the first of ascending ``values[begin:end]`` that is not below a value; ``end`` if none is."""
     while begin < end:
         middle = (begin + end) // 2
         if values[middle] < value:

@@ -25,6 +25,7 @@ from puncture_twin.planning.place.mounts import Region, ring_weights
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import body_directions, step_of
 from puncture_twin.twin.report.palette import reason_of
+from puncture_twin.twin.report.present import number
 
 TRUTH_IS_BELIEF = (
     "in this rehearsal the patient lies exactly where they are believed to lie: what the tip misses is the joints' "
@@ -98,14 +99,6 @@ def needle_text(case: Any) -> str:
     return f"needle ⌀ {n.diameter_mm:g} mm, shaft {n.shaft_mm:g} mm, tip to flange {n.length_mm:g} mm"
 
 
-def number(value: float, digits: int = 1, unit: str = "") -> str:
-    """A number for people; a dash where there is none."""
-    if not math.isfinite(value):
-        return "–"
-    text = f"{value:.{digits}f}".replace("-", "−")
-    return f"{text} {unit}" if unit else text
-
-
 def clearance_text(clearance_mm: float, unit: str = "") -> str:
     """A clearance, or that the needle crosses the structure, of which a clearance below zero says too little."""
     return "crossed" if clearance_mm < 0 else number(clearance_mm, 1, unit)
@@ -114,11 +107,6 @@ def clearance_text(clearance_mm: float, unit: str = "") -> str:
 def expected_text(error_mm: float) -> str:
     """An expected error (rms), or why there is none."""
     return number(error_mm, 2, "mm") if math.isfinite(error_mm) else "unknown (no markers)"
-
-
-def percent(fraction: float) -> str:
-    """A share 0..1 in percent; what is there never reads as zero."""
-    return "<0.1 %" if 0 < fraction < 0.0005 else f"{100 * fraction:.1f} %"
 
 
 def arm_text(candidates: Candidates) -> str:
@@ -145,7 +133,7 @@ NEARLY = 0.985
 
 
 def direction_text(direction_ct: Floats, space: str) -> str:
-    """What a person calls a direction, such as "the patient's left"; "" where no name fits.
+    """Name of a direction for a person, such as "the patient's left"; "" where none fits.
 
     Args:
         direction_ct: Shape (3,), unit.

@@ -15,7 +15,7 @@ from puncture_twin.planning.arm.links import address_file, collision_links, mode
 from puncture_twin.planning.arm.tool import Tool, ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.mesh import joined
 from puncture_twin.twin.world.client import to_m, write_obj
 
@@ -39,11 +39,6 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     """Write the arm with holder and needle as a URDF that PyBullet can load, and its collision pieces next to it.
 
     The collision bodies are the planner's own: convex pieces that contain each link.
-
-    Args:
-        model: The arm.
-        tool: What the flange carries.
-        folder: Where to write.
 
     Returns:
         The URDF's path.
@@ -74,7 +69,7 @@ def _check_weights(urdf: ArmUrdf) -> None:
         if not any(member.link.weighs for member in members):
             what = "it states no mass and inertia above 0, without which nothing can be simulated"
             here = f"{urdf.where}: link '{members[0].link.name}'"
-            raise InputError(what, where=here, allowed="an <inertial> of every moving link")
+            refuse(what, here, "an <inertial> of every moving link", "no_inertia")
 
 
 def _simplify(robot: ET.Element) -> None:

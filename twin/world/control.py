@@ -33,7 +33,7 @@ from puncture_twin.planning.arm.links import model_urdf
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.twin.world.arm import Arm, load_arm
@@ -154,9 +154,7 @@ class Admittance:
     def __init__(self, model: UrModel, tip_m: float, virtual: VirtualMass, dt: float) -> None:
         decay = virtual.damping_ns_m * dt / virtual.mass_kg
         if not decay < MOST_DECAY:
-            raise InputError(
-                f"D dt / M = {decay:.2f} would diverge", where="admittance", allowed=f"below {MOST_DECAY:g}"
-            )
+            refuse(f"D dt / M = {decay:.2f} would diverge", "admittance", f"below {MOST_DECAY:g}", "control_unstable")
         self.dt = dt
         self._model, self._tip_m, self._virtual = model, tip_m, virtual
         self._place, self._velocity = np.zeros(3), np.zeros(3)
@@ -313,12 +311,11 @@ def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> No
     """
     ratio = stability_ratio(stiffness, J, M, dt)
     if not ratio < MOST_RATIO:
-        raise InputError(
+        what = (
             f"a stiffness of {stiffness.translation_n_m:g} N/m at steps of {1e3 * dt:g} ms would diverge: "
-            f"sqrt(K/m) dt = {ratio:.2f}",
-            where="impedance",
-            allowed=f"below {MOST_RATIO}: less stiffness or a shorter step",
+            f"sqrt(K/m) dt = {ratio:.2f}"
         )
+        refuse(what, "impedance", f"below {MOST_RATIO}: less stiffness or a shorter step", "control_unstable")
 
 
 @dataclass(frozen=True, eq=False)

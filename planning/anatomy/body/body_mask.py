@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.cut_ends import Box, Content, content_of, shifted, spacing_of
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown, TableSide, touching_tables
-from puncture_twin.planning.anatomy.body.unscanned import Unscanned, find_unscanned, measured_hu
+from puncture_twin.planning.anatomy.body.unscanned import find_unscanned, measured_hu
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, grown
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume, canonical, in_order
 from puncture_twin.planning.geometry.parts import largest_part, middle_of, parts_of
 
@@ -52,13 +52,9 @@ MIN_BONE_ML = 1.0
 ALIKE = 0.9
 """Overlap (intersection over union) of sections with the median one, from which on a part is one section drawn along
 the bed."""
-PADDED = (
-    "where nothing was scanned the image is filled up with one value, and that cuts the body; no skin is known there, "
-    "no body that the arm could meet, and what is filled up is unknown_region (outside_body)"
-)
-CIRCLE = (
-    "the scanner's field of view (a circle in the image) cuts the body; no skin is known there, "
-    "and no body that the arm could meet"
+UNSCANNED = (
+    "what was not scanned (beyond the scanner's field of view, or filled up with one value) cuts the body; no skin is "
+    "known there, no body that the arm could meet, and what is near to it is unknown_region (outside_body)"
 )
 
 
@@ -90,7 +86,7 @@ class CtImage:
         where: The file.
         shown: What a person says that it shows.
         as_stored: Shape of ``hu``, as the file has them, where that differs.
-        measured: What was not, where that is known.
+        not_measured: Shape of ``hu``, what was not, where that is known.
     """
 
     hu: NDArray[Any]
@@ -98,7 +94,7 @@ class CtImage:
     where: Path
     shown: Shown = PATIENT
     as_stored: NDArray[Any] | None = None
-    measured: Unscanned | None = None
+    not_measured: Bools | None = None
 
     @property
     def stored(self) -> NDArray[Any]:
@@ -117,12 +113,12 @@ class CtImage:
         Raises:
             InputError: See `body_mask`.
         """
-        return body_mask(self.hu, self.spacing_mm, where=self.where, shown=self.shown, measured=self.unscanned)
+        return body_mask(self.hu, self.spacing_mm, where=self.where, shown=self.shown, unscanned=self.unscanned)
 
     @cached_property
-    def unscanned(self) -> Unscanned:
+    def unscanned(self) -> Bools:
         """What was not measured."""
-        return self.measured or find_unscanned(self.hu)
+        return find_unscanned(self.hu) if self.not_measured is None else self.not_measured
 
     @property
     def content(self) -> Content:
@@ -142,8 +138,8 @@ def ct_image(volume: Volume) -> CtImage:
     """A CT in Hounsfield units, whichever way its file runs."""
     oriented = canonical(volume.values, volume.T_ct_index)
     stored = in_order(oriented.values, np.int16 if np.can_cast(oriented.values.dtype, np.int16) else np.float32)
-    hu, measured = measured_hu(stored)
-    return CtImage(hu, oriented.T_ct_index, volume.path, as_stored=stored, measured=measured)
+    hu, not_measured = measured_hu(stored)
+    return CtImage(hu, oriented.T_ct_index, volume.path, as_stored=stored, not_measured=not_measured)
 
 
 def body_mask(
@@ -152,7 +148,7 @@ def body_mask(
     *,
     where: str | Path,
     shown: Shown = PATIENT,
-    measured: Unscanned | None = None,
+    unscanned: Bools | None = None,
 ) -> BodyMask:
     """Finds the patient, or the phantom, in a CT.
 
@@ -165,19 +161,15 @@ def body_mask(
         spacing_mm: Shape (3,).
         where: For messages.
         shown: What a person says of the image.
-        measured: What was not, where that is known.
+        unscanned: What was not measured, where that is known.
 
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
     """
     body, tables, warnings = _found(hu, spacing_mm, where, shown)
-    unscanned, padded = measured or find_unscanned(hu)
-    if unscanned.any():
-        ends = grown(body) & unscanned & ~body
-        if (ends & padded).any():
-            warnings.append(PADDED)
-        if (ends & ~padded).any():
-            warnings.append(CIRCLE)
+    unscanned = find_unscanned(hu) if unscanned is None else unscanned
+    if unscanned.any() and (grown(body) & unscanned & ~body).any():
+        warnings.append(UNSCANNED)
     return BodyMask(body, unscanned, tuple(warnings), tables)
 
 
@@ -192,8 +184,7 @@ def _found(
         trunk[first.box] = largest_part(first.mask)
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
-        allowed = f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body"
-        raise InputError(what, where=where, allowed=allowed)
+        refuse(what, where, f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body", "no_body")
     warnings: list[str] = []
     tables: tuple[TableSide, ...] = ()
     if shown.tables:
@@ -209,7 +200,7 @@ def _found(
         filled[box] |= filled_slices(limb)
     _fill_cut_lungs(filled, hu, voxel_ml, warnings)
     if filled.all():
-        raise InputError("no air around the body", where=where, allowed="a CT that shows the skin somewhere")
+        refuse("no air around the body", where, "a CT that shows the skin somewhere", "no_air")
     return filled, tables, warnings
 
 
@@ -283,32 +274,15 @@ def thick_parts(mask: Bools, spacing_mm: Floats) -> Iterator[Piece]:
 def _coarse_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
     """Number the parts into which the ball fits, 1 the largest, and what lies near each; 0 elsewhere."""
     reach = np.ceil(OPENING_MM / spacing_mm).astype(int)
-    cores = parts_of(_eroded(np.pad(mask, [(r, r) for r in reach], mode="edge"), spacing_mm))
+    padded = np.pad(mask, [(r, r) for r in reach], mode="edge")
+    cores = parts_of(scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm) > OPENING_MM)
     rank = np.argsort(np.argsort(-cores.sizes, kind="stable"), kind="stable").astype(np.int32)
     numbers = cores.painted(rank + 1)
     if not len(rank):
         return np.zeros(mask.shape, np.int32)
-    nearest = scipy.ndimage.distance_transform_edt(
-        numbers == 0, sampling=spacing_mm, return_distances=False, return_indices=True
-    )
-    gap = np.zeros(numbers.shape, np.float32)
-    for axis, at in enumerate(nearest):
-        along = np.moveaxis(at, axis, -1) - np.arange(numbers.shape[axis], dtype=np.int32)
-        gap += np.moveaxis(np.square(along * np.float32(spacing_mm[axis])), -1, axis)
-    parts = np.where(gap <= (CORNER * OPENING_MM + spacing_mm.max()) ** 2, numbers[tuple(nearest)], 0)
+    gap_mm, nearest = scipy.ndimage.distance_transform_edt(numbers == 0, sampling=spacing_mm, return_indices=True)
+    parts = np.where(gap_mm <= CORNER * OPENING_MM + spacing_mm.max(), numbers[tuple(nearest)], 0)
     return np.asarray(parts[tuple(slice(r, -r) for r in reach)])
-
-
-def _eroded(mask: Bools, spacing_mm: Floats) -> Bools:
-    """Where the ball fits."""
-    fits, size = mask.copy(), mask.shape
-    reach = np.floor(OPENING_MM / spacing_mm).astype(int)
-    for by in itertools.product(*(range(-r, r + 1) for r in reach)):
-        if np.linalg.norm(by * spacing_mm) <= OPENING_MM:
-            into = tuple(slice(max(0, -k), n - max(0, k)) for k, n in zip(by, size, strict=True))
-            out_of = tuple(slice(max(0, k), n - max(0, -k)) for k, n in zip(by, size, strict=True))
-            fits[into] &= mask[out_of]
-    return fits
 
 
 def detached_limbs(hu: NDArray[np.float32], parts: Iterable[Piece], spacing_mm: Floats) -> tuple[Piece, ...]:

@@ -1,4 +1,4 @@
-"""Where an image was cut through the body, and filled up with air behind the face at which it was cut.
+"""Images cut through the body and filled up with air: the faces at which they were cut.
 
 Resampling, padding to a common size and some exports lay air around an image, with the noise of a scanner or without.
 Then no face of the file cuts the body, and the face at which it was cut looks like skin. But no body ends by itself as
@@ -122,7 +122,7 @@ class Content:
 
 
 def content_of(dense: Bools, T_ct_index: Floats) -> Content:
-    """Where what is denser than air ends in an image, and how.
+    """Measure where, and how, what is denser than air ends in an image.
 
     Args:
         dense: Shape (nx, ny, nz), axes running to the left, back and head.
@@ -213,7 +213,7 @@ def stated_ends(names: Iterable[str]) -> Bools:
 
 
 def end_warnings(content: Content, cut: Bools, whole: bool) -> tuple[str, ...]:
-    """What was left out behind cut faces, and which flat ends of a phantom were taken for its own."""
+    """Warnings of what was left out behind cut faces, and of flat ends of a phantom that count as its own."""
     filled = cut & (content.beyond > 0)
     flat = np.array([[False], [False], [whole]]) & content.thick & content.wide & (content.beyond > 0) & ~cut
     said = []

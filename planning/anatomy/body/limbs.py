@@ -1,9 +1,9 @@
 """Limbs that are pressed against the trunk: one body in the CT, but no way for a needle to go from one into the other.
 
-Between an arm and the trunk that it touches there is skin, which a CT does not show. Three things tell them apart: the
-neck (a ball that fits into either does not fit through where they touch); a straight long bone beside the trunk,
-lateral to all others; and a bone with air on many sides. A rib lies below skin that is nearly flat: of a sphere about
-it, 1.6 times as wide as it is deep, .19 is air, however it runs. About a forearm's bones it is a third and more.
+Between an arm and the trunk that it touches there is skin, which a CT does not show. Two things tell them apart: the
+neck (a ball that fits into either does not fit through where they touch), and a bone with air on many sides. A rib lies
+below skin that is nearly flat: of a sphere about it, 1.6 times as wide as it is deep, .19 is air, however it runs.
+About a forearm's bones it is a third and more.
 
 Labels explain bones: what has a known name is no evidence, unless that is an arm's, or of bones altogether; beyond a
 neck a leg's bone is evidence too. No part that is larger than a limb can be is one, nor the part that holds the target,
@@ -16,6 +16,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, CtImage
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
-from puncture_twin.planning.anatomy.second_witness import Named
+from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 
@@ -51,11 +52,8 @@ PARTLY, EXPOSED = 0.26, 0.32
 median is .30 at most, of forearms across drawn trunks .33 and more."""
 LEAST_MM = 60.0
 """Length of a limb's bones. A nose's, a collar bone's visible end and a spinous process's are shorter."""
-STRAIGHT_MM, TILT, WIDTH_MM = 6.0, 0.7, (5.0, 40.0)
-"""A long bone beside the trunk keeps so near to a line, which leans so little against the bed (mm per mm; a rib
-descends at 45 degrees), and is so wide."""
-ASIDE, LATERAL_FRACTION = 0.5, 0.8
-"""It lies so far from the middle, of the half width; in so many slices no other bone of its side is more lateral."""
+LINE_MM = 12.0
+"""What continues a limb's bone keeps so near to its line."""
 FLAT, SLACK_MM = 1.25, 5.0
 """From its bone a limb that is pressed flat reaches so many times as far as the air is away, and so much farther: that
 holds .994 and more of the arms of drawn patients, beside two thirds as much of the trunk at most."""
@@ -74,7 +72,6 @@ class LimbSearch:
         solid: Same shape, body, and what was not scanned: neither is air.
         bone: Same shape, bone that is evidence of a limb; a block counts where an eighth of it is, which noise is not.
         limb_bone: Same shape, a leg's named bone too: such is a limb's beyond a neck, and the trunk's in a hip.
-        every_bone: Same shape, named bone too.
         spacing_mm: Shape (3,).
         T_ct_index: Shape (4, 4), LPS mm.
         at: The target's block.
@@ -84,19 +81,13 @@ class LimbSearch:
     solid: Bools
     bone: Bools
     limb_bone: Bools
-    every_bone: Bools
     spacing_mm: Floats
     T_ct_index: Floats
     at: tuple[int, int, int]
 
-    @property
-    def block_ml(self) -> float:
-        """Of one block."""
-        return float(np.prod(self.spacing_mm)) / 1000.0
-
     def volume_ml(self, mask: Bools) -> float:
         """Of a mask."""
-        return float(np.count_nonzero(mask)) * self.block_ml
+        return float(np.count_nonzero(mask) * np.prod(self.spacing_mm)) / 1000.0
 
     @cached_property
     def depth_mm(self) -> Floats:
@@ -111,7 +102,7 @@ class LimbSearch:
             return found
         for part in self._beyond_necks():
             found |= part
-        for bones in (*self._rods(), *self._exposed()):
+        for bones in self._exposed():
             found |= self._about(bones)
         return found & self.body
 
@@ -125,24 +116,20 @@ class LimbSearch:
             if number != owner[self.at] and small and self.volume_ml(part & self.limb_bone) >= MIN_BONE_ML:
                 yield part
 
-    def _near_skin(self) -> Bools:
-        deepest = min(DEEPEST_MM, DEEPEST_FRACTION * float(self.depth_mm[self.body].max()))
-        return np.asarray(self.bone & (self.depth_mm <= deepest))
-
     def _exposed(self) -> Iterator[Bools]:
         """Bones about which air is on more sides than about a bone of the trunk, of one limb each."""
-        near = self._near_skin()
-        air = np.zeros(self.body.shape)
+        deepest = min(DEEPEST_MM, DEEPEST_FRACTION * float(self.depth_mm[self.body].max()))
+        near, air = self.bone & (self.depth_mm <= deepest), np.zeros(self.body.shape)
         air[near] = self._air_about(np.argwhere(near))
-        groups = _groups(air >= PARTLY, self.spacing_mm)
-        for number, box in enumerate(scipy.ndimage.find_objects(groups), start=1):
-            if box is None:
-                continue
-            group = groups[box] == number
-            exposed = np.argwhere(group & (air[box] >= EXPOSED)) * self.spacing_mm
-            enough = len(exposed) * self.block_ml >= MIN_BONE_ML and np.linalg.norm(np.ptp(exposed, axis=0)) >= LEAST_MM
-            if enough and np.median(air[box][group]) >= EXPOSED:
-                yield self._along(groups == number)
+        partly = air >= PARTLY
+        gap_mm = scipy.ndimage.distance_transform_edt(~partly, sampling=self.spacing_mm)
+        groups, count = scipy.ndimage.label(gap_mm <= GAP_MM / 2.0, FULL)
+        for number in range(1, count + 1) if partly.any() else ():
+            group = partly & (groups == number)
+            exposed = group & (air >= EXPOSED)
+            long = exposed.any() and np.linalg.norm(np.ptp(np.argwhere(exposed), axis=0) * self.spacing_mm) >= LEAST_MM
+            if long and self.volume_ml(exposed) >= MIN_BONE_ML and np.median(air[group]) >= EXPOSED:
+                yield self._along(group)
 
     def _along(self, bones: Bools) -> Bools:
         """With what continues them in a line, where the limb lies deeper."""
@@ -152,7 +139,7 @@ class LimbSearch:
         off_mm = index * self.spacing_mm - middle
         off_mm -= np.outer(off_mm @ axis, axis)
         line = bones.copy()
-        line[tuple(index[np.linalg.norm(off_mm, axis=1) <= 2.0 * STRAIGHT_MM].T)] = True
+        line[tuple(index[np.linalg.norm(off_mm, axis=1) <= LINE_MM].T)] = True
         return line
 
     def _air_about(self, index: NDArray[np.int64]) -> Floats:
@@ -166,39 +153,6 @@ class LimbSearch:
             at = np.clip(np.rint(index + radius_mm[:, None] * direction / self.spacing_mm).astype(int), 0, last)
             air += ~self.solid[tuple(at.T)]
         return air / DIRECTIONS
-
-    def _rods(self) -> Iterator[Bools]:
-        """Straight long bones along the bed, near the skin and lateral to all other bones."""
-        labels, _ = scipy.ndimage.label(self.bone, FULL)
-        for number, box in enumerate(scipy.ndimage.find_objects(labels), start=1):
-            if (box[2].stop - box[2].start) * self.spacing_mm[2] >= LEAST_MM:
-                bone = labels == number
-                if self._is_straight(bone) and self._is_lateral(bone):
-                    yield bone
-
-    def _is_straight(self, bone: Bools) -> bool:
-        slices = np.flatnonzero(bone.any(axis=(0, 1)))
-        filled = [scipy.ndimage.binary_fill_holes(bone[:, :, k]) for k in slices]
-        area_mm2 = np.median([np.count_nonzero(section) for section in filled]) * np.prod(self.spacing_mm[:2])
-        middle_mm = np.array([scipy.ndimage.center_of_mass(section) for section in filled]) * self.spacing_mm[:2]
-        z_mm = slices * self.spacing_mm[2]
-        line = np.polynomial.polynomial.polyfit(z_mm, middle_mm, 1)
-        off_mm = np.linalg.norm(middle_mm - np.polynomial.polynomial.polyval(z_mm, line).T, axis=1)
-        straight = np.percentile(off_mm, 90) <= STRAIGHT_MM and np.linalg.norm(line[1]) <= TILT
-        return bool(straight and WIDTH_MM[0] <= 2.0 * np.sqrt(area_mm2 / np.pi) <= WIDTH_MM[1])
-
-    def _is_lateral(self, bone: Bools) -> bool:
-        """Whether it is near the skin everywhere, and in most slices no bone lies farther from the body's middle."""
-        lateral, depths = [], []
-        for k in np.flatnonzero(bone.any(axis=(0, 1))):
-            x, y = np.rint(scipy.ndimage.center_of_mass(bone[:, :, k])).astype(int)
-            first, last = np.flatnonzero(self.body[:, :, k].any(axis=1))[[0, -1]]
-            outward = 1.0 if 2.0 * x > first + last else -1.0
-            others = outward * np.flatnonzero(self.every_bone[:, :, k].any(axis=1))
-            beyond_mm = (others.max() - outward * x) * self.spacing_mm[0]
-            lateral.append(abs(2.0 * x - first - last) >= ASIDE * (last - first) and beyond_mm <= WIDTH_MM[1])
-            depths.append(self.depth_mm[x, y, k])
-        return max(depths) <= DEEPEST_MM and float(np.mean(lateral)) >= LATERAL_FRACTION
 
     def _about(self, bones: Bools) -> Bools:
         """What may belong to the limb about some bones, also some way beyond their ends; nothing about the target."""
@@ -230,15 +184,15 @@ def limb_search(image: CtImage, body: Bools, target_ct: Floats, structures: Sequ
     T[:3, 3] += T[:3, :3] @ ((stride - 1) / 2.0)
     T[:3, :3] *= stride
     coarse = _share(body, stride) > 0.0
-    every_bone = _share(body & (image.hu > BONE_HU), stride) >= 0.125
     index = np.rint(np.linalg.solve(T, np.append(target_ct, 1.0))[:3]).astype(int)
     x, y, z = np.clip(index, 0, np.array(coarse.shape) - 1)
     labels, _ = scipy.ndimage.label(coarse)
     part = coarse & (labels == labels[x, y, z])
-    solid = coarse | (_share(image.unscanned.voxels, stride) >= 0.5)
+    solid = coarse | (_share(image.unscanned, stride) >= 0.5)
+    every_bone = _share(body & (image.hu > BONE_HU), stride) >= 0.125
     legs, others = _explained(every_bone, T, structures)
     bone, limb_bone = (every_bone & part & ~named for named in (legs | others, others))
-    return LimbSearch(part, solid, bone, limb_bone, every_bone, image.spacing_mm * stride, T, (int(x), int(y), int(z)))
+    return LimbSearch(part, solid, bone, limb_bone, image.spacing_mm * stride, T, (int(x), int(y), int(z)))
 
 
 def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[Named]) -> tuple[Bools, Bools]:
@@ -263,26 +217,10 @@ def _axis(points: Floats) -> tuple[Floats, Floats]:
 
 def _share(mask: Bools, stride: NDArray[np.int_]) -> Floats:
     """How much of each block a mask fills; 0..1."""
-    counts: NDArray[np.integer] = mask.view(np.uint8)
-    most = np.ones(1)
+    counts: NDArray[Any] = mask.view(np.uint8)
     for axis, times in enumerate(stride):
-        blocks = np.add.reduceat(np.ones(mask.shape[axis]), np.arange(0, mask.shape[axis], times))
-        most = most[..., None] * blocks
-        source = np.moveaxis(counts, axis, 0)
-        found = np.zeros((len(blocks), *source.shape[1:]), np.min_scalar_type(int(np.prod(stride))))
-        for first in range(times):
-            found[: len(source[first::times])] += source[first::times]
-        counts = np.moveaxis(found, 0, axis)
-    return counts / most[0]
-
-
-def _groups(mask: Bools, spacing_mm: Floats) -> Ints32:
-    """Numbers of voxels that hold together across gaps of ``GAP_MM``, 0 outside of the mask."""
-    if not mask.any():
-        return np.zeros(mask.shape, np.int32)
-    gap = scipy.ndimage.distance_transform_edt(~mask, sampling=spacing_mm)
-    labels, _ = scipy.ndimage.label(gap <= GAP_MM / 2.0, FULL)
-    return np.asarray(np.where(mask, labels, 0), dtype=np.int32)
+        counts = np.add.reduceat(counts, np.arange(0, mask.shape[axis], times), axis=axis, dtype=np.uint16)
+    return counts / np.prod(stride)
 
 
 def _nearest_core(body: Bools, spacing_mm: Floats) -> Ints32:

@@ -1,10 +1,9 @@
-"""What a body lies on: tables, cradles and pads, touching it or not, and what of them the image does not show.
+"""What a body lies on: tables, cradles, boards and pads, touching it or not, and what of them the image does not show.
 
-A scanner's table has the same section in every slice; a patient has not. Seen from its far side it is one line, drawn
-along the bed, which may run at an angle to the slices' axis (a tilted gantry). Nothing comes from beyond that line.
-Where the table touches a body as dense as itself and is wider, its thickness is seen beside the body, and it is cut off
-there: what is left is the body. A board that touches along a part of the image ends it in a plane: no skin is flat over
-a hand's breadth, unless it is pressed flat.
+A table has one section, drawn along the bed; a patient has not. Seen from its far side it ends at one line in most
+slices, or along a hand's breadth, at the same angle to the slices' axis everywhere. Nothing comes from beyond that
+line. Where the table touches a body as dense as itself and is wider, its thickness is seen beside the body, and it is
+cut off there: what is left is the body.
 
 A body that has one section at all four sides is no table, whatever it lies on: it is a phantom, or a part of one.
 """
@@ -14,7 +13,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -23,63 +22,57 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.parts import ends_of, middle_of, parts_of
 
-FLAT_MM = 1.0
-"""A side is flat where it keeps within this of one plane; noise moves the surface of a 5 mm voxel by some 0.2 mm."""
-FLAT_WIDTH_MM = 100.0
-"""Over so much of its width, in enough slices. A round back with a radius of 1.2 m is as flat."""
-FLAT_LENGTH_MM = 50.0
-"""Enough are half of the slices, or all along so much of the bed: a board may be shorter than the image."""
-BEYOND_FRACTION = 0.01
-"""Of a side's surface: more of it beyond the plane, and the plane is a step, such as a table's top beside the body."""
-SIDES = {(0, 0): "right", (0, -1): "left", (1, 0): "front", (1, -1): "back"}
-"""Names of the sides by array axis and end, axes running to the left, back and head."""
 DRAWN_MM = 0.75
-"""A line of sight is drawn where the surface keeps within this of its median; noise moves it by some 0.3 mm."""
+"""A line of sight is drawn where the surface keeps within this of one line; noise moves it by some 0.3 mm."""
 DRAWN_FRACTION = 0.8
-"""Of the slices at least. Seen from its far side nothing lies before a table."""
-DRAWN_WIDTH_MM = 100.0
-"""Over so much of its width together. Of a real abdomen in air no side keeps to a line over more than 63 mm."""
-BESIDE_WIDTH_MM = 20.0
-"""Where one side is drawn, so much suffices for those beside it: where a cradle rises steeply it is seen from there."""
-RUN_MM = 20.0
-"""Single lines of sight may be drawn by chance; a table has runs of this width."""
+"""Of the slices at least."""
+FLAT_LENGTH_MM, BEYOND_FRACTION = 50.0, 0.01
+"""Where lines of sight end in one plane, along so much of the bed is enough: a board may be shorter than the image, and
+a round back as flat over 100 mm has a radius of 1.2 m. More of the side beyond it, and the plane is a step."""
+DRAWN_WIDTH_MM, RUN_MM = 100.0, 20.0
+"""Over so much of its width together, of runs of so much: single lines of sight may be drawn by chance. Of a real
+abdomen in air no side keeps to a line over more than 63 mm."""
 SMOOTH_ALONG_MM = 12.0
 """Ends are averaged so far along the bed: a table is constant there, noise is not."""
 THICKEST_MM, ALIKE_MM = 80.0, 5.0
 """No table is thicker, and beside the body it is as thick to so much all over."""
 LEAST_LENGTH_MM = 50.0
-"""In a shorter image every body is nearly one section along the bed: tables that touch it are not told."""
+"""In a shorter image every body is nearly one section along the bed: tables are not told."""
 TILTS_FROM_MM = 100.0
 """From this length of the image on, a bed at an angle to the slices' axis is looked for too."""
-TILTS_RAD = np.radians(np.linspace(-4.0, 4.0, 17))
+TILTS = np.tan(np.radians(np.linspace(-4.0, 4.0, 17)))
 """Of the bed against the slices' axis, across the lines of sight; along them any angle is found."""
-TILT_SAMPLING_MM = 4.0, 8.0
-"""Spacing of lines of sight and slices by which such an angle is sought; smoothed along the bed they hold all of it."""
 NEARLY = 0.95
 """A tilted bed explains more than a straight one only if more than this is drawn."""
-EDGE_MM = 40.0
+EDGE_MM = 30.0
 """The edge of a table or cradle is no thicker."""
-TOO_SHORT = (
-    "the image is only {length:.0f} mm long: a curved table or cradle that is as dense as the body and touches it "
-    "cannot be told from the body"
-)
-CUT_OFF = (
-    "a table {thick:.0f} mm thick touches the body at its {name} side; it is wider than the body, and was cut off there"
-)
-PRISM = (
-    "the body has one section along the bed at all four sides, as a phantom has: none of them counts as a table "
-    '([ct] table = "present" says that one is; region = "phantom", if it is one, that it is whole)'
-)
 NEAR_MM = 60.0
 """A face is near the body up to this distance. Mattresses are at most some 50 mm thick; of their foam a CT shows
 nothing that is denser than air."""
 CUT_FRACTION = 0.5
 """A face cuts what the body lies on where something outside of the body ends at it in so many of the slices."""
+TOO_SHORT = (
+    "the image is only {length:.0f} mm long: a table or cradle that is as dense as the body and touches it cannot be "
+    "told from the body"
+)
+CUT_OFF = (
+    "a table {thick:.0f} mm thick touches the body at its {name} side; it is wider than the body, and was cut off there"
+)
+TOUCHES = (
+    "the body ends in one section along the bed at its {name} side, over {width:.0f} mm, as a table or board does: "
+    'nothing beyond it counts as free ([ct] table = "none" where there is none)'
+)
+PRISM = (
+    "the body has one section along the bed at all four sides, as a phantom has: none of them counts as a table "
+    '([ct] table = "present" says that one is; region = "phantom", if it is one, that it is whole)'
+)
 
-Side = tuple[int, int]
-"""Axis and end of a face, as `SIDES` names them."""
-FACES: tuple[Side, ...] = tuple(itertools.product((0, 1), (0, -1)))
+Face = tuple[int, int]
+"""Array axis and end of a face."""
+FACES: tuple[Face, ...] = tuple(itertools.product((0, 1), (0, -1)))
 """The faces of an image beside the bed's two ends."""
+NAMES = dict(zip(FACES, ("right", "left", "front", "back"), strict=True))
+"""Axes run to the left, back and head."""
 
 
 @dataclass(frozen=True)
@@ -112,44 +105,28 @@ PATIENT = Shown()
 
 
 class TableSide(NamedTuple):
-    """One line, drawn along the bed, at which a body or what it lies on ends.
+    """A section, drawn along the bed, at which a body or what it lies on ends.
 
     Attributes:
-        axis: 0 or 1, running to the left or to the back: along the lines of sight.
-        end: 0 or -1, the side of the body: at the axis' low or high end.
-        across: Shape (n,), where the lines of sight cross the other axis in slice 0, ascending, voxels.
-        along: Shape (n,), where each meets the line in slice 0, voxels along ``axis``.
-        slope: How far ``across`` and ``along`` move from slice to slice, voxels.
-        width_mm: How much of the width is drawn.
-        whole: Whether this is the table's far side, so that its edges are where the line ends; else it is a part of a
-            table that is seen from the side.
-        edge_mm: How far before the line its edges count as table, beyond both of its ends; None where they do not.
+        face: The side of the image toward which it ends.
+        line: Shape (n, nz), by line of sight and slice, where it ends, voxels along the face's axis; beyond its edges
+            where they may end.
+        lines: Shape (n,), which lines of sight are those of the table.
+        slope: How it moves along the face's axis, mm per mm along the bed.
+        width_mm: How much of them is drawn.
     """
 
-    axis: int
-    end: int
-    across: Floats
-    along: Floats
-    slope: tuple[float, float]
+    face: Face
+    line: Floats
+    lines: Bools
+    slope: float
     width_mm: float
-    whole: bool
-    edge_mm: float | None = None
 
-    @property
-    def face(self) -> Side:
-        """Axis and end."""
-        return self.axis, self.end
-
-    @property
-    def warning(self) -> str:
-        """One sentence."""
-        flat = np.ptp(self.along) == 0.0
-        how = "is flat" if flat else "ends in one section along the bed"
-        like = "it is pressed on something there, or is one with it" if flat else "as a table or cradle does"
-        return (
-            f"the body {how} at its {SIDES[self.face]} side, over {self.width_mm:.0f} mm: {like}; nothing beyond it "
-            'counts as free ([ct] table = "none" where there is none)'
-        )
+    def beyond(self, shape: tuple[int, ...]) -> Bools:
+        """The voxels of an image beyond the line."""
+        axis, end = self.face
+        index = np.arange(shape[axis])[:, None, None]
+        return np.asarray(np.moveaxis(index > self.line if end else index < self.line, 0, axis))
 
 
 class Touching(NamedTuple):
@@ -167,7 +144,7 @@ class Touching(NamedTuple):
 
 
 def touching_tables(
-    hu: NDArray[np.floating], trunk: Bools, spacing_mm: Floats, shown: Shown = PATIENT, level: float = 0.0
+    hu: NDArray[Any], trunk: Bools, spacing_mm: Floats, shown: Shown = PATIENT, level: float = 0.0
 ) -> Touching:
     """The tables that hold together with a body.
 
@@ -180,32 +157,26 @@ def touching_tables(
         level: Where the body's surface is, of the values.
     """
     dense = hu > level
-    drawn = drawn_sides(hu, trunk, spacing_mm, level)
-    cut_off, said, cut = np.zeros(trunk.shape, bool), list[str](), set[Side]()
-    for side in (side for side in drawn if side.whole):
+    parts = parts_of(dense | trunk)
+    drawn = drawn_sides(surface_ends(hu, parts.painted(parts.counts(trunk) > 0), level), trunk, spacing_mm)
+    cut_off, left, said = np.zeros(trunk.shape, bool), list[TableSide](), list[str]()
+    for side in drawn:
         table = table_beside(dense, side, spacing_mm)
         if table.any():
-            thick_mm = float(np.median(table.sum(axis=side.axis)[table.any(axis=side.axis)])) * spacing_mm[side.axis]
-            said.append(CUT_OFF.format(thick=thick_mm, name=SIDES[side.face]))
+            deep = table.sum(axis=side.face[0])
+            thick_mm = float(np.median(deep[deep > 0]) * spacing_mm[side.face[0]])
+            said.append(CUT_OFF.format(thick=thick_mm, name=NAMES[side.face]))
             cut_off |= table
-            cut.add(side.face)
-    if cut:
-        trunk = trunk & ~cut_off
-        hu = hu.copy()
-        hu[cut_off] = level - np.abs(hu[cut_off] - level)
-        drawn = drawn_sides(hu, trunk, spacing_mm, level)
-    flat = flat_sides(hu, trunk, spacing_mm, level)
-    prism = {side.face for side in (*flat, *drawn) if side.whole} == set(FACES)
-    if (shown.phantom or prism) and shown.table != "present":
-        return Touching(cut_off, (), tuple(said) if shown.phantom else (*said, PRISM))
-    named = {side.face for side in flat}
-    left = [side for side in drawn if side.face not in cut]  # at a table's face the body is pressed into its section
-    left = left if not cut or any(side.whole for side in left) else []
-    said += [side.warning for side in (*flat, *(one for one in left if one.whole and one.face not in named))]
-    length_mm = trunk.shape[2] * float(spacing_mm[2])
-    if length_mm < LEAST_LENGTH_MM:
+        else:
+            left.append(side)
+    if len(drawn) == len(FACES) and not shown.phantom and shown.table != "present":
+        said.append(PRISM)
+    if (len(drawn) == len(FACES) or shown.phantom) and shown.table != "present":
+        left = []
+    said += [TOUCHES.format(name=NAMES[side.face], width=side.width_mm) for side in left]
+    if (length_mm := trunk.shape[2] * float(spacing_mm[2])) < LEAST_LENGTH_MM:
         said.append(TOO_SHORT.format(length=length_mm))
-    return Touching(cut_off, (*flat, *left), tuple(said))
+    return Touching(cut_off, tuple(left), tuple(said))
 
 
 def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
@@ -218,57 +189,28 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
         side: Its far side.
         spacing_mm: Shape (3,).
     """
-    along_mm, across_mm = (float(spacing_mm[axis]) for axis in (side.axis, 1 - side.axis))
-    found, view = np.zeros(dense.shape, bool), np.moveaxis(dense, side.axis, 0)
-    first = ends_of(dense)[FACES.index(side.face)]
-    inward = np.arange(int(THICKEST_MM / along_mm) + 2)
-    index = first + (-1 if side.end else 1) * inward[:, None, None]
-    seen = (first >= 0) & (index >= 0) & (index < len(view))
-    seen &= np.take_along_axis(view, np.clip(index, 0, len(view) - 1), axis=0)
-    lines = np.unique(np.clip(np.rint(side.across).astype(int), 0, view.shape[1] - 1))
-    thick_mm = np.where(seen.all(axis=0), np.inf, np.argmin(seen, axis=0) * along_mm)[lines]
+    axis, end = side.face
+    table, along_mm = np.zeros(dense.shape, bool), float(spacing_mm[axis])
+    view, out = (np.moveaxis(one, axis, 0)[:: -1 if end else 1] for one in (dense, table))  # as it is seen
+    steps = np.arange(int(THICKEST_MM / along_mm) + 2)[:, None, None]
+    at = np.minimum(view.argmax(axis=0) + steps, len(view) - 1)
+    solid = np.logical_and.accumulate(np.take_along_axis(view, at, axis=0), axis=0)
+    thick_mm = solid.sum(axis=0) * along_mm
     middle = np.median(thick_mm, axis=1)
-    alike_mm = max(ALIKE_MM / 2.0, 1.5 * along_mm)
-    alike = (thick_mm >= middle[:, None] - alike_mm) & (thick_mm <= middle[:, None] + alike_mm)
-    open_to_body = (alike.mean(axis=1) >= DRAWN_FRACTION) & (middle <= THICKEST_MM)
-    at = np.where(open_to_body, middle, np.nan)
-    run = max(2, int(RUN_MM / across_mm))
-    edges = [_seen_edge(at, run), _seen_edge(at[::-1], run)]
-    if not all(edges) or open_to_body.all():
-        return found
-    table_mm = np.interp(np.arange(view.shape[1]), lines[open_to_body], middle[open_to_body], left=0.0, right=0.0)
-    table_mm = np.minimum(table_mm, max(edges) + ALIKE_MM)
-    deep, line, k = np.nonzero(seen & (inward[:, None, None] * along_mm < table_mm[:, None] - 1e-6))
-    np.moveaxis(found, side.axis, 0)[index[deep, line, k], line, k] = True
-    return found
+    alike = np.abs(thick_mm - middle[:, None]) <= max(ALIKE_MM / 2.0, 1.5 * along_mm)
+    seen = side.lines & (alike.mean(axis=1) >= DRAWN_FRACTION) & (middle > 0.0) & (middle <= THICKEST_MM)
+    run, lines = max(2, int(RUN_MM / spacing_mm[1 - axis])), np.flatnonzero(side.lines)
+    ends = [some[seen[some]] for some in (lines[:run], lines[-run:])]
+    if seen[lines].all() or any(len(one) < DRAWN_FRACTION * run or np.ptp(middle[one]) > 2 * ALIKE_MM for one in ends):
+        return table
+    most_mm = max(float(np.median(middle[one])) for one in ends) + ALIKE_MM
+    table_mm = np.interp(np.arange(len(seen)), np.flatnonzero(seen), middle[seen], left=0.0, right=0.0)
+    solid &= steps * along_mm < np.minimum(table_mm, most_mm)[:, None] - 1e-6
+    np.put_along_axis(out, at, solid | np.take_along_axis(out, at, axis=0), axis=0)
+    return table
 
 
-def _seen_edge(thick_mm: Floats, run: int) -> float:
-    """How thick a table is at its first edge, where it is seen in a run of lines and is as thick all along it; or 0."""
-    seen = np.flatnonzero(np.isfinite(thick_mm))
-    first = thick_mm[seen[0] : seen[0] + run] if len(seen) else thick_mm[:0]
-    known = first[np.isfinite(first)]
-    enough = len(known) >= 0.8 * run and float(np.ptp(known)) <= 2.0 * ALIKE_MM
-    return float(np.median(known)) if enough else 0.0
-
-
-def flat_sides(hu: NDArray[np.floating], body: Bools, spacing_mm: Floats, level: float = 0.0) -> tuple[TableSide, ...]:
-    """The sides at which a body ends in a plane across its image's axes; arguments as of `touching_tables`."""
-    return tuple(_flat_sides(surface_ends(hu, body, level), body, spacing_mm))
-
-
-def _flat_sides(surfaces: dict[Side, Floats], body: Bools, spacing_mm: Floats) -> Iterator[TableSide]:
-    for (axis, end), ends in surfaces.items():
-        step_mm, across_mm = float(spacing_mm[axis]), float(spacing_mm[1 - axis])
-        plane = _commonest(ends[np.isfinite(ends)], FLAT_MM / step_mm)
-        outward_mm = (ends - plane) * (step_mm if end else -step_mm)
-        width_mm = _flat_width((np.abs(outward_mm) <= FLAT_MM / 2).sum(axis=0), float(spacing_mm[2])) * across_mm
-        if width_mm >= FLAT_WIDTH_MM and np.mean(outward_mm[np.isfinite(ends)] > FLAT_MM) < BEYOND_FRACTION:
-            lines = np.arange(body.shape[1 - axis], dtype=float)
-            yield TableSide(axis, end, lines, np.full(len(lines), plane), (0.0, 0.0), width_mm, True, 0.0)
-
-
-def surface_ends(hu: NDArray[np.floating], body: Bools, level: float = 0.0) -> dict[Side, Floats]:
+def surface_ends(hu: NDArray[Any], body: Bools, level: float = 0.0) -> dict[Face, Floats]:
     """Where a body's surface is along each line of an axis, seen from each end of it.
 
     Args:
@@ -291,152 +233,131 @@ def surface_ends(hu: NDArray[np.floating], body: Bools, level: float = 0.0) -> d
     return surfaces
 
 
-def _flat_width(flat: NDArray[np.integer], step_mm: float) -> float:
-    """How many lines are flat in half of the slices, or along `FLAT_LENGTH_MM` without a gap, whichever is more.
+def drawn_sides(
+    surfaces: dict[Face, Floats], body: Bools, spacing_mm: Floats, own: dict[Face, Bools] | None = None
+) -> tuple[TableSide, ...]:
+    """The sides at which surfaces end in one section along the bed, beyond the middle of a body.
 
     Args:
-        flat: Shape (nz,), the flat lines of each slice.
-        step_mm: From slice to slice.
+        surfaces: By face, as `surface_ends` gives them.
+        body: Shape (nx, ny, nz).
+        spacing_mm: Shape (3,).
+        own: Which ends count, by face, where not all do: these are known to a voxel.
     """
-    run = min(len(flat), int(np.ceil(FLAT_LENGTH_MM / step_mm)))
-    least = np.lib.stride_tricks.sliding_window_view(flat, run).min(axis=1)
-    return max(float(np.median(flat)), float(least.max()))
+    if body.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
+        return ()
+    found, middle = [], middle_of(body)
+    for face, ends in surfaces.items():
+        counts = np.isfinite(ends) if own is None else own[face]
+        near_mm = DRAWN_MM if own is None else max(DRAWN_MM, float(spacing_mm[face[0]]))
+        side = _View(face, ends, counts, spacing_mm, near_mm, own is None).side(middle)
+        if side is not None:
+            found.append(side)
+    return tuple(found)
 
 
-def _commonest(values: Floats, window: float) -> float:
-    """The middle of the window that holds most values; NaN for none."""
-    if len(values) == 0:
-        return float("nan")
-    values = np.sort(values)
-    counts = np.searchsorted(values, values + window, side="right") - np.arange(len(values))
-    return float(values[np.argmax(counts)] + window / 2)
-
-
-class _Ends(NamedTuple):
+class _View(NamedTuple):
     """Where lines of sight end at one side of a body.
 
     Attributes:
-        axis: 0 or 1, along the lines of sight.
-        end: 0 or -1.
-        ends_mm: Shape (n, nz), along the axis, NaN where they end at nothing.
-        firm: Shape (n, nz), which of them may count as drawn.
+        face: The side.
+        ends: Shape (n, nz), voxels along its axis, NaN where they end at nothing.
+        counts: Shape (n, nz), which of them count.
         spacing_mm: Shape (3,).
-        near_mm: How near to their median ends are drawn.
-        middle_mm: Shape (3,), of the body.
+        near_mm: How near to a line ends are drawn.
+        touching: Whether the body itself ends there: then beyond both edges nothing is free either.
     """
 
-    axis: int
-    end: int
-    ends_mm: Floats
-    firm: Bools
+    face: Face
+    ends: Floats
+    counts: Bools
     spacing_mm: Floats
     near_mm: float
-    middle_mm: Floats
+    touching: bool
 
-    @property
-    def length_mm(self) -> float:
-        """Of the image, along the bed."""
-        return float(self.ends_mm.shape[1] * self.spacing_mm[2])
+    def side(self, middle: Floats) -> TableSide | None:
+        """The table's side, if there is one beyond the middle of the body, voxels."""
+        axis, end = self.face
+        along_mm, across_mm = float(self.spacing_mm[axis]), float(self.spacing_mm[1 - axis])
+        ends_mm = np.where(self.counts, _smooth(self.ends * along_mm, float(self.spacing_mm[2])), np.nan)
+        slope, outward = self._slope(ends_mm), 1.0 if end else -1.0
+        at, drawn = self._drawn(ends_mm, slope)
+        edge_mm = EDGE_MM if self.touching else -np.inf
+        if self.touching and drawn.sum() * across_mm < DRAWN_WIDTH_MM:
+            edge_mm, slope, (at, drawn) = 0.0, np.zeros(len(at)), self._flat(self.ends * along_mm)
+        sink = slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
+        drawn &= outward * (at + slope * middle[2] * self.spacing_mm[2]) > outward * middle[axis] * along_mm
+        width_mm = drawn.sum() * across_mm
+        closed = scipy.ndimage.binary_closing(drawn, np.ones(3))
+        runs = scipy.ndimage.binary_opening(closed, np.ones(max(1, int(RUN_MM / across_mm))))
+        if width_mm < DRAWN_WIDTH_MM or not runs.any():
+            return None
+        first, last = np.flatnonzero(runs)[[0, -1]]
+        if not first <= middle[1 - axis] <= last:
+            return None
+        farthest = outward * np.fmax.reduce(outward * (self.ends * along_mm - sink), axis=1)
+        at, across = np.where(drawn, at, farthest), np.arange(len(at))
+        known = np.isfinite(at) & (across >= first) & (across <= last)
+        line = np.interp(across, across[known], at[known])
+        line[(across < first) | (across > last)] -= outward * edge_mm
+        steady = np.interp(across, across[drawn], slope[drawn])[:, None] * np.arange(sink.shape[1]) * self.spacing_mm[2]
+        of_bed, lines = float(np.median(slope[drawn])), runs | (known & drawn)
+        return TableSide(self.face, (line[:, None] + steady) / along_mm, lines, of_bed, float(width_mm))
 
-    def sampled(self) -> _Ends:
-        """Some of its lines of sight in some of its slices."""
-        axes = [1 - self.axis, 2]
-        step = np.maximum(1, (TILT_SAMPLING_MM / self.spacing_mm[axes]).astype(int))
-        spacing_mm, some = self.spacing_mm.copy(), np.s_[:: step[0], :: step[1]]
-        spacing_mm[axes] *= step
-        return self._replace(ends_mm=self.ends_mm[some], firm=self.firm[some], spacing_mm=spacing_mm)
+    def _slope(self, ends_mm: Floats) -> Floats:
+        """How the ends of each line of sight move along the bed, shape (n,), mm per mm: that of a bed at an angle.
 
+        A bed moves along the lines of sight, and across them, where its section moves the ends as it is inclined. Of
+        all angles that under which most is drawn; of those under which nearly most is, the least.
+        """
+        n, count = ends_mm.shape
+        step_mm, across_mm = float(self.spacing_mm[2]), float(self.spacing_mm[1 - self.face[0]])
+        if count * step_mm < TILTS_FROM_MM:
+            return np.zeros(n)
+        lag, some = count // 2, slice(None, None, max(1, int(4.0 / across_mm)))
+        section = _medians(ends_mm)
+        incline = np.where(np.isfinite(section), np.gradient(section, across_mm), 0.0)
+        moves = (ends_mm[some, lag:] - ends_mm[some, :-lag]) / (lag * step_mm)
+        slopes = [np.zeros(n)]
+        for across in TILTS:
+            along = _commonest(moves + across * incline[some, None], 2.0 * DRAWN_MM / (lag * step_mm))
+            slopes.append(along - across * incline)
+        widths = [int(self._drawn(ends_mm[some], slope[some])[1].sum()) for slope in slopes]
+        enough = [slope for slope, width in zip(slopes, widths, strict=True) if width >= NEARLY * max(widths)]
+        return min(enough, key=lambda slope: float(np.abs(slope).max()))
 
-class _Bed(NamedTuple):
-    """Ends of lines of sight (n,), mm, in slice 0 of a bed that may run at an angle to the slices' axis.
+    def _drawn(self, ends_mm: Floats, slope: Floats) -> tuple[Floats, Bools]:
+        """Where most ends of each line of sight are in slice 0, shape (n,), mm, and whether it is drawn."""
+        count = ends_mm.shape[1]
+        level = ends_mm - slope[:, None] * np.arange(count) * self.spacing_mm[2]
+        at = _medians(level)
+        near = np.abs(level - at[:, None]) <= self.near_mm
+        return at, near.mean(axis=1) >= DRAWN_FRACTION
 
-    Attributes:
-        at: The median over the slices, NaN without any.
-        farthest: The outermost over the slices, NaN without any.
-        drawn: Whether the line of sight ends at the same place in most slices.
-        slopes: Of the bed along axes 0 and 1, mm per mm.
-        width_mm: How much is drawn.
-    """
-
-    at: Floats
-    farthest: Floats
-    drawn: Bools
-    slopes: tuple[float, float]
-    width_mm: float
-
-
-def drawn_sides(
-    hu: NDArray[np.floating], trunk: Bools, spacing_mm: Floats, level: float = 0.0
-) -> tuple[TableSide, ...]:
-    """The sides at which a body, or what holds together with it, ends in one section along the bed; edges count.
-
-    Arguments are those of `touching_tables`.
-    """
-    if trunk.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
-        return ()
-    parts = parts_of((hu > level) | trunk)
-    surfaces = surface_ends(hu, parts.painted(parts.counts(trunk) > 0), level)
-    sides = _sides(_views(surfaces, trunk, spacing_mm))
-    return tuple(side._replace(edge_mm=EDGE_MM) if side.whole else side for side in sides)
-
-
-def support_side(outside: Bools, body: Bools, spacing_mm: Floats) -> TableSide | None:
-    """The side at which something outside of the body ends in one section along the bed: what it lies on.
-
-    None where there is nothing like it; of several the widest. Between its parts, where the body lies before it, the
-    line runs where the body ends farthest out.
-
-    Args:
-        outside: Shape (nx, ny, nz), what was scanned, lies outside of the body and is not air.
-        body: Same shape.
-        spacing_mm: Shape (3,).
-    """
-    surfaces, own = {}, {}
-    for face, first, outer in zip(FACES, ends_of(outside | body), ends_of(outside), strict=True):
-        surfaces[face] = np.where(first < 0, np.nan, first + (0.5 if face[1] else -0.5))  # the voxel's outer face
-        own[face] = outer == first
-    sides = [side for side in _sides(_views(surfaces, body, spacing_mm, own)) if side.whole]
-    return max(sides, key=lambda side: side.width_mm, default=None)
-
-
-def _views(
-    surfaces: dict[Side, Floats], body: Bools, spacing_mm: Floats, own: dict[Side, Bools] | None = None
-) -> list[_Ends]:
-    """What is seen of surfaces from each side; where ``own`` says which ends count, they are known to a voxel."""
-    views, middle_mm = [], middle_of(body) * spacing_mm
-    for (axis, end), ends in surfaces.items():
-        ends_mm = _smooth(ends * spacing_mm[axis], float(spacing_mm[2]))
-        firm = np.isfinite(ends_mm) & (True if own is None else own[axis, end])
-        near_mm = DRAWN_MM if own is None else max(DRAWN_MM, float(spacing_mm[axis]))
-        views.append(_Ends(axis, end, ends_mm, firm, spacing_mm, near_mm, middle_mm))
-    return views
+    def _flat(self, ends_mm: Floats) -> tuple[Floats, Bools]:
+        """As `_drawn` of ends that lie in one plane across their axis, along a part of the bed too."""
+        plane, count = _commonest(ends_mm, DRAWN_MM), ends_mm.shape[1]
+        beyond = (ends_mm - plane) * (1.0 if self.face[1] else -1.0) > self.near_mm
+        run = min(count, int(np.ceil(FLAT_LENGTH_MM / self.spacing_mm[2])))
+        near = (np.abs(ends_mm - plane) <= self.near_mm).astype(np.float32)
+        along = scipy.ndimage.uniform_filter1d(near, run, axis=1, mode="constant").max(axis=1)
+        step = beyond.sum() > BEYOND_FRACTION * np.isfinite(ends_mm).sum()
+        return np.full(len(ends_mm), plane), (along > 1.0 - 0.5 / run) & ~step
 
 
-def _sides(views: Sequence[_Ends]) -> tuple[TableSide, ...]:
-    """The drawn sides of one bed."""
-    if views[0].length_mm < LEAST_LENGTH_MM:
-        return ()
-    slopes = _direction([view.sampled() for view in views])
-    beds = [_bed_at(view, slopes) for view in views]
-    tables = [bed.width_mm >= DRAWN_WIDTH_MM for bed in beds]
-    sides = []
-    for view, bed, table in zip(views, beds, tables, strict=True):
-        next_to = any(tables[i] for i, other in enumerate(views) if other.axis != view.axis)
-        if table or (next_to and bed.width_mm >= BESIDE_WIDTH_MM):
-            sides.append(_side(view, bed, table))
-    return tuple(side for side in sides if side is not None)
+def _medians(values: Floats) -> Floats:
+    """Of each row (n, k) the median of those that are known, shape (n,), the lower one of two; NaN without any."""
+    ordered, count = np.sort(values, axis=1), np.isfinite(values).sum(axis=1)  # NaN comes last
+    return np.asarray(ordered[np.arange(len(values)), np.maximum(count - 1, 0) // 2])
 
 
-def _direction(views: Sequence[_Ends]) -> tuple[float, float]:
-    """A bed's slopes under which most is drawn at one side; of those under which nearly most is, the least."""
-    widths = {(0.0, 0.0): max(_bed_at(view, (0.0, 0.0)).width_mm for view in views)}
-    for view in views if views[0].length_mm >= TILTS_FROM_MM else ():
-        for across in np.tan(TILTS_RAD):
-            along = _commonest_slope(_sheared(view, across), float(view.spacing_mm[2]))
-            tilt = (along, float(across)) if view.axis == 0 else (float(across), along)
-            widths[tilt] = max(widths.get(tilt, 0.0), _bed_at(view, tilt).width_mm)
-    most = max(widths.values())
-    return min((tilt for tilt, width in widths.items() if width >= NEARLY * most), key=lambda tilt: np.hypot(*tilt))
+def _commonest(values: Floats, window: float) -> float:
+    """The middle of the window that holds most values; 0 for none."""
+    values = np.sort(values[np.isfinite(values)])
+    if len(values) == 0:
+        return 0.0
+    first = int(np.argmax(np.searchsorted(values, values + window, side="right") - np.arange(len(values))))
+    return float(np.median(values[first : np.searchsorted(values, values[first] + window, side="right")]))
 
 
 def _smooth(ends_mm: Floats, step_mm: float) -> Floats:
@@ -446,72 +367,6 @@ def _smooth(ends_mm: Floats, step_mm: float) -> Floats:
     weight = scipy.ndimage.uniform_filter1d(known.astype(float), size, axis=1, mode="nearest")
     mean = scipy.ndimage.uniform_filter1d(np.where(known, ends_mm, 0.0), size, axis=1, mode="nearest")
     return np.where(known & (weight > 0.5), mean / np.maximum(weight, 0.5), np.nan)
-
-
-def _bed_at(view: _Ends, slopes: tuple[float, float]) -> _Bed:
-    """The bed of one direction; what ends before the body's middle is not beyond the body, but beside it."""
-    along_bed = np.arange(view.ends_mm.shape[1]) * view.spacing_mm[2]
-    level = _sheared(view, slopes[1 - view.axis]) - slopes[view.axis] * along_bed
-    firm = _sheared(view._replace(ends_mm=np.where(view.firm, view.ends_mm, np.nan)), slopes[1 - view.axis])
-    firm -= slopes[view.axis] * along_bed
-    outward = 1.0 if view.end else -1.0
-    at, farthest = _medians(firm), outward * np.fmax.reduce(outward * level, axis=1)
-    middle = view.middle_mm[view.axis] - slopes[view.axis] * view.middle_mm[2]
-    drawn = (np.abs(firm - at[:, None]) <= view.near_mm).mean(axis=1) >= DRAWN_FRACTION
-    drawn &= outward * at > outward * middle
-    return _Bed(at, farthest, drawn, slopes, float(drawn.sum() * view.spacing_mm[1 - view.axis]))
-
-
-def _medians(ends_mm: Floats) -> Floats:
-    """Of every line of sight the median over the slices in which it ends anywhere; NaN without any."""
-    ends_mm, rows = np.sort(ends_mm, axis=1), np.arange(len(ends_mm))  # NaN comes last
-    count = np.isfinite(ends_mm).sum(axis=1)
-    return np.asarray((ends_mm[rows, (count - 1) // 2] + ends_mm[rows, count // 2 - (count == 0)]) / 2.0)
-
-
-def _sheared(view: _Ends, across_slope: float) -> Floats:
-    """Ends (n, nz) of the lines of sight that move with the bed across their direction."""
-    count, slices = view.ends_mm.shape
-    shift = across_slope * np.arange(slices) * view.spacing_mm[2] / view.spacing_mm[1 - view.axis]
-    at = np.arange(count)[:, None] + shift
-    low = np.floor(at).astype(int)
-    between = at - low
-    below, above = (
-        np.take_along_axis(view.ends_mm, np.clip(k, 0, count - 1), axis=0) for k in (low, low + (between > 0.0))
-    )
-    found = below + between * (above - below)
-    return np.asarray(np.where((at >= 0.0) & (at <= count - 1), found, np.nan))
-
-
-def _commonest_slope(ends_mm: Floats, step_mm: float) -> float:
-    """The slope along the bed that most lines of sight have between slices half the image apart."""
-    lag = ends_mm.shape[1] // 2
-    slopes = (ends_mm[:, lag:] - ends_mm[:, :-lag]) / (lag * step_mm)
-    slopes = np.sort(slopes[np.isfinite(slopes)])
-    if len(slopes) == 0:
-        return 0.0
-    window = 2.0 * DRAWN_MM / (lag * step_mm)
-    counts = np.searchsorted(slopes, slopes + window, side="right") - np.arange(len(slopes))
-    first = int(np.argmax(counts))
-    return float(np.median(slopes[first : first + counts[first]]))
-
-
-def _side(view: _Ends, bed: _Bed, table: bool) -> TableSide | None:
-    """The line from the first run of drawn lines of sight to the last; between runs the outermost end counts."""
-    along_mm, across_mm, step_mm = (float(view.spacing_mm[axis]) for axis in (view.axis, 1 - view.axis, 2))
-    run = max(1, int(RUN_MM / across_mm))
-    runs = scipy.ndimage.binary_opening(scipy.ndimage.binary_closing(bed.drawn, np.ones(3)), np.ones(run))
-    if not runs.any():
-        return None
-    first, last = np.flatnonzero(runs)[[0, -1]]
-    across = np.arange(first, last + 1)
-    at = np.where(bed.drawn, bed.at, bed.farthest)[across]
-    known = np.isfinite(at)
-    along = np.interp(across, across[known], at[known]) / along_mm
-    slope = (bed.slopes[1 - view.axis] * step_mm / across_mm, bed.slopes[view.axis] * step_mm / along_mm)
-    middle_mm = view.middle_mm[1 - view.axis] - bed.slopes[1 - view.axis] * view.middle_mm[2]
-    whole = table and bool(first * across_mm <= middle_mm <= last * across_mm)
-    return TableSide(view.axis, view.end, across.astype(float), along, slope, bed.width_mm, whole)
 
 
 class Support(NamedTuple):
@@ -526,7 +381,7 @@ class Support(NamedTuple):
 
     drawn: tuple[TableSide, ...]
     seen: bool
-    open_faces: tuple[Side, ...]
+    open_faces: tuple[Face, ...]
 
 
 def find_support(
@@ -543,19 +398,23 @@ def find_support(
     """
     if shown.table == "none":
         return Support((), False, ())
-    side = support_side(outside, body, spacing_mm)
-    drawn = () if side is None else (side,)
-    supports = {side.face for side in (*drawn, *touching) if side.whole}
-    cut = [face for face in FACES if _cuts(outside, face) and any(face[0] != axis for axis, _ in supports)]
-    faces = cut if supports else FACES
+    surfaces, own = {}, {}
+    for face, first, outer in zip(FACES, ends_of(outside | body), ends_of(outside), strict=True):
+        surfaces[face] = np.where(first < 0, np.nan, first + (0.5 if face[1] else -0.5))  # the voxel's outer face
+        own[face] = outer == first
+    sides = drawn_sides(surfaces, body, spacing_mm, own)
+    drawn = tuple(sorted(sides, key=lambda side: side.width_mm)[-1:])
+    supports = {side.face[0] for side in (*drawn, *touching)}
+    near = [face for face in FACES if _gap_mm(body, face, spacing_mm) <= NEAR_MM]
     arms = shown.limbs and bool(body[:, :, [0, -1]].any())  # of a body that ends in the image its arms are there too
-    faces = [face for face in faces if face[0] == 1 or arms]  # at its sides only an arm may lie unseen
-    gaps = {face: _gap_mm(body, face, spacing_mm) for face in faces}
-    near = tuple(face for face, gap in gaps.items() if gap <= NEAR_MM and not (supports and gap == 0.0))
-    return Support(drawn, bool(supports), () if shown.phantom and not supports else near)
+    near = [face for face in near if face[0] == 1 or arms]  # at its sides only an arm may lie unseen
+    if supports:  # arms may lie on what a face cuts beside the body
+        beside = [face for face in near if any(face[0] != axis for axis in supports)]
+        near = [face for face in beside if _cuts(outside, face) and _gap_mm(body, face, spacing_mm) > 0.0]
+    return Support(drawn, bool(supports), () if shown.phantom and not supports else tuple(near))
 
 
-def support_warnings(seen: bool, open_faces: Sequence[Side]) -> Iterator[str]:
+def support_warnings(seen: bool, open_faces: Sequence[Face]) -> Iterator[str]:
     """What the image does not show of what lies beside the body, and what says so where nothing lies there.
 
     Args:
@@ -563,9 +422,8 @@ def support_warnings(seen: bool, open_faces: Sequence[Side]) -> Iterator[str]:
         open_faces: The faces beyond which nothing is known.
     """
     bed = f"the CT does not show {'all of ' if seen else ''}what the body lies on"
-    sides = ((1, bed, "[ct] table"), (0, "the CT need not show all of the arms", "[ct] arms"))
-    for axis, said, key in sides:
-        names = " and ".join(SIDES[face] for face in open_faces if face[0] == axis)
+    for axis, said, key in ((1, bed, "[ct] table"), (0, "the CT need not show all of the arms", "[ct] arms")):
+        names = " and ".join(NAMES[face] for face in open_faces if face[0] == axis)
         if names:
             yield (
                 f"{said}: what is beyond its {names} face, within {NEAR_MM:g} mm of the body, is unknown_region "
@@ -575,12 +433,12 @@ def support_warnings(seen: bool, open_faces: Sequence[Side]) -> Iterator[str]:
         yield "the CT shows nothing that the body lies on; what is beyond its faces counts as air"
 
 
-def _cuts(outside: Bools, face: Side) -> bool:
+def _cuts(outside: Bools, face: Face) -> bool:
     axis, end = face
     return bool(outside.take(end, axis=axis).any(axis=0).mean() >= CUT_FRACTION)
 
 
-def _gap_mm(body: Bools, face: Side, spacing_mm: Floats) -> float:
+def _gap_mm(body: Bools, face: Face, spacing_mm: Floats) -> float:
     """From the body to a face of the image; 0 where the face cuts it."""
     axis, end = face
     occupied = np.flatnonzero(body.any(axis=(1 - axis, 2)))

@@ -16,7 +16,7 @@ import numpy as np
 from puncture_twin.planning.arm.urdf.document import UrdfDocument, UrdfShape, parse_urdf
 from puncture_twin.planning.arm.urdf.lengths import ArmChain, arm_chain, ur_lengths
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, parse_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
@@ -40,11 +40,6 @@ class BodyShape(NamedTuple):
 def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tuple[BodyShape, ...], ...]:
     """The collision shapes of each of the arm's seven bodies.
 
-    Args:
-        chain: The arm.
-        document: Its URDF.
-        read: Reads a mesh file.
-
     Raises:
         InputError: A link is drawn without a shape for contacts, a body has none at all, something is fixed beyond the
             flange, or a mesh cannot be used.
@@ -55,13 +50,11 @@ def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tu
         for member in members:
             link, here = member.link, f"{document.where}: link '{member.link.name}'"
             if link.drawn and not link.collisions:
-                what = "it is drawn, and has no shape for contacts"
-                raise InputError(what, where=here, allowed="a <collision>; the mesh of its <visual> will do")
+                allowed = "a <collision>; the mesh of its <visual> will do"
+                refuse("it is drawn, and has no shape for contacts", here, allowed, "no_collision_shape")
             if link.collisions and link.name in chain.beyond:
-                what = f"it is fixed beyond the flange '{chain.flange}'"
-                raise InputError(
-                    what, where=here, allowed="the arm alone; what the flange carries is [tool] of the case"
-                )
+                allowed = "the arm alone; what the flange carries is [tool] of the case"
+                refuse(f"it is fixed beyond the flange '{chain.flange}'", here, allowed, "shape_beyond_flange")
             shapes += [
                 BodyShape(_mesh(shape, document, here, read), member.T_body_link @ shape.T_link_shape)
                 for shape in link.collisions
@@ -69,7 +62,7 @@ def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tu
         if not shapes:
             names = ", ".join(member.link.name for member in members)
             what = f"nothing has a collision shape between the joints {number} and {number + 1} (links {names})"
-            raise InputError(what, where=document.where, allowed="one collision shape a link at least")
+            refuse(what, document.where, "one collision shape a link at least", "no_collision_shape")
         found.append(tuple(shapes))
     return tuple(found)
 
@@ -89,16 +82,15 @@ def _mesh(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> Tr
 
 def _file(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> TriangleMesh:
     if Path(shape.address).suffix.lower() not in MESH_SUFFIXES:
-        what = f"mesh '{shape.address}' is of a kind that is not read"
-        raise InputError(what, where=here, allowed=f"a file ending in {', '.join(MESH_SUFFIXES)}, for contacts")
+        allowed = f"a file ending in {', '.join(MESH_SUFFIXES)}, for contacts"
+        refuse(f"mesh '{shape.address}' is of a kind that is not read", here, allowed, "unknown_format")
     path = document.where.parent / shape.address
     try:
         return parse_mesh(read(shape.address), path, unit=Unit.M, space=Space.LOCAL, up=Up.Z, stretch=shape.size)
     except InputError as error:
         what = f"mesh '{shape.address}': {error.what}"
-        raise InputError(
-            what, where=here, allowed=f'{error.allowed}; a URDF speaks metres, scale="0.001 0.001 0.001" reads mm'
-        ) from error
+        allowed = f'{error.allowed}; a URDF speaks metres, scale="0.001 0.001 0.001" reads mm'
+        raise InputError(what, where=here, allowed=allowed, code=error.code) from error
 
 
 def _about(radius: float, length: float) -> Floats:

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import check_name
 from puncture_twin.planning.geometry.rigid import about_fixed_axes, pose
 
@@ -135,10 +135,6 @@ class UrdfDocument:
 def parse_urdf(data: bytes, where: Path) -> UrdfDocument:
     """The links and joints of a URDF.
 
-    Args:
-        data: The whole file.
-        where: Its name, for errors.
-
     Raises:
         InputError: It is no well-formed XML, no URDF, or says something that is not understood.
     """
@@ -147,13 +143,11 @@ def parse_urdf(data: bytes, where: Path) -> UrdfDocument:
     links = _by_name([_link(one, where) for one in root.findall("link")], "link", where)
     joints = _by_name([_joint(one, where) for one in root.findall("joint")], "joint", where)
     if len(links) > MOST_LINKS:
-        raise InputError(f"{len(links)} links", where=where, allowed=f"at most {MOST_LINKS}")
+        refuse(f"{len(links)} links", where, f"at most {MOST_LINKS}", "too_many")
     for joint in joints.values():
         for end in (joint.parent, joint.child):
             if end not in links:
-                raise InputError(
-                    f"joint '{joint.name}': there is no link '{end}'", where=where, allowed=", ".join(links)
-                )
+                refuse(f"joint '{joint.name}': there is no link '{end}'", where, ", ".join(links), "unknown_link")
     return UrdfDocument(name, links, tuple(joints.values()), where)
 
 
@@ -161,29 +155,30 @@ def _root(data: bytes, where: Path) -> Element:
     try:
         text = data.decode("utf-8-sig")
         if "<!" in text.replace("<!--", ""):
-            raise InputError("a document type or CDATA section", where=where, allowed="a URDF without either")
+            refuse("a document type or CDATA section", where, "a URDF without either", "xml_doctype")
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise InputError(f"XML is not well formed ({error})", where=where, allowed=ALLOWED) from error
+        what = f"XML is not well formed ({error})"
+        raise InputError(what, where=where, allowed=ALLOWED, code="xml_damaged") from error
     if any("xacro" in one.tag for one in root.iter()):
-        what = "it holds xacro macros, which stand for what is not there yet"
-        raise InputError(what, where=where, allowed="the URDF that they make: xacro arm.urdf.xacro > arm.urdf")
+        allowed = "the URDF that they make: xacro arm.urdf.xacro > arm.urdf"
+        refuse("it holds xacro macros, which stand for what is not there yet", where, allowed, "xacro_macros")
     if root.tag != "robot":
-        raise InputError(f"<{root.tag}> where <robot> was expected", where=where, allowed=ALLOWED)
+        refuse(f"<{root.tag}> where <robot> was expected", where, ALLOWED, "wrong_format")
     return root
 
 
 def _by_name(parts: Sequence[Named], what: str, where: Path) -> Mapping[str, Named]:
     for name, count in Counter(part.name for part in parts).items():
         if count > 1:
-            raise InputError(f"{what} '{name}' stands {count} times", where=where, allowed="each name once")
+            refuse(f"{what} '{name}' stands {count} times", where, "each name once", "duplicate_name")
     return {part.name: part for part in parts}  # no proxy: an arm is sent to other processes
 
 
 def _link(element: Element, where: Path) -> UrdfLink:
     name = _plain(element, "a link", where)
     if name in TAKEN:
-        raise InputError(f"a link called '{name}'", where=where, allowed=f"any name but {', '.join(TAKEN)}, the tool's")
+        refuse(f"a link called '{name}'", where, f"any name but {', '.join(TAKEN)}, the tool's", "reserved_name")
     here = f"{where}: link '{name}'"
     shapes = tuple(_shape(one, here) for one in element.findall("collision"))
     return UrdfLink(name, shapes, element.find("visual") is not None, _weighs(element, here))
@@ -192,7 +187,7 @@ def _link(element: Element, where: Path) -> UrdfLink:
 def _plain(element: Element, what: str, where: Path) -> str:
     name = check_name(element.get("name", ""), what, where=where)
     if not PLAIN.fullmatch(name):
-        raise InputError(f"{what} is called '{name}'", where=where, allowed="letters, digits and _ . / -")
+        refuse(f"{what} is called '{name}'", where, "letters, digits and _ . / -", "bad_name")
     return name
 
 
@@ -201,18 +196,18 @@ def _shape(element: Element, here: str) -> UrdfShape:
     kinds = [one.tag for one in geometry]
     if len(kinds) != 1 or kinds[0] not in SHAPES:
         found = ", ".join(kinds) or "nothing"
-        raise InputError(f"a collision of {found}", where=here, allowed=f"one of {', '.join(SHAPES)}")
+        refuse(f"a collision of {found}", here, f"one of {', '.join(SHAPES)}", "unknown_shape")
     kind, shape = kinds[0], geometry[0]
     for key in SHAPES[kind]:
         if not shape.get(key, "").strip():
-            raise InputError(f"<{kind}> without {key}", where=here, allowed=", ".join(SHAPES[kind]))
+            refuse(f"<{kind}> without {key}", here, ", ".join(SHAPES[kind]), "missing_key")
     T = _origin(element, here)
     if kind == "mesh":
         return UrdfShape(kind, T, shape.get("filename", ""), _scale(shape, here))
     counts = {"size": 3}
     size = MM_PER_M * np.concatenate([_numbers(shape, key, counts.get(key, 1), here) for key in SHAPES[kind]])
     if not ((size > 0.0) & (size <= MOST_SIZE_MM)).all():
-        raise InputError(f"<{kind}> of {_listed(size)} mm", where=here, allowed=f"above 0, at most {MOST_SIZE_MM:g} mm")
+        refuse(f"<{kind}> of {_listed(size)} mm", here, f"above 0, at most {MOST_SIZE_MM:g} mm", "out_of_range")
     return UrdfShape(kind, T, "", size)
 
 
@@ -220,8 +215,7 @@ def _scale(mesh: Element, here: str) -> Floats:
     """The factors (3,) by which a mesh is stretched."""
     scale = _numbers(mesh, "scale", 3, here) if "scale" in mesh.attrib else np.ones(3)
     if not (scale > 0.0).all():
-        what = f'scale="{mesh.get("scale")}" mirrors or flattens the mesh'
-        raise InputError(what, where=here, allowed="three factors above 0")
+        refuse(f'scale="{mesh.get("scale")}" mirrors or flattens the mesh', here, "three factors above 0", "mirrored")
     return scale
 
 
@@ -229,9 +223,9 @@ def _joint(element: Element, where: Path) -> UrdfJoint:
     name = _plain(element, "a joint", where)
     here, kind = f"{where}: joint '{name}'", element.get("type", "")
     if kind not in JOINTS:
-        raise InputError(f"type '{kind}'", where=here, allowed=", ".join(JOINTS))
+        refuse(f"type '{kind}'", here, ", ".join(JOINTS), "unknown_joint_type")
     if element.find("mimic") is not None:
-        raise InputError("it mimics another joint", where=here, allowed="joints that move by themselves")
+        refuse("it mimics another joint", here, "joints that move by themselves", "mimic_joint")
     parent, child = (_only(element, end, here).get("link", "") for end in ("parent", "child"))
     axis = _axis(element, here)
     limit = element.find("limit")
@@ -247,7 +241,7 @@ def _axis(element: Element, here: str) -> Floats:
     axis = np.array([1.0, 0.0, 0.0]) if stated is None else _numbers(stated, "xyz", 3, here)
     length = float(np.linalg.norm(axis))
     if length == 0.0:
-        raise InputError("its axis is zero", where=here, allowed="a direction")
+        refuse("its axis is zero", here, "a direction", "zero_direction")
     return np.asarray(axis / length)
 
 
@@ -257,7 +251,7 @@ def _origin(element: Element, here: str) -> Floats:
     if not origins:
         return np.eye(4)
     if len(origins) > 1 or not set(origins[0].attrib) <= {"xyz", "rpy"}:
-        raise InputError("an <origin> with more than xyz and rpy, or two of them", where=here, allowed="one, of both")
+        refuse("an <origin> with more than xyz and rpy, or two of them", here, "one, of both", "duplicate_element")
     xyz, rpy = (
         _numbers(origins[0], key, 3, here) if key in origins[0].attrib else np.zeros(3) for key in ("xyz", "rpy")
     )
@@ -278,17 +272,17 @@ def _weighs(element: Element, here: str) -> bool:
 def _only(element: Element, tag: str, here: str) -> Element:
     found = element.findall(tag)
     if len(found) != 1:
-        raise InputError(f"{len(found)} <{tag}>", where=here, allowed="one")
+        refuse(f"{len(found)} <{tag}>", here, "one", "wrong_count")
     return found[0]
 
 
 def _numbers(element: Element, key: str, count: int, here: str) -> Floats:
-    """So many finite numbers of an attribute, shape (count,)."""
+    """The finite numbers of an attribute, shape (count,); refused where there are more or fewer."""
     text = element.get(key, "")
     values = _parsed(text.split(), _number)
     if values is None or len(values) != count or not all(map(math.isfinite, values)):
         allowed = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise InputError(f'<{element.tag} {key}="{text}">', where=here, allowed=allowed)
+        refuse(f'<{element.tag} {key}="{text}">', here, allowed, "not_a_number")
     return np.array(values)
 
 

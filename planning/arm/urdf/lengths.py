@@ -19,7 +19,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.urdf.document import UrdfDocument, UrdfJoint, UrdfLink
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotation_angle
 
 SQUARE_RAD = 1e-4
@@ -94,7 +94,7 @@ def ur_lengths(chain: ArmChain, document: UrdfDocument, T_base_root: Floats | No
     for name, length, sign in zip(("d1", "a2", "a3", "d4", "d5", "d6"), lengths, (1, -1, -1, 1, 1, 1), strict=True):
         if not sign * length > OFF_MM:
             what = f"its length {name} is {length:g} mm (flange '{chain.flange}')"
-            raise InputError(what, where=document.where, allowed=f"{'above' if sign > 0 else 'below'} 0, as of a UR")
+            refuse(what, document.where, f"{'above' if sign > 0 else 'below'} 0, as of a UR", "arm_not_as_ur")
     return UrLengths(lengths, T_base_root)
 
 
@@ -129,7 +129,7 @@ def _base(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> Floats:
             "a link 'base', fixed to the root, whose z is axis 1 and whose -y is axis 2 at the angle zero "
             '(ur_description: rpy="0 0 3.141592653589793")'
         )
-        raise InputError(what, where=document.where, allowed=allowed)
+        refuse(what, document.where, allowed, "arm_not_as_ur")
     return T
 
 
@@ -160,7 +160,7 @@ def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
             f"the flange '{chain.flange}' is {np.linalg.norm(off):.4g} mm beside axis 6 and turned by "
             f"{np.degrees(off_angle):.4g} degrees against a UR's"
         )
-        raise InputError(what, where=document.where, allowed=f"the link that a UR has as tool0; {AS_UR}")
+        refuse(what, document.where, f"the link that a UR has as tool0; {AS_UR}", "arm_not_as_ur")
 
 
 def _mm(off: list[float]) -> str:
@@ -168,7 +168,12 @@ def _mm(off: list[float]) -> str:
 
 
 def _other(chain: ArmChain, joint: int, what: str, document: UrdfDocument) -> InputError:
-    return InputError(f"axis {joint + 1} ('{chain.joints[joint].name}') {what}", where=document.where, allowed=AS_UR)
+    return InputError(
+        f"axis {joint + 1} ('{chain.joints[joint].name}') {what}",
+        where=document.where,
+        allowed=AS_UR,
+        code="arm_not_as_ur",
+    )
 
 
 MOST_RAD = 4.0 * math.pi
@@ -207,11 +212,6 @@ NOTHING_STATED = StatedLimits()
 def urdf_limits(joints: tuple[UrdfJoint, ...], stated: StatedLimits, where: Path) -> JointLimits:
     """The limits of a URDF's six joints; what the case states of them takes the place of what the URDF lacks.
 
-    Args:
-        joints: The six.
-        stated: By the case.
-        where: The URDF, for errors.
-
     Raises:
         InputError: A limit is missing, is in degrees, or makes no sense.
     """
@@ -239,14 +239,14 @@ def narrowed(known: JointLimits, stated: StatedLimits, where: str) -> JointLimit
             joint = int(np.argmax(wider))
             low, high = np.degrees(angles[joint])
             what = f"the angles of joint {joint + 1} go beyond the arm's own"
-            raise InputError(what, where=where, allowed=f"from {low:g} to {high:g} degrees")
+            refuse(what, where, f"from {low:g} to {high:g} degrees", "limit_beyond_arm")
         angles = stated.angles
     if stated.speeds is not None:
         faster = stated.speeds > speeds + ROUNDING_RAD
         if faster.any():
             joint = int(np.argmax(faster))
-            what = f"the speed of joint {joint + 1} is above the arm's own"
-            raise InputError(what, where=where, allowed=f"at most {np.degrees(speeds[joint]):g} degrees/s")
+            allowed = f"at most {np.degrees(speeds[joint]):g} degrees/s"
+            refuse(f"the speed of joint {joint + 1} is above the arm's own", where, allowed, "limit_beyond_arm")
         speeds = stated.speeds
     return JointLimits(angles, speeds, known.torques)
 
@@ -258,15 +258,15 @@ def _unlimited(joint: UrdfJoint, stated: StatedLimits) -> bool:
 
 def _angles(joint: UrdfJoint, here: str) -> tuple[float, float]:
     if joint.kind == "continuous":
-        raise InputError("it is continuous: it states no limits", where=here, allowed="revolute, or [robot.limits]")
+        refuse("it is continuous: it states no limits", here, "revolute, or [robot.limits]", "missing_limits")
     if not {"lower", "upper"} <= set(joint.limits):
-        raise InputError("<limit> lacks lower or upper", where=here, allowed="both, in rad; or [robot.limits]")
+        refuse("<limit> lacks lower or upper", here, "both, in rad; or [robot.limits]", "missing_limits")
     low, high = joint.limits["lower"], joint.limits["upper"]
     if not low < high:
-        raise InputError(f"limits from {low:g} to {high:g}", where=here, allowed="lower below upper, in rad")
+        refuse(f"limits from {low:g} to {high:g}", here, "lower below upper, in rad", "out_of_range")
     if max(-low, high) > MOST_RAD:
         what = f"limits from {low:g} to {high:g} rad, which look like degrees"
-        raise InputError(what, where=here, allowed=f"rad, at most {MOST_RAD:.2f} either way")
+        refuse(what, here, f"rad, at most {MOST_RAD:.2f} either way", "wrong_unit")
     return low, high
 
 
@@ -274,7 +274,7 @@ def _above_zero(joint: UrdfJoint, key: str, here: str, unit: str, most: float) -
     value = joint.limits.get(key, 0.0)
     if not 0.0 < value <= most:
         allowed = f"above 0{'' if math.isinf(most) else f', at most {most:.2f}'} {unit}"
-        raise InputError(f'<limit {key}="{value:g}">', where=here, allowed=allowed)
+        refuse(f'<limit {key}="{value:g}">', here, allowed, "out_of_range")
     return value
 
 
@@ -337,18 +337,18 @@ def arm_chain(document: UrdfDocument, flange: str) -> ArmChain:
     """
     where = document.where
     if flange not in document.links:
-        what = f"there is no link '{flange}', which would be the flange"
-        raise InputError(what, where=where, allowed=f"[robot] flange, one of {', '.join(document.links)}")
+        allowed = f"[robot] flange, one of {', '.join(document.links)}"
+        refuse(f"there is no link '{flange}', which would be the flange", where, allowed, "unknown_link")
     above = _parents(document)
     path = _path(above, flange, document)
     turning = [joint for joint in path if joint.kind != "fixed"]
     for joint in document.joints:
         if joint.kind != "fixed" and joint not in turning:
             what = f"joint '{joint.name}' ({joint.kind}) moves something beside the way to the flange '{flange}'"
-            raise InputError(what, where=where, allowed="six joints that turn; everything else fixed")
+            refuse(what, where, "six joints that turn; everything else fixed", "moving_branch")
     if len(turning) != JOINT_COUNT or any(joint.kind not in TURNING for joint in turning):
         found = ", ".join(f"{joint.name} ({joint.kind})" for joint in turning) or "none"
-        raise InputError(f"the joints that move are {found}", where=where, allowed="six revolute joints in a row")
+        refuse(f"the joints that move are {found}", where, "six revolute joints in a row", "not_six_joints")
     bodies, places = _bodies(document, above, turning)
     to_joint = [places[joint.parent] @ joint.T_parent_child for joint in turning]
     beyond = frozenset(name for name in document.links if name != flange and flange in _ancestors(above, name))
@@ -361,12 +361,12 @@ def _parents(document: UrdfDocument) -> dict[str, UrdfJoint]:
     for joint in document.joints:
         if joint.child in above:
             what = f"link '{joint.child}' hangs on two joints, '{above[joint.child].name}' and '{joint.name}'"
-            raise InputError(what, where=document.where, allowed="a tree of links")
+            refuse(what, document.where, "a tree of links", "not_a_tree")
         above[joint.child] = joint
     roots = [name for name in document.links if name not in above]
     if len(roots) != 1 or any(roots[0] not in (name, *_ancestors(above, name)) for name in document.links):
         what = f"it is not a tree: links that hang on no joint: {', '.join(roots) or 'none'}"
-        raise InputError(what, where=document.where, allowed="one root, and a tree of links below it")
+        refuse(what, document.where, "one root, and a tree of links below it", "not_a_tree")
     return above
 
 

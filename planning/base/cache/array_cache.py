@@ -31,7 +31,7 @@ from puncture_twin.planning.base.cache.entry_file import (
     unpacked,
 )
 from puncture_twin.planning.base.cache.source_stamp import library_versions, module_unedited, source_stamp
-from puncture_twin.planning.base.errors import CacheWarning, InputError
+from puncture_twin.planning.base.errors import CacheWarning, InputError, refuse
 
 Value = TypeVar("Value")
 
@@ -56,7 +56,7 @@ class Memory:
 
     @property
     def held_bytes(self) -> int:
-        """What the values hold now."""
+        """Bytes that the values hold now."""
         return self._held
 
     def get(self, key: tuple[Hashable, ...], make: Callable[[], Value], size: Callable[[Value], int]) -> Value:
@@ -76,22 +76,14 @@ class Memory:
 
     @property
     def most_bytes(self) -> int:
-        """What the values may hold."""
+        """Bytes that the values may hold."""
         return self._most
-
-    def limit(self, most_bytes: int) -> None:
-        """Hold no more than so much from now on."""
-        self._most = min(self._most, most_bytes)
-        self._shrink()
 
     def _keep(self, key: tuple[Hashable, ...], value: Any, size: int) -> None:
         if size > self._most:
             return
         self._kept[key] = value, size
         self._held += size
-        self._shrink()
-
-    def _shrink(self) -> None:
         while self._held > self._most:
             _, (_, gone) = self._kept.popitem(last=False)
             self._held -= gone
@@ -166,7 +158,7 @@ class Cache:
     def value(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
     ) -> Value:
-        """What ``read`` makes of `arrays`. To read them is their check too: a mesh is guarded once.
+        """The value that ``read`` makes of `arrays`; reading is their check too, so a mesh is guarded once.
 
         Args:
             made_from: See `arrays`.
@@ -179,7 +171,7 @@ class Cache:
                 return read(_frozen(make()))
             return self._from_folder(_entry(made_from, by), make, read).value
         entry = _entry(made_from, by)
-        return read(self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, read).arrays, _size))
+        return self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, read), _size).value
 
     def _from_folder(
         self, entry: StoredFile, make: Callable[[], Arrays], read: Callable[[Arrays], Value]
@@ -223,9 +215,7 @@ def _most_bytes() -> int:
     if not stated:
         return MOST_BYTES
     if not (stated.isascii() and stated.isdigit() and len(stated) < 10):
-        raise InputError(
-            f"{stated[:40]!r} is no size", where=f"${SIZE_VARIABLE}", allowed="whole megabytes, such as 2000"
-        )
+        refuse(f"{stated[:40]!r} is no size", f"${SIZE_VARIABLE}", "whole megabytes, such as 2000", "not_a_number")
     return int(stated) * 1_000_000
 
 
@@ -236,8 +226,9 @@ def _frozen(arrays: Arrays) -> Arrays:
     return arrays
 
 
-def _size(arrays: Arrays) -> int:
-    return sum(array.nbytes for array in arrays.values())
+def _size(found: _Read[Any]) -> int:
+    """Of the arrays, which the value looks at."""
+    return sum(array.nbytes for array in found.arrays.values())
 
 
 def _entry(made_from: Mapping[str, Any], by: str) -> StoredFile:
@@ -248,7 +239,7 @@ def _entry(made_from: Mapping[str, Any], by: str) -> StoredFile:
 
 @cache
 def _generation(by: str) -> str:
-    """Of all code that a module's results depend on, as a hash; reading it takes milliseconds, so once a process."""
+    """Hash of all code that a module's results depend on; it takes milliseconds, so it is made once a process."""
     parts = {
         "source": source_stamp(by),
         "python": platform.python_version(),
@@ -258,7 +249,7 @@ def _generation(by: str) -> str:
 
 
 def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value] | None:
-    """What an entry holds, or None where it is not there or, which is said, not whole.
+    """The arrays of an entry; None where there is no entry, or, with a note, a damaged one.
 
     Raises:
         InputError: Another user owns it, or may write it.

@@ -30,7 +30,7 @@ ALIGNED = 64
 
 
 class DamagedError(Exception):
-    """An entry that is not what was written under its name."""
+    """Raised for an entry whose content is not what was written under its name."""
 
 
 def packed(arrays: Arrays, key: str) -> bytes:
@@ -92,7 +92,7 @@ def check_own_folder(folder: Path) -> None:
     Raises:
         InputError: With the code ``cache_not_own``.
     """
-    check_own(folder / "entry")
+    check_own(folder)  # and those around it, where others could lay another in its place
     status = folder.lstat()
     if stat.S_ISLNK(status.st_mode):
         raise _refusal(folder, "is a link")
@@ -111,7 +111,7 @@ def _in_reach(folder: Path) -> bool:
 
 @cache
 def _known_in_reach(folder: Path, uid: int, gid: int, mode: int) -> bool:
-    """The same of a folder of this owner and mode: the folders around it are looked at once in a process."""
+    """`_in_reach` of a folder of this owner and mode; the folders around it are looked at once in a process."""
     status = folder.stat()
     _refuse_foreign(folder, status)
     if not _open_to_others(status, stat.S_IXGRP, stat.S_IXOTH):

@@ -108,13 +108,13 @@ def _version(name: str) -> str:
 
 @cache
 def _opened(file: str) -> tuple[bytes, tuple[int, ...]]:
-    """What a source says, and its state when it was read."""
+    """A source's bytes, and its state when it was read."""
     with open(file, "rb") as stream:  # noqa: PTH123  # a path of each costs 0.01 s
         return stream.read(), _state(os.fstat(stream.fileno()))
 
 
 def _state(status: os.stat_result) -> tuple[int, ...]:
-    """What changes when a file is written or replaced."""
+    """State of a file that changes whenever it is written or replaced."""
     return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
@@ -164,7 +164,7 @@ def _absolute(module: str, file: str) -> str:
 
 
 def _imports(source: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
-    """What `IMPORTED` finds in a source: it is tried where the word stands, not at every line."""
+    """The imports in a source by `IMPORTED`, which is tried where the word occurs, not at every line."""
     at = source.find(b"import")
     while at >= 0:
         found = IMPORTED.match(source, source.rfind(b"\n", 0, at) + 1)

@@ -1,4 +1,4 @@
-"""What an output folder holds, written down beside it: ``manifest.json``, an entry a command, and who may read by it.
+"""``manifest.json``: what an output folder holds, an entry for each command, and the checks of whoever reads it.
 
 A file belongs to the folder's set only if the manifest lists it with the hash of its bytes.
 """
@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import is_plain_file, read_input
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
 from puncture_twin.planning.base.strict_json import field, fitting, read_json, text, texts
@@ -89,7 +89,7 @@ class Manifest:
         return next((key for key, entry in self.entries.items() if name in entry.files), None)
 
     def text(self) -> str:
-        """As it is written: the same entries give the same bytes."""
+        """The manifest as it is written: the same entries give the same bytes."""
         document = {
             "format": FORMAT,
             "layout": LAYOUT,
@@ -121,7 +121,7 @@ class Output(NamedTuple):
     """A warning where the file lies outside of any set, else empty."""
 
     def input(self, role: str) -> Input:
-        """As an input of what is made from it."""
+        """This file as an input, for the provenance of what is made from it."""
         return Input(role, self.path.name, self.sha256)
 
 
@@ -140,22 +140,19 @@ def read_output(path: Path, *, max_bytes: int) -> Output:
     digest = hashlib.sha256(data).hexdigest()
     home = path.resolve()
     if home.name == MANIFEST_NAME:
-        raise InputError("lists the files of a command and is none of them", where=path, allowed="one that it lists")
+        refuse("lists the files of a command and is none of them", path, "one that it lists", "not_in_manifest")
     manifest = _set_of(home.parent)
     if manifest is None:
         return Output(path, data, digest, f"{path} lies outside of any output set: nothing tells whether it is whole")
     if manifest.files.get(home.name) != digest:
         wrong = "is not listed" if home.name not in manifest.files else "has other bytes than are listed"
-        raise InputError(
-            f"{wrong} in {MANIFEST_NAME} beside it: the folder's set is unfinished, or the file was edited",
-            where=path,
-            allowed="what the command wrote: run it again",
-        )
+        what = f"{wrong} in {MANIFEST_NAME} beside it: the folder's set is unfinished, or the file was edited"
+        refuse(what, path, "what the command wrote: run it again", "output_not_whole")
     return Output(path, data, digest, "")
 
 
 def problems(folder: Path) -> tuple[str, ...]:
-    """What keeps a folder from being one whole set, a sentence each; empty if nothing does.
+    """Sentences on what keeps a folder from being one whole set; empty if nothing does.
 
     Raises:
         InputError: The manifest cannot be read, or is another program's.
@@ -184,7 +181,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         return None
     document = _document(path)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        raise InputError("is not that of an output folder", where=path, allowed=ANOTHER_FOLDER)
+        refuse("is not that of an output folder", path, ANOTHER_FOLDER, "not_an_output_folder")
     with fitting(path, ANOTHER_FOLDER):
         return _manifest(document)
 

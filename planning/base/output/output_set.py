@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import Manifest, read_manifest
 from puncture_twin.planning.base.output.publish import Draft, new_draft, publish, refuse_foreign, sweep
 from puncture_twin.planning.base.provenance import Input
@@ -88,7 +88,7 @@ def _silent(_: str) -> None:
 
 @contextmanager
 def _explained(out: Path) -> Iterator[None]:
-    """A disk that takes no more is bad input, not a failure of the program."""
+    """Context in which a full disk is reported as bad input, not as a failure of the program."""
     try:
         yield
     except OSError as error:
@@ -96,7 +96,7 @@ def _explained(out: Path) -> Iterator[None]:
             raise
         reason = os.strerror(error.errno or errno.ENOSPC)
         what = f"cannot be written ({reason}); what it held before is untouched"
-        raise InputError(what, where=out, allowed="a folder with enough free space") from error
+        raise InputError(what, where=out, allowed="a folder with enough free space", code="unwritable") from error
 
 
 def disk_is_full(error: OSError, out: Path) -> bool:
@@ -120,7 +120,7 @@ def _folder(out: Path) -> Iterator[None]:
         if error.errno in NO_SPACE:
             raise
         what = f"cannot be written ({error.strerror})"
-        raise InputError(what, where=out, allowed="a folder that may be written to") from error
+        raise InputError(what, where=out, allowed="a folder that may be written to", code="unwritable") from error
     try:
         yield
     finally:
@@ -141,7 +141,7 @@ def _sources(draft: Draft, made_from: Mapping[str, str]) -> tuple[str, ...]:
         if owner is not None:
             if draft.old.files[name] != digest:
                 allowed = f"another folder: what is made from one {name} does not belong beside another"
-                raise InputError(f"holds another {name}", where=draft.out, allowed=allowed)
+                refuse(f"holds another {name}", draft.out, allowed, "folder_of_another")
             owners.append(owner)
     return tuple(owners)
 
@@ -177,11 +177,13 @@ def _locked(path: Path) -> int:
             holder = os.pread(handle, 20, 0).decode(errors="replace")
             os.close(handle)
             what = f"another command is writing into this folder (process {holder or 'unknown'})"
-            raise InputError(what, where=path.parent, allowed="one at a time, or another folder") from None
+            allowed = "one at a time, or another folder"
+            raise InputError(what, where=path.parent, allowed=allowed, code="folder_in_use") from None
         except OSError as error:
             os.close(handle)
             what = f"the folder cannot be locked ({error.strerror})"
-            raise InputError(what, where=path.parent, allowed="a folder on a file system with locks") from error
+            allowed = "a folder on a file system with locks"
+            raise InputError(what, where=path.parent, allowed=allowed, code="folder_not_locked") from error
         os.close(handle)
 
 
@@ -190,7 +192,8 @@ def _opened(path: Path) -> int:
         return os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     except OSError as error:
         what = f"cannot be written ({error.strerror})"
-        raise InputError(what, where=path.parent, allowed="a folder that may be written to") from error
+        where = path.parent
+        raise InputError(what, where=where, allowed="a folder that may be written to", code="unwritable") from error
 
 
 def _is_at(handle: int, path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""From a draft to the command's set.
+"""Publish a set of output files: from a draft folder to the command's own.
 
 When all files of a draft are there:
 
@@ -31,7 +31,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
     MAX_MANIFEST_BYTES,
@@ -117,11 +117,11 @@ def refuse_foreign(draft: Draft, files: Iterable[str]) -> None:
         foreign = _foreign_entry(draft.out, name)
         if foreign is not None:
             what = f"{name} is to be written, but the file {foreign} there comes from no run of this program"
-            raise InputError(what, where=draft.out, allowed="another folder, or this one without that file")
+            refuse(what, draft.out, "another folder, or this one without that file", "foreign_file")
 
 
 def _foreign_entry(out: Path, name: str) -> str | None:
-    """What stands under a name that is to be written, or where a sub-folder of it must be; a link leads elsewhere."""
+    """An entry that is in the way of a file or sub-folder that is to be written; a link leads elsewhere."""
     place = out / name
     for folder in reversed(Path(name).parents[:-1]):
         if (out / folder).is_symlink() or ((out / folder).exists() and not (out / folder).is_dir()):
@@ -195,7 +195,7 @@ def with_timings(
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What is there; nothing where it cannot be read: no result depends on it."""
+    """Bytes of a file; nothing where it cannot be read: no result depends on it."""
     try:
         document = read_json(path, max_bytes=MAX_MANIFEST_BYTES, allowed="timings")
     except InputError:
@@ -233,7 +233,7 @@ class Draft:
     parts: dict[str, str] = field(default_factory=dict)
 
     def final(self, files: Iterable[Path]) -> tuple[Path, ...]:
-        """Where files of the draft will lie."""
+        """Path at which each file of the draft will be."""
         return tuple(self.out / path.relative_to(self.folder) for path in files)
 
     def split(self, command: str, *files: Path) -> None:

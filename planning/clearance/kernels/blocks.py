@@ -24,8 +24,8 @@ FAR_MM = 1e15
 class Blocks:
     """One surface, packed. Made once per patient; nothing here depends on the target.
 
-    A node is a disc: every point p of its triangles has |(p - c) . n| <= h and lies within rho of the axis through c
-    along n. Level 0 holds the blocks; node j of a level has the nodes 16 j ... 16 j + 15 of the level below.
+    A node is a thick disc: for every point p of its triangles |(p - c) . n| <= h, and p is within rho of the axis
+    through c along n. Level 0 holds the blocks; node j of a level holds nodes 16 j to 16 j + 15 of the level below.
 
     Attributes:
         triangles: Shape (16 b, 9), corners in block order, mm; the last block is filled up with its last triangle.
@@ -109,10 +109,10 @@ def _fill(vertices, faces, order, triangles):  # type: ignore[no-untyped-def]  #
 
 
 PARALLEL = 1e-6
-"""Fraction of its triangles' area below which a block's mean normal says nothing."""
+"""Length of a block's mean normal over its triangles' area, below which the normal is not used."""
 
 FAINT = 1e-140
-"""Length, mm^2, below which a mean normal says nothing: its square nears the least number, and is not its length's."""
+"""Length of a mean normal, mm^2, below which it is not used: its square is near the least number, and inexact."""
 
 
 @allocation_free(nogil=True)
@@ -254,11 +254,9 @@ def _reach_across(center, disc, j, n, c):  # type: ignore[no-untyped-def]  # num
 
 @allocation_free(nogil=True)
 def _axis(disc, j):  # type: ignore[no-untyped-def]  # numba infers
-    """Normal of a disc."""
     return disc[0, j], disc[1, j], disc[2, j]
 
 
 @allocation_free(nogil=True)
 def _dot(p, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Inner product of two vectors of three."""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]

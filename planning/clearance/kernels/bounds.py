@@ -15,13 +15,13 @@ from puncture_twin.planning.clearance.kernels.lanes import Arguments, Vector, in
 THREE = types.UniTuple(types.float32, 3)  # type: ignore[no-untyped-call]  # numba has no types
 
 NEVER = np.float32(1e18)
-"""The bound of what lies behind the target: the target's own distance covers it."""
+"""The bound of what lies behind the target: nothing there is nearer to an axis than to the target itself."""
 
 SINE_SLACK = np.float32(1e-5)
 """Added to 1 - q^2: many times float32's rounding of it."""
 
 COSINE_SLACK = np.float32(2e-6)
-"""Added to |q|, likewise."""
+"""Added to |q|: many times float32's rounding of it."""
 
 TINY = np.float32(1e-30)
 """Keeps a division finite; far below any square of a length that matters."""
@@ -30,10 +30,11 @@ HUGE = np.float32(3e38)
 """More than any square of a length here."""
 
 ROOT = np.float32(1 - 1e-6)
-"""What float32 may take from a root is less than this takes."""
+"""Factor that lowers a bound by more than the rounding of its root to float32."""
 
 SOONER = np.float32(1e-6)
-"""Taken from a bound for each mm below the needle's top: of discs that an axis meets, the first has the least."""
+"""Taken from a bound for each mm below the needle's top: of discs that an axis intersects (all of bound 0), the first
+then has the least bound, and is tested first."""
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 
@@ -46,6 +47,12 @@ def disc_bounds(  # type: ignore[no-untyped-def]  # numba's own types
     typing_context, nodes, group, u, chord, length, slack, bounds, first
 ):
     """Lower bounds of the distance of every axis of a cone from the 16 discs of a group.
+
+        bound = hypot(lateral, beyond) - chord min(L, c.u + R + chord (|c| + R)) - slack
+        lateral = |w| - rho sqrt(1 - q^2) - h q,    w = c - (c.u) u,    q = |n.w| / |w|,    beyond = c.u - R - L
+
+    of a disc with centre c from the target, normal n, radius rho, half-thickness h, R = hypot(rho, h), and a needle of
+    length L. A disc wholly behind the target has the bound `NEVER`.
 
     Args:
         typing_context: Numba's; not given by the caller.
@@ -68,15 +75,16 @@ def _write_disc_bounds(context, builder, signature, arguments):  # type: ignore[
     ux, uy, uz = given.three(2)
     chord, length, slack = (given.number(place) for place in range(3, 6))
     cx, cy, cz, nx, ny, nz, rho, h, radius, reach = given.rows(0, 1, 10)
-    t = cx * ux + cy * uy + cz * uz
-    wx, wy, wz = cx - t * ux, cy - t * uy, cz - t * uz
+    t = cx * ux + cy * uy + cz * uz  # depth of the centre
+    wx, wy, wz = cx - t * ux, cy - t * uy, cz - t * uz  # and its position across the axis
     w = (wx * wx + wy * wy + wz * wz).root()
     inverse = given.constant(1.0) / (w + TINY)
     q = abs(nx * wx + ny * wy + nz * wz) * inverse
     sine = (abs(given.constant(1.0) - q * q) + SINE_SLACK).root()
+    # The last term: rounding e of w changes the sine by e / |w| at most.
     lateral = most(w - rho * sine - h * (q + COSINE_SLACK) - (rho + h) * slack * inverse, 0.0)
     beyond = most(t - radius - length, 0.0)
-    ahead = t + radius + chord * reach + slack
+    ahead = t + radius + chord * reach + slack  # no point of the disc is deeper on any axis of the cone
     bound = (lateral * lateral + beyond * beyond).root() * ROOT
     bound = (ahead > 0.0).choose(bound - (chord * least(ahead, length) + slack + slack), NEVER)
     given.write(6, 7, bound + (least(t, length) - length) * SOONER)
@@ -87,17 +95,17 @@ def _write_disc_bounds(context, builder, signature, arguments):  # type: ignore[
 def line_distances(  # type: ignore[no-untyped-def]  # as above
     typing_context, local, block, e, f, ox, oy, tolerance, squares, first
 ):
-    """Squared distances of a line from the triangles of a block, as they appear along the line.
+    """Squared distances of a line from the triangles of a block, projected on the plane across the line.
 
     Args:
-        typing_context: As above.
+        typing_context: Numba's; not given by the caller.
         local: Shape (b, 9, 16), float32, corners from the block's centre.
         block: Which.
         e: Three float32 numbers, first unit vector across the line.
         f: Three float32 numbers, the second.
         ox: The block's centre along e, from the line, mm.
-        oy: The same along f.
-        tolerance: A triangle whose edge functions all exceed this on one side counts as crossed; negative, mm^2.
+        oy: The block's centre along f, from the line, mm.
+        tolerance: Negative, mm^2: a triangle whose edge functions all exceed this on one side counts as crossed.
         squares: Shape (m, 16), float32; row ``first`` is written, mm^2.
         first: See ``squares``.
     """
@@ -115,6 +123,8 @@ def _write_line_distances(context, builder, signature, arguments):  # type: igno
         shadows.append((ox + px * ex + py * ey + pz * ez, oy + px * fx + py * fy + pz * fz))
     (ax, ay), (bx, by), (cx, cy) = shadows
     one = least(least(_edge(ax, ay, bx, by), _edge(bx, by, cx, cy)), _edge(cx, cy, ax, ay))
+    # Where the line may pass through the triangle (edge functions of one sign, up to rounding), the distance is 0: too
+    # small a distance costs a float64 test, too large a one would lose the triangle.
     wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
     over = least(least(wa, wb), wc) > tolerance
     under = most(most(wa, wb), wc) < -tolerance
@@ -124,7 +134,7 @@ def _write_line_distances(context, builder, signature, arguments):  # type: igno
 
 
 def _edge(px: Vector, py: Vector, qx: Vector, qy: Vector) -> Vector:
-    """Squared distances of the origin from segments of the plane: `_square`, a vector at a time."""
+    """Squared distances of the origin from 16 segments of the plane; `_square` of one."""
     dx, dy = qx - px, qy - py
     t = -(px * dx + py * dy) / (dx * dx + dy * dy + TINY)
     t = least(most(t, 0.0), 1.0)
@@ -133,15 +143,15 @@ def _edge(px: Vector, py: Vector, qx: Vector, qy: Vector) -> Vector:
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
-def heed_ends(local, block, lanes, u, depth, length, slack, squares, first):  # type: ignore[no-untyped-def]  # numba infers
-    """Correct `line_distances` for the axis' ends.
+def correct_for_ends(local, block, lanes, u, depth, length, slack, squares, first):  # type: ignore[no-untyped-def]  # numba infers
+    """Correct `line_distances`, which sees a line, for the ends of the axis.
 
-    What lies wholly beyond its top is that much farther away; what lies wholly behind the target is no candidate.
+    A triangle wholly beyond the top is farther away by that; one wholly behind the target is not measured.
 
     Args:
-        local: As above.
-        block: Which.
-        lanes: 16, as above.
+        local: See `line_distances`.
+        block: Row of the block.
+        lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
         u: Three float32 numbers, the direction of the line.
         depth: The block's centre along u, mm.
         length: Of the needle, mm.
@@ -165,18 +175,19 @@ def heed_ends(local, block, lanes, u, depth, length, slack, squares, first):  # 
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
-def lower_upper_bounds(frames, lanes, corners, length, error, upper):  # type: ignore[no-untyped-def]  # numba infers
-    """Let one triangle lower the upper bounds of a bundle's members, all at once.
+def tighten_upper_bounds(frames, lanes, corners, length, error, upper):  # type: ignore[no-untyped-def]  # numba infers
+    """Lower the upper bounds of a bundle's members to their distances from one triangle, all members at once.
 
-    Where the triangle lies next to the axis its nearest edge is taken, else its nearest corner.
+    Any point of the triangle gives an upper bound: where it lies next to the axis its nearest edge is taken, else its
+    nearest corner.
 
     Args:
         frames: Shape (9, 16), float32, each member's direction u, and e and f that complete it to a frame.
-        lanes: 16, as above.
+        lanes: `LANES`, as in `correct_for_ends`.
         corners: Nine float32 numbers, from the target, mm.
-        length: Of the needle, mm.
-        error: What float32 may take from a distance, mm.
-        upper: Shape (16,), float32, changed, mm.
+        length: Of the axes, mm.
+        error: Added to a distance for the rounding to float32, mm.
+        upper: Shape (16,), float32, lowered, mm.
     """
     px, py, pz, qx, qy, qz, rx, ry, rz = corners
     for k in range(lanes):
@@ -190,19 +201,19 @@ def lower_upper_bounds(frames, lanes, corners, length, error, upper):  # type: i
         one, two, three = _square(ax, ay, bx, by), _square(bx, by, cx, cy), _square(cx, cy, ax, ay)
         one = one if one < two else two
         one = one if one < three else three
-        a, b, c = _past(ta, length), _past(tb, length), _past(tc, length)
-        beside = (ta == a) & (tb == b) & (tc == c)
+        a, b, c = _clamped(ta, length), _clamped(tb, length), _clamped(tc, length)
+        lateral = (ta == a) & (tb == b) & (tc == c)  # all corners at depths of the axis
         a = ax * ax + ay * ay + (ta - a) * (ta - a)
         b = bx * bx + by * by + (tb - b) * (tb - b)
         c = cx * cx + cy * cy + (tc - c) * (tc - c)
         a = a if a < b else b
         a = a if a < c else c
-        one = np.sqrt(one if beside else a) + error
+        one = np.sqrt(one if lateral else a) + error
         upper[k] = one if one < upper[k] else upper[k]
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
-def _past(t, length):  # type: ignore[no-untyped-def]  # numba infers
+def _clamped(t, length):  # type: ignore[no-untyped-def]  # numba infers
     """A depth, clamped to 0..length."""
     t = t if t > ZERO else ZERO
     return t if t < length else length

@@ -160,7 +160,7 @@ class Arguments:
 
 
 @intrinsic  # type: ignore[untyped-decorator]  # numba's own types
-def at_most(typing_context: Any, rows: Any, row: Any, limit: Any) -> Any:
+def lanes_at_most(typing_context: Any, rows: Any, row: Any, limit: Any) -> Any:
     """Which lanes of ``rows[row]``, shape (m, 16), float32, do not exceed a limit: a bit each, lane 0 the lowest."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -185,8 +185,8 @@ def least_of(typing_context: Any, rows: Any, row: Any) -> Any:
 
 
 @intrinsic  # type: ignore[untyped-decorator]  # numba's own types
-def lowest(typing_context: Any, bits: Any) -> Any:
-    """Place of the lowest bit that is set; of 0, nothing that means anything."""
+def lowest_bit(typing_context: Any, bits: Any) -> Any:
+    """Place of the lowest bit that is set; meaningless for 0."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))

@@ -5,8 +5,8 @@ non-negative weights of its corners, and its distance from the axis is computed 
 however badly conditioned, can make the distance too small; and one of them is the nearest point (`axis_triangle`).
 
 `nearest_triangle` gives the target's own distance from a packed surface, an upper bound for every axis from there.
-`displaced_distance` measures an axis that is displaced again and again from the few faces near it: spheres around
-faces, and around blocks of 16, tell which faces may be skipped.
+`displaced_distance` measures axes displaced by little from the few faces near them; spheres around faces, and around
+blocks of 16, tell which faces may be skipped.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.lanes import LANES
 
 CONTACT_MM = 1e-10
-"""Below this the axis and the triangle meet: a thousand times the rounding of coordinates of 500 mm."""
+"""Nearer than this the axis and the triangle intersect: a thousand times the rounding of coordinates of 500 mm."""
 
 LEAST = 1e-300
 """Keeps a division by the square of an edge that is a point finite, mm^2."""
@@ -29,7 +29,7 @@ LEAST = 1e-300
 def axis_triangle(u, length, a, b, c):  # type: ignore[no-untyped-def]  # numba infers
     """Squared distance of the axis from a triangle, and the depth of the axis point nearest to it.
 
-    Where they meet the distance is 0 and the depth that of the first meeting point found.
+    Where they intersect the distance is 0 and the depth the least of the candidates that intersect.
 
     Args:
         u: Unit direction, three numbers; the axis starts at the origin.
@@ -42,13 +42,16 @@ def axis_triangle(u, length, a, b, c):  # type: ignore[no-untyped-def]  # numba 
     ax, ay, az = a
     bx, by, bz = b
     cx, cy, cz = c
+    # Candidates 1 to 3: the nearest point of each edge.
     best, depth = _edge(ux, uy, uz, length, ax, ay, az, bx, by, bz)
     best, depth = _nearer(best, depth, _edge(ux, uy, uz, length, bx, by, bz, cx, cy, cz))
     best, depth = _nearer(best, depth, _edge(ux, uy, uz, length, cx, cy, cz, ax, ay, az))
+    # Candidate 4: where the line pierces the face; the edge functions there are the point's weights.
     wa = _triple(ux, uy, uz, bx, by, bz, cx, cy, cz)
     wb, wc = _triple(ux, uy, uz, cx, cy, cz, ax, ay, az), _triple(ux, uy, uz, ax, ay, az, bx, by, bz)
     best, depth = _nearer(best, depth, _weighted(ux, uy, uz, length, ax, ay, az, bx, by, bz, cx, cy, cz, wa, wb, wc))
     ta, tb, tc = ax * ux + ay * uy + az * uz, bx * ux + by * uy + bz * uz, cx * ux + cy * uy + cz * uz
+    # Candidates 5 and 6: the foot on the face of each end of the axis, where the triangle reaches beyond that end.
     for end in range(2):
         s = 0.0 if end == 0 else length
         if (end == 0 and min(ta, tb, tc) < 0.0) or (end == 1 and max(ta, tb, tc) > length):
@@ -61,7 +64,7 @@ def axis_triangle(u, length, a, b, c):  # type: ignore[no-untyped-def]  # numba 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _nearer(best, depth, found):  # type: ignore[no-untyped-def]  # numba infers
-    """The nearer of two candidates; of two that are equally near, the one met first."""
+    """The nearer of two candidates; of two that are equally near, that of lesser depth."""
     if found[0] < best or (found[0] == best and found[1] < depth):
         return found[0], found[1]
     return best, depth
@@ -72,6 +75,7 @@ def _point(ux, uy, uz, length, x, y, z):  # type: ignore[no-untyped-def]  # numb
     """Squared distance of a point from the axis, and the depth of the axis point nearest to it."""
     t = x * ux + y * uy + z * uz
     s = min(max(t, 0.0), length)
+    # Across and along apart: |p - s u|^2 at once would lose what is small across to what is large along.
     px, py, pz = x - t * ux, y - t * uy, z - t * uz
     d2 = px * px + py * py + pz * pz + (t - s) * (t - s)
     return (0.0, s) if d2 < CONTACT_MM * CONTACT_MM else (d2, s)
@@ -80,7 +84,7 @@ def _point(ux, uy, uz, length, x, y, z):  # type: ignore[no-untyped-def]  # numb
 @nb.njit(cache=True, error_model="numpy")
 def _along(ux, uy, uz, length, px, py, pz, dx, dy, dz, up, down):  # type: ignore[no-untyped-def]  # numba infers
     """The candidate on the edge p + t d at t = up / down, clamped to 0..1."""
-    t = up / down if down > 0.0 else 0.0
+    t = up / down if down > 0.0 else 0.0  # an edge that is a point, or parallel to the axis
     t = min(max(t, 0.0), 1.0)
     return _point(ux, uy, uz, length, px + t * dx, py + t * dy, pz + t * dz)
 
@@ -94,29 +98,29 @@ def _edge(ux, uy, uz, length, px, py, pz, qx, qy, qz):  # type: ignore[no-untype
     """
     dx, dy, dz = qx - px, qy - py, qz - pz
     tp, td = px * ux + py * uy + pz * uz, dx * ux + dy * uy + dz * uz
-    fx, fy, fz = dx - td * ux, dy - td * uy, dz - td * uz
-    gx, gy, gz = px - tp * ux, py - tp * uy, pz - tp * uz
+    fx, fy, fz = dx - td * ux, dy - td * uy, dz - td * uz  # d across the axis
+    gx, gy, gz = px - tp * ux, py - tp * uy, pz - tp * uz  # p across the axis
     best, depth = _point(ux, uy, uz, length, px, py, pz)
-    up, down = -(gx * fx + gy * fy + gz * fz), fx * fx + fy * fy + fz * fz
+    up, down = -(gx * fx + gy * fy + gz * fz), fx * fx + fy * fy + fz * fz  # nearest to the line: least |g + t f|
     best, depth = _nearer(best, depth, _along(ux, uy, uz, length, px, py, pz, dx, dy, dz, up, down))
     low, high = min(tp, tp + td), max(tp, tp + td)
     if low < 0.0 or high > length:
-        up, down = -(px * dx + py * dy + pz * dz), dx * dx + dy * dy + dz * dz
+        up, down = -(px * dx + py * dy + pz * dz), dx * dx + dy * dy + dz * dz  # to the start: least |p + t d|
         best, depth = _nearer(best, depth, _along(ux, uy, uz, length, px, py, pz, dx, dy, dz, up, down))
-        up += length * td
+        up += length * td  # to the end: least |p + t d - length u|
         best, depth = _nearer(best, depth, _along(ux, uy, uz, length, px, py, pz, dx, dy, dz, up, down))
     return best, depth
 
 
 @nb.njit(cache=True, error_model="numpy")
 def _triple(ux, uy, uz, px, py, pz, qx, qy, qz):  # type: ignore[no-untyped-def]  # numba infers
-    """U . (p x q): on which side of the edge p-q the axis passes."""
+    """Triple product u . (p x q): its sign is the side of the edge p-q on which the axis passes."""
     return ux * (py * qz - pz * qy) + uy * (pz * qx - px * qz) + uz * (px * qy - py * qx)
 
 
 @nb.njit(cache=True, error_model="numpy")
 def _weighted(ux, uy, uz, length, ax, ay, az, bx, by, bz, cx, cy, cz, wa, wb, wc):  # type: ignore[no-untyped-def]  # numba infers
-    """The candidate with these weights, if they have one sign: then it is a point of the triangle."""
+    """The candidate with these weights of a, b and c, if they have one sign: then it is a point of the triangle."""
     total = wa + wb + wc
     same = (wa >= 0.0 and wb >= 0.0 and wc >= 0.0) or (wa <= 0.0 and wb <= 0.0 and wc <= 0.0)
     if not same or total == 0.0:
@@ -128,7 +132,7 @@ def _weighted(ux, uy, uz, length, ax, ay, az, bx, by, bz, cx, cy, cz, wa, wb, wc
 
 @nb.njit(cache=True, error_model="numpy")
 def _foot(qx, qy, qz, ax, ay, az, bx, by, bz, cx, cy, cz):  # type: ignore[no-untyped-def]  # numba infers
-    """Weights (not normalised) of the foot of a point's perpendicular on the triangle's plane."""
+    """Weights (not normalised) of the foot of q's perpendicular on the triangle's plane: where q + t n pierces it."""
     ax, ay, az, bx, by, bz, cx, cy, cz = (
         ax - qx, ay - qy, az - qz, bx - qx, by - qy, bz - qz, cx - qx, cy - qy, cz - qz,
     )  # fmt: skip
@@ -142,12 +146,12 @@ def _foot(qx, qy, qz, ax, ay, az, bx, by, bz, cx, cy, cz):  # type: ignore[no-un
 
 
 STACK = 512
-"""Groups of nodes that wait: at most 16 for each of a tree's levels, and 2^31 triangles have 8 levels."""
+"""Groups of nodes still to visit: at most 16 for each of a tree's levels, and 2^31 triangles have 8 levels."""
 
 
 @nb.njit(cache=True, error_model="numpy")
 def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-untyped-def]  # numba infers
-    """Distance of the target from a surface, mm, and the row of the nearest triangle.
+    """Distance of the target from a surface, mm, and the row of the nearest triangle: branch and bound over its tree.
 
     Args:
         triangles: See `Blocks`.
@@ -163,7 +167,7 @@ def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-
         waiting -= 1
         first, level = stack[waiting, 0], stack[waiting, 1]
         for k in range(LANES):
-            reach = nodes[first, 9, k] - 2 * nodes[first, 8, k]
+            reach = nodes[first, 9, k] - 2 * nodes[first, 8, k]  # (|c| + R) - 2 R: distance of the sphere
             if reach - slack - 1e-5 * abs(reach) >= distance:
                 continue
             child = (first - base[level]) * LANES + k
@@ -187,7 +191,7 @@ def _distance(triangles, row, target):  # type: ignore[no-untyped-def]  # numba 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def beyond(sphere, ox, oy, oz, ux, uy, uz, length, best):  # type: ignore[no-untyped-def]
-    """Whether all that a sphere holds is at least ``best`` from the axis."""
+    """Whether no point of a sphere (centre, radius) is nearer to the axis than ``best``."""
     x, y, z = sphere[0] - ox, sphere[1] - oy, sphere[2] - oz
     s = min(max(x * ux + y * uy + z * uz, 0.0), length)
     x, y, z = x - s * ux, y - s * uy, z - s * uz
@@ -197,7 +201,7 @@ def beyond(sphere, ox, oy, oz, ux, uy, uz, length, best):  # type: ignore[no-unt
 
 @nb.njit(cache=True, error_model="numpy")
 def displaced_distance(triangles, faces, blocks, origin, outward, length, enough, hint):  # type: ignore[no-untyped-def]
-    """Distance of an axis from faces, mm, and the row of the nearest; or of any face that is nearer than ``enough``.
+    """Distance of an axis from faces, mm, and the row of the nearest; or of some face nearer than ``enough``.
 
     Args:
         triangles: Shape (m, 9), corners, mm.
@@ -206,13 +210,13 @@ def displaced_distance(triangles, faces, blocks, origin, outward, length, enough
         origin: Three numbers, where the axis starts, mm.
         outward: Three numbers, unit.
         length: Of the axis, mm.
-        enough: The search ends at a face nearer than this, mm.
-        hint: Row to begin with.
+        enough: The search ends at a face nearer than this, mm; negative to find the nearest.
+        hint: Row to begin with, the last axis' nearest: the better the first distance, the more is skipped.
     """
     ox, oy, oz = origin
     ux, uy, uz = outward
     best, nearest = np.inf, hint
-    if len(triangles) > 0:  # where the last axis was nearest, first
+    if len(triangles) > 0:
         best = _face(triangles, hint, ox, oy, oz, outward, length)
     for block in range(len(blocks)):
         if best < enough:
@@ -245,23 +249,23 @@ def displaced_distances(triangles, faces, blocks, origins, outward, length, dist
 
 
 GROWN = 1 + 1e-9
-"""Spheres are grown by more than the rounding of what made them."""
+"""Factor by which a sphere's radius is grown, more than the rounding of its centre and radius."""
 
 
 @nb.njit(cache=True, error_model="numpy")
 def blocks_near(center, disc, count, origin, outward, length, reach):  # type: ignore[no-untyped-def]  # numba infers
-    """Rows of the blocks that may lie within reach of an axis, and how near each may be.
+    """Rows of the blocks that may lie within reach of an axis, and a lower bound of each one's distance less the reach.
 
     Args:
         center: Shape (nodes, 3), of `Blocks`, mm; the first are the blocks.
         disc: Shape (5, nodes), of `Blocks`.
-        count: Blocks there are.
+        count: How many blocks there are.
         origin: Shape (3,), where the axis starts, mm.
         outward: Shape (3,), unit.
         length: Of the axis, mm.
         reach: At its start and at its end, mm; linear in between.
     """
-    found, bounds, kept = np.empty(count, np.int64), np.empty(count), 0
+    near, bounds, n_near = np.empty(count, np.int64), np.empty(count), 0
     start, slope = reach[0], (reach[1] - reach[0]) / max(length, 1e-9)
     tilt = math.sqrt(max(1.0 - slope * slope, 0.0))
     for block in range(count):
@@ -273,9 +277,9 @@ def blocks_near(center, disc, count, origin, outward, length, reach):  # type: i
         s = min(max(along + slope * across / max(tilt, 1e-3), 0.0), length)
         bound = math.hypot(across, along - s) - slope * s if tilt > 1e-3 else -abs(slope) * length
         if bound - radius <= start:
-            found[kept], bounds[kept] = block, bound - radius
-            kept += 1
-    return found[:kept], bounds[:kept]
+            near[n_near], bounds[n_near] = block, bound - radius
+            n_near += 1
+    return near[:n_near], bounds[:n_near]
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -290,7 +294,7 @@ def spheres_around(triangles, faces, blocks):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, error_model="numpy")
 def _sphere(points, sphere):  # type: ignore[no-untyped-def]
-    """About the middle of the points' box."""
+    """Fill a sphere around points, with its centre in the middle of their box."""
     for x in range(3):
         low, high = points[0, x], points[0, x]
         for k in range(1, len(points)):

@@ -1,9 +1,10 @@
 """Exact distances of many axes from many triangles, in float64, pair by pair.
 
-Each pair is brought into the frame of its axis. Most triangles lie next to their axis, where the distance is that of
-their projection on the plane across it; those are all measured in one loop without a branch, the few others singly.
-As in `segment_triangle.py`, every distance is that of a point *of the triangle*.
-`Scratch` holds the arrays in which one structure is searched: made once, passed down as one.
+Each pair is brought into the frame of its axis. Most triangles lie next to their axis, at depths of 0 to its length:
+there the distance is that of their projection on the plane across it. These are all measured in one loop without a
+branch, the few others singly. As in `segment_triangle.py`, every distance is that of a point *of the triangle*.
+
+`Scratch` holds the working arrays of the search of one structure.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ ROWS = 12
 """Rows of a buffer of pairs: nine coordinates, squared distance, depth, length of the axis."""
 
 UNDECIDED, BEYOND = -1.0, -2.0
-"""In place of a squared distance: `axis_triangle` must be asked; the triangle lies wholly beyond the axis' top."""
+"""Marks in place of a squared distance: left to `axis_triangle`; the triangle lies wholly beyond the axis' top."""
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
@@ -36,43 +37,45 @@ def bring_into_frame(u, e, f, triangles, row, origin, pairs, k):  # type: ignore
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
-def measure_beside(pairs, count):  # type: ignore[no-untyped-def]  # numba infers
-    """Answer the pairs whose triangle lies next to the axis or is pierced by it; mark the others.
+def measure_lateral(pairs, count):  # type: ignore[no-untyped-def]  # numba infers
+    """Measure the pairs whose triangle lies next to the axis or is pierced by it; mark the others.
 
     Args:
         pairs: Shape (12, m); rows 0 to 8 as `bring_into_frame` writes them, row 11 the axes' lengths; rows 9
             and 10 are written: squared distance (or `UNDECIDED`, `BEYOND`), and the depth of the axis' nearest point.
         count: Pairs there are.
     """
-    for k in range(count):
+    for k in range(count):  # selects, no branches: the compiler makes vectors of it
         ax, ay, ta, bx, by, tb = pairs[0, k], pairs[1, k], pairs[2, k], pairs[3, k], pairs[4, k], pairs[5, k]
         cx, cy, tc, length = pairs[6, k], pairs[7, k], pairs[8, k], pairs[11, k]
+        # The axis is the origin of the plane across it: the distance of the projected edges from there.
         best, depth = _shadow(ax, ay, ta, bx, by, tb)
         two, two_depth = _shadow(bx, by, tb, cx, cy, tc)
         three, three_depth = _shadow(cx, cy, tc, ax, ay, ta)
         depth, best = two_depth if two < best else depth, two if two < best else best
         depth, best = three_depth if three < best else depth, three if three < best else best
+        # Edge functions: of one sign where the line passes through the triangle; over their sum, the point's weights.
         wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
         around = ((wa >= 0.0) & (wb >= 0.0) & (wc >= 0.0)) | ((wa <= 0.0) & (wb <= 0.0) & (wc <= 0.0))
         outside = (ta < 0.0) | (tb < 0.0) | (tc < 0.0) | (ta > length) | (tb > length) | (tc > length)
-        fraction = 1.0 / (wa + wb + wc)
+        fraction = 1.0 / (wa + wb + wc)  # of a sum of 0 not finite: every comparison below is then false
         x, y = (wa * ax + wb * bx + wc * cx) * fraction, (wa * ay + wb * by + wc * cy) * fraction
         pierced = (wa * ta + wb * tb + wc * tc) * fraction
         pierces = around & (x * x + y * y < CONTACT_MM * CONTACT_MM) & (pierced >= 0.0) & (pierced <= length)
-        pierces &= best >= CONTACT_MM  # else the axis may run along the triangle's plane and meet it earlier
+        pierces &= best >= CONTACT_MM  # else the axis may run along the triangle's plane and intersect it earlier
         best = UNDECIDED if around | outside | (best < CONTACT_MM) else best
         best = BEYOND if (ta > length) & (tb > length) & (tc > length) else best
         pairs[9, k], pairs[10, k] = 0.0 if pierces else best, pierced if pierces else depth
 
 
 @nb.njit(cache=True, error_model="numpy")
-def measure_other(pairs, k):  # type: ignore[no-untyped-def]  # numba infers
-    """Squared distance and depth of a pair that `measure_beside` has marked."""
+def measure_marked(pairs, k):  # type: ignore[no-untyped-def]  # numba infers
+    """Squared distance and depth of a pair that `measure_lateral` has marked."""
     a, b, c = (pairs[0, k], pairs[1, k], pairs[2, k]), (pairs[3, k], pairs[4, k], pairs[5, k]), (
         pairs[6, k], pairs[7, k], pairs[8, k],
     )  # fmt: skip
     length = pairs[11, k]
-    if pairs[9, k] == BEYOND:
+    if pairs[9, k] == BEYOND:  # the nearest axis point is the top
         top = (0.0, 0.0, length)
         return _origin_triangle(_minus(a, top), _minus(b, top), _minus(c, top)), length
     return axis_triangle((0.0, 0.0, 1.0), length, a, b, c)
@@ -80,7 +83,10 @@ def measure_other(pairs, k):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _shadow(px, py, tp, qx, qy, tq):  # type: ignore[no-untyped-def]  # numba infers
-    """Squared distance of the origin from an edge's shadow p-q, and the depth there (at p and q ``tp`` and ``tq``)."""
+    """Squared distance of the origin from an edge p-q projected across the axis, and the depth of its nearest point.
+
+    ``tp`` and ``tq`` are the depths of p and q.
+    """
     dx, dy = qx - px, qy - py
     t = -(px * dx + py * dy) / (dx * dx + dy * dy + LEAST)
     t = t if t > 0.0 else 0.0
@@ -116,19 +122,16 @@ def _origin_edge(p, q):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _minus(p, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Difference of two vectors."""
     return p[0] - q[0], p[1] - q[1], p[2] - q[2]
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _inner(p, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Inner product of two vectors."""
     return p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _cross(p, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Cross product of two vectors."""
     return p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]
 
 
@@ -139,29 +142,29 @@ PAIRS = 64
 """Pairs of a direction and a block that are tested side by side."""
 
 APART = 8
-"""Columns by which rows of ``corners`` exceed a power of two, which would put them all in the same cache lines."""
+"""Columns added to a row of ``corners``: rows of a power of two would all compete for the same cache lines."""
 
 
 class Scratch(NamedTuple):
     """Scratch arrays for one bundle of at most 16 directions.
 
     Attributes:
-        found: Shape (r,), the blocks that the bundle may have to look at.
-        chosen: Shape (g, 10, 16), float32, their nodes side by side.
+        blocks: Shape (r,), the blocks that may come near to some member of the bundle.
+        chosen: Shape (g, 10, 16), float32, the nodes of these blocks, in groups.
         bounds: Shape (16 g, 16), float32, their bounds: of member m and group j in row m g' + j, g' groups being used.
-        stack: Shape (512, 2), groups of the tree that wait, and their level.
+        stack: Shape (512, 2), groups of the tree that are still to visit, and their level.
         frames: Shape (9, 16), each member's direction u, and e and f that complete it to a frame.
-        frames32: The same as float32.
-        upper: Shape (16,), float32, above each member's distance, mm.
-        pairs: Shape (64, 2), members, and places in ``found``.
-        squares: Shape (64, 16), float32, each pair's distances from its 16 triangles, mm^2.
-        least: Shape (64,), float32, the least of them.
-        errors: Shape (64,), float32, by how much such a distance may err, mm.
+        frames32: ``frames`` as float32.
+        upper: Shape (16,), float32, upper bound of each member's distance, mm.
+        pairs: Shape (64, 2), members, and rows of ``blocks``.
+        squares: Shape (64, 16), float32, squared distances of each pair's axis from its 16 triangles, mm^2.
+        least: Shape (64,), float32, the least of each pair's ``squares``.
+        errors: Shape (64,), float32, how much the root of a pair's ``squares`` may err, mm.
         tried: Shape (1024, 2), members, and rows of triangles.
-        corners: Shape (12, 1032), see `side_by_side.measure_beside`.
+        corners: Shape (12, 1032), see `measure_lateral`.
     """
 
-    found: NDArray[np.int64]
+    blocks: NDArray[np.int64]
     chosen: NDArray[np.float32]
     bounds: NDArray[np.float32]
     stack: NDArray[np.int64]
@@ -176,8 +179,8 @@ class Scratch(NamedTuple):
     corners: NDArray[np.float64]
 
 
-class Found(NamedTuple):
-    """Output of a search: squared distance (mm^2), depth (mm), nearest triangle of each axis; `COUNTED`."""
+class SearchOutput(NamedTuple):
+    """Output of a search: squared distance (mm^2), depth (mm), nearest triangle of each axis; counts as `COUNTED`."""
 
     square: NDArray[np.float64]
     depth: NDArray[np.float64]
@@ -186,13 +189,13 @@ class Found(NamedTuple):
 
 
 class NeedleAxes(NamedTuple):
-    """Start and length of all axes, and two float32 numbers.
+    """Start and length of the axes of a search.
 
     Attributes:
-        target: Three numbers, mm.
-        length: Shape (n,), of each axis, in the tiles' order, mm.
-        longest: Of those of one bundle.
-        slack: Rounding of a node's coordinate, mm.
+        target: Three numbers, where all start, mm.
+        length: Shape (n,), of each axis, in the bundles' order, mm.
+        longest: Length of the longest axis of the bundle, float32, mm.
+        slack: Rounding of a node's coordinate, float32, mm.
     """
 
     target: Any
@@ -205,7 +208,7 @@ def scratch_for(groups: int) -> Scratch:
     """Scratch arrays for bundles that may have to test all of ``groups`` groups of blocks."""
     size = groups + 1
     return Scratch(
-        found=np.empty(size * LANES, np.int64),
+        blocks=np.empty(size * LANES, np.int64),
         chosen=np.empty((size, NODE_ROWS, LANES), np.float32),
         bounds=np.empty((size * LANES, LANES), np.float32),
         stack=np.empty((STACK, 2), np.int64),

@@ -188,6 +188,7 @@ def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
     lower, upper, count = -math.inf, math.inf, 0
     i, j = at[0], at[1]
     for _ in range(SUPPORTS):
+        # Support: the first hull's corner farthest along the direction, less the second's farthest against it.
         bx = M[0, 0] * x + M[1, 0] * y + M[2, 0] * z
         by = M[0, 1] * x + M[1, 1] * y + M[2, 1] * z
         bz = M[0, 2] * x + M[1, 2] * y + M[2, 2] * z
@@ -196,11 +197,12 @@ def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
         wx = corners[i, 0] - (M[0, 0] * qx + M[0, 1] * qy + M[0, 2] * qz + M[0, 3])
         wy = corners[i, 1] - (M[1, 0] * qx + M[1, 1] * qy + M[1, 2] * qz + M[1, 3])
         wz = corners[i, 2] - (M[2, 0] * qx + M[2, 1] * qy + M[2, 2] * qz + M[2, 3])
-        gap = -(wx * x + wy * y + wz * z)
+        gap = -(wx * x + wy * y + wz * z)  # a plane across the direction separates them by so much: a lower bound
         if gap > lower:
             lower, axis[0], axis[1], axis[2] = gap, x, y, z
         if lower > needed or (upper <= needed and lower >= TIGHT * upper):
             break
+        # The simplex with the new point: its point v nearest to the origin gives the upper bound |v|.
         S[count, 0], S[count, 1], S[count, 2] = wx, wy, wz
         p, q, r, vx, vy, vz = count, -1, -1, wx, wy, wz
         if count == 1:
@@ -210,16 +212,16 @@ def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
         elif count == 3:
             p, q, r, vx, vy, vz = _nearest_of_tetrahedron(S)
         before, squared = upper, vx * vx + vy * vy + vz * vz
-        if p < 0 or squared <= ROUNDING_MM2:
+        if p < 0 or squared <= ROUNDING_MM2:  # the origin is in the simplex: the hulls share a point
             lower, upper = TOUCHING, 0.0
             if count < 3:
                 S[3, 0] = math.nan
             break
         upper = math.sqrt(squared)
-        if upper >= before * ONWARD:
+        if upper >= before * ONWARD:  # no progress but rounding
             upper = before
             break
-        count = _keep(S, p, q, r)
+        count = _keep(S, p, q, r)  # the corners that v does not depend on are dropped
         x, y, z = -vx / upper, -vy / upper, -vz / upper
     at[0], at[1] = i, j
     return lower, upper
@@ -246,7 +248,7 @@ def deep(S, mm):
 
 @allocation_free(fastmath={"nnan", "ninf", "nsz", "reassoc", "contract"})
 def _extreme(px, py, pz, x, y, z):
-    """The largest projection of points on a direction. Its inputs are finite: that lets it run four abreast."""
+    """The largest projection of points on a direction; they are finite, so fastmath may take four at a time."""
     best = -1e300
     for i in range(len(px)):
         best = max(best, x * px[i] + y * py[i] + z * pz[i])
@@ -255,7 +257,7 @@ def _extreme(px, py, pz, x, y, z):
 
 @allocation_free()
 def _plane_gap(axes, starts, first, second, M, x, y, z):
-    """The gap between two hulls along a direction, by all of some corners."""
+    """Gap between two hulls projected on a direction, over all their corners, mm."""
     cx, cy, cz = axes
     bx = M[0, 0] * x + M[1, 0] * y + M[2, 0] * z
     by = M[0, 1] * x + M[1, 1] * y + M[2, 1] * z
@@ -302,10 +304,10 @@ def hull_gap(hulls, first, second, M, axis, at, needed, S):
         first: The one.
         second: The other.
         M: See :func:`distance_bounds`.
-        axis: As there; where it is zero the search begins anew.
-        at: As there.
-        needed: As there.
-        S: Scratch, as there.
+        axis: See :func:`distance_bounds`; zero begins the search anew.
+        at: See :func:`distance_bounds`.
+        needed: See :func:`distance_bounds`.
+        S: See :func:`distance_bounds`.
     """
     if axis[0] == 0.0 and axis[1] == 0.0 and axis[2] == 0.0:
         at[0], at[1] = hulls.starts[first], hulls.starts[second]
@@ -314,6 +316,8 @@ def hull_gap(hulls, first, second, M, axis, at, needed, S):
     lower, _ = distance_bounds(hulls.corners, starts, ends, M, axis, at, needed, S)
     if lower > 0.0:
         x, y, z = axis[0], axis[1], axis[2]
+        # Climbing over neighbours may end at a corner that rounding favours: all corners confirm the gap, first those
+        # of a coarser hull around each (looser by `slack`), which are fewer.
         gap = _plane_gap(hulls.few, hulls.few_starts, first, second, M, x, y, z)
         gap -= hulls.slack[first] + hulls.slack[second]
         if gap <= 0.0 or gap <= needed < lower:  # else all corners prove no more that is of use

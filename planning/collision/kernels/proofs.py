@@ -1,7 +1,8 @@
 """Compiled proofs that parts of an arm are clear, check by check, at states and in boxes of joint angles about them.
 
-Each bound is a lower one on a distance, in mm: above 0 it proves that nothing touches; at or below, it proves nothing.
-The bounds themselves are those of `surfaces` and `hulls`.
+Each bound is a lower bound of a distance, mm: above ``MIN_GAP_MM`` it proves that nothing touches; else it proves
+nothing. The bounds of two hulls are in `hulls`, those of a body and the skin in `surfaces`. Along a path a gap proves
+more than one state: it holds until the bodies may have moved by as much (`first_unproven`).
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -27,10 +28,10 @@ MIN_GAP_MM = 1e-3
 """What a gap must exceed to prove anything: far above the rounding of these sums (1e-10 mm) and FCL's tolerance."""
 
 ENOUGH_MM = 12.0
-"""Along a path a larger gap saves questions; beyond this it is not worth a closer look."""
+"""Gap from which on no tighter bound is sought along a path: the larger a gap, the later the check is due again."""
 
 FAR_MM = 200.0
-"""Larger distances to the skin are not distinguished."""
+"""Distance from the skin up to which a search is worth it: larger ones are reported as this."""
 
 
 class SkinTree(NamedTuple):
@@ -47,7 +48,7 @@ class SkinTree(NamedTuple):
 
 
 class ProofScene(NamedTuple):
-    """The checks of a cell and what they are about."""
+    """The checks of a workcell, and the geometry of what they compare."""
 
     checks: Ints
     """Shape (k, 5): kind, first, second, and the frames of both. Both are rows of hulls; for ``SKIN`` the first is that
@@ -72,12 +73,12 @@ class Movers(NamedTuple):
 
 
 class ProofScratch(NamedTuple):
-    """Memory and scratch of the search for a proof: see :func:`scratch`."""
+    """Scratch of the search for a proof, and where each check's last search ended: see :func:`proof_scratch`."""
 
     axes: Floats
-    """Shape (k, 3): the last direction of each check; zero to begin anew."""
+    """Shape (k, 3): each check's last separating direction, with which the next search begins; zero for none."""
     corners: Ints
-    """Shape (k, 2): the last corners."""
+    """Shape (k, 2): the corners of its last search."""
     spheres: Floats
     """Shape (h, 3), mm: where the centres of the hulls' spheres are."""
     stack: Ints
@@ -87,7 +88,7 @@ class ProofScratch(NamedTuple):
 
 
 @nb.njit(cache=True)
-def scratch(checks, hulls):
+def proof_scratch(checks, hulls):
     """Scratch for so many checks and hulls."""
     axes, corners, spheres = np.zeros((checks, 3)), np.zeros((checks, 2), np.int64), np.empty((hulls, 3))
     stacks = np.empty(STACK, np.int64), np.empty(STACK, np.int64)
@@ -127,7 +128,7 @@ def sphere_gap(is_box, first, second, spheres, radii, T_box_base, halves):
 
 @allocation_free()
 def _between(A, B, M):
-    """Fill ``M`` (3, 4) with frame B (4, 4) as frame A sees it."""
+    """Fill ``M`` (3, 4) with the upper rows of inv(A) B, for poses A and B (4, 4)."""
     for i in range(3):
         M[i, 3] = 0.0
         for k in range(3):
@@ -137,9 +138,10 @@ def _between(A, B, M):
 
 @allocation_free()
 def near_gap(scene, work, at, frames, enough, far, needed):
-    """Lower bound on the distance of check ``at``, the arm standing at ``frames`` (7, 4, 4); of use above ``needed``.
+    """Lower bound on the distance of the bodies of check ``at``, the arm at ``frames`` (7, 4, 4), mm.
 
-    See :func:`skin_gap` and :func:`hull_gap`; ``TOUCHING`` is certain.
+    The search ends where the bound cannot come above ``needed``. ``TOUCHING`` says that they certainly touch. See
+    :func:`skin_gap` and :func:`hull_gap`.
     """
     kind, second, frame_a, frame_b = scene.checks[at, 0], scene.checks[at, 2], scene.checks[at, 3], scene.checks[at, 4]
     if kind == SKIN:
@@ -152,9 +154,9 @@ def near_gap(scene, work, at, frames, enough, far, needed):
 
 @allocation_free(inline="always")
 def state_gap(scene, work, at, frames, enough, far, needed):
-    """Lower bound as of :func:`near_gap`, sooner where the spheres about two hulls are ``enough`` apart.
+    """Lower bound as :func:`near_gap`, or that of the bounding spheres where it is above ``enough``, which is faster.
 
-    The spheres are where :func:`place_spheres` has put them.
+    ``work.spheres`` must be filled by :func:`place_spheres`.
     """
     kind, first, second = scene.checks[at, 0], scene.checks[at, 1], scene.checks[at, 2]
     if kind != SKIN:
@@ -167,22 +169,22 @@ def state_gap(scene, work, at, frames, enough, far, needed):
 
 @allocation_free()
 def _moved_apart(checks, levers, motion, at, row):
-    """How far the two bodies of a check may have moved against one another since a path's first state, mm."""
+    """Upper bound on how far the bodies of a check have moved against one another since a path's first state, mm."""
     kind, frame_a, frame_b = checks[at, 0], checks[at, 3], checks[at, 4]
     _, moved_mm, rotated = motion
-    if kind != PAIR:
+    if kind != PAIR:  # the other body, skin or box, stays where it is
         return moved_mm[row, frame_b]
     path = 0.0
-    for joint in range(frame_a, frame_b):
+    for joint in range(frame_a, frame_b):  # only the joints between them move two bodies of the arm apart
         path += levers[at, joint] * rotated[row, joint]
     return path
 
 
 @allocation_free()
 def _due(checks, levers, motion, at, row, proven):
-    """The first state after ``row`` at which the two bodies of a check may have moved by ``proven``, mm, or more.
+    """The first state after ``row`` at which the bodies of a check may have moved by ``proven``, mm, or more.
 
-    Found by halving, for what they may have moved only grows; the number of states where there is none.
+    Found by halving, for the bound on their motion never falls. The number of states where there is none.
     """
     low, high = row + 1, len(motion[0])
     while low < high:
@@ -208,8 +210,9 @@ def _earliest(due, tested):
 def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
     """The next state and check, in order, that the bounds do not prove to be more than ``clear_mm`` apart.
 
-    A check whose gap was g stays clear until its two bodies have moved by g - ``clear_mm`` against one another: that is
-    where it is due again. One that is not proven is due at the next state, so that a further call goes on from there.
+    A check whose gap was g stays clear until its two bodies have moved by g - ``clear_mm`` against one another
+    (conservative advancement): there it is due again. One that is not proven is due at the next state, so that a
+    further call goes on from there.
 
     Args:
         scene: See :class:`ProofScene`.
@@ -229,7 +232,7 @@ def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
     frames, checks = motion[0], scene.checks
     enough, far = (clear_mm + ENOUGH_MM, clear_mm + FAR_MM) if len(frames) > 1 else (clear_mm, clear_mm + MIN_GAP_MM)
     row = _earliest(due, tested)
-    while row < len(frames):
+    while row < len(frames):  # states at which no check is due are skipped
         place_spheres(scene.hulls, frames[row], work.spheres)
         for at in range(len(checks)):
             if not tested[at] or due[at] > row:
@@ -245,12 +248,13 @@ def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
 
 
 @allocation_free()
-def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
-    """How far a body may move while each joint rotates by at most a fraction of ``turns`` (6,), rad, either way.
+def paths_about(frames, body_frame, centre, radius, rotations, fraction, paths):
+    """Fill ``paths`` (7,), mm: how far a body may move while joints rotate by a fraction of ``rotations`` (6,), rad.
 
-    Fills ``paths`` (7,), mm: entry j bounds the motion against the frame before joint j, the arm standing at ``frames``
-    (7, 4, 4) in the middle. A point's distance from axis j is at most that of the body's sphere, plus what the joints
-    beyond have moved it against that axis.
+        paths[j] = paths[j + 1] + fraction rotations[j] (distance of centre and axis j + radius + paths[j + 1])
+
+    Entry j bounds the motion against the frame before joint j, either way from the arm at ``frames`` (7, 4, 4): a point
+    is no farther from axis j than its body's bounding sphere, plus what the joints beyond j have moved it.
     """
     x, y, z = moved(frames[body_frame], centre)
     paths[body_frame] = 0.0
@@ -259,21 +263,21 @@ def paths_about(frames, body_frame, centre, radius, turns, fraction, paths):
         ax, ay, az = frames[joint, 0, 2], frames[joint, 1, 2], frames[joint, 2, 2]
         cx, cy, cz = dy * az - dz * ay, dz * ax - dx * az, dx * ay - dy * ax
         lever = math.sqrt(cx * cx + cy * cy + cz * cz) + radius + paths[joint + 1]
-        paths[joint] = paths[joint + 1] + fraction * turns[joint] * lever
+        paths[joint] = paths[joint + 1] + fraction * rotations[joint] * lever
 
 
 @nb.njit(cache=True)
-def clear_about(scene, movers, frames, turns, work, gaps, unproven):
-    """Which checks are not proven clear at some states and wherever each joint rotates by ``turns`` from them.
+def clear_about(scene, movers, frames, rotations, work, gaps, unproven):
+    """Prove checks clear in boxes of joint angles: wherever each joint is within ``rotations`` of some states.
 
     Args:
         scene: See :class:`ProofScene`.
         movers: See :class:`Movers`.
         frames: Shape (m, 7, 4, 4), mm: the states.
-        turns: Shape (6,), rad.
+        rotations: Shape (6,), rad.
         work: See :class:`ProofScratch`.
-        gaps: Shape (m, k): filled with the bound at the state itself, ``TOUCHING`` included, for what is tested.
-        unproven: Shape (m, k): True where a check is tested; left so where nothing is proven.
+        gaps: Shape (m, k): filled, for what is tested, with the bound at the state itself, or ``TOUCHING``.
+        unproven: Shape (m, k): True where a check is to be tested; set to False where it is proven clear.
     """
     paths = np.empty(7)
     for row in range(len(frames)):
@@ -281,7 +285,7 @@ def clear_about(scene, movers, frames, turns, work, gaps, unproven):
             if unproven[row, at]:
                 mover = movers.of_check[at]
                 sphere = movers.centres[mover], movers.radii[mover]
-                paths_about(frames[row], movers.frames[mover], sphere[0], sphere[1], turns, 1.0, paths)
+                paths_about(frames[row], movers.frames[mover], sphere[0], sphere[1], rotations, 1.0, paths)
                 path = paths[scene.checks[at, 3]] + MIN_GAP_MM
                 gaps[row, at] = near_gap(scene, work, at, frames[row], path, path + MIN_GAP_MM, path)
                 unproven[row, at] = gaps[row, at] <= path

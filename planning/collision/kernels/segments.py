@@ -28,20 +28,20 @@ from puncture_twin.planning.collision.kernels.proofs import (
     paths_about,
     place_sphere,
     place_spheres,
-    scratch,
+    proof_scratch,
     sphere_gap,
 )
 
 KEPT = 0.8
-"""Fraction of the clearance at the nearer end of a segment that all of it is to keep: bounds are loose by up to a
-tenth."""
+"""Fraction of the clearance at the nearer end of a segment that the whole segment must keep: bounds are loose by up to
+a tenth."""
 
 
 @allocation_free()
-def _keep(scene, segment, clear_mm, room):
-    """Fills ``kept`` (k,), mm: what a check is to keep, ``clear_mm`` or as much as the nearer end does (``KEPT``)."""
+def _keep(scene, segment, clear_mm, scratch):
+    """Fill ``kept`` (k,), mm: the clearance that each check must keep, ``clear_mm`` or ``KEPT`` of the nearer end's."""
     checks, hulls, T_box_base, halves = scene.checks, scene.hulls, scene.T_box_base, scene.halves
-    kept, work, frames, enough = room.kept, room.work, segment.frames[0], clear_mm / KEPT
+    kept, work, frames, enough = scratch.kept, scratch.work, segment.frames[0], clear_mm / KEPT
     for at in range(len(checks)):
         kept[at] = 0.0 if checks[at, 0] == PAIR else clear_mm
     for end in (0.0, 1.0):
@@ -60,9 +60,9 @@ def _keep(scene, segment, clear_mm, room):
 
 @allocation_free()
 def _bound(scene, work, at, frames, needed):
-    """Lower bound on the distance of a check, of use above ``needed``: of the spheres about two hulls where they tell.
+    """Lower bound on the distance of a check's bodies: by bounding spheres where they decide, else by `near_gap`.
 
-    Spheres whose middles are nearer than ``needed`` are about hulls that are, so no closer look proves more.
+    They decide where their gap exceeds ``needed``, and where it cannot: their centres are then nearer than that.
     """
     checks, hulls = scene.checks, scene.hulls
     kind, first, second = checks[at, 0], checks[at, 1], checks[at, 2]
@@ -78,14 +78,14 @@ def _bound(scene, work, at, frames, needed):
 
 
 @allocation_free()
-def _prove(scene, movers, segment, at, within, fine_mm, room, answer):
-    """Whether a check surely finds something, or keeps less than it is to; else what is left to query joins the answer.
+def _prove(scene, movers, segment, at, within, fine_mm, scratch, answer):
+    """Prove one check clear in the part ``within`` (low, high) of the segment; True where it certainly is not.
 
-    Looked at is the part ``within`` (low, high) of the segment. Its middle clears what lies nearer to it than its gap
-    allows to move; the rest is checked in the same way, by the middles of what is left on either side.
+    The middle's gap clears the states up to which the bodies cannot move that far (adaptive bisection); what is left on
+    either side is checked likewise. States where neither is proven are added to the answer's queries.
     """
-    mover, frame_a, frames, paths = movers.of_check[at], scene.checks[at, 3], segment.frames[0], room.paths[0]
-    work, parts, kept_mm = room.work, room.parts, room.kept[at]
+    mover, frame_a, frames, paths = movers.of_check[at], scene.checks[at, 3], segment.frames[0], scratch.paths[0]
+    work, parts, kept_mm = scratch.work, scratch.parts, scratch.kept[at]
     kept = kept_mm + MIN_GAP_MM
     parts[0, 0], parts[0, 1], top = within[0], within[1], 1
     while top > 0:
@@ -94,7 +94,7 @@ def _prove(scene, movers, segment, at, within, fine_mm, room, answer):
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         place_arm(segment, middle)
         sphere = movers.centres[mover], movers.radii[mover]
-        paths_about(frames, movers.frames[mover], sphere[0], sphere[1], segment.turns, half, paths)
+        paths_about(frames, movers.frames[mover], sphere[0], sphere[1], segment.rotations, half, paths)
         needed = paths[frame_a] + kept
         gap = _bound(scene, work, at, frames, needed)
         if gap > needed:
@@ -103,11 +103,12 @@ def _prove(scene, movers, segment, at, within, fine_mm, room, answer):
             answer.status[STATUS], answer.status[CHECK] = CONTACT, at
             return True
         if paths[frame_a] > fine_mm:
+            # The bodies move in proportion to the distance from the middle: the gap suffices for this much of it.
             clear = half * max(0.0, gap - kept) / (needed - kept_mm)
             parts[top, 0], parts[top, 1] = low, middle - clear
             parts[top + 1, 0], parts[top + 1, 1] = middle + clear, high
             top += 2
-        elif gap <= kept:
+        elif gap <= kept:  # the part is too short to divide: its middle decides
             if kept_mm > 0.0:
                 answer.status[STATUS], answer.status[CHECK] = CONTACT, at
                 return True
@@ -119,8 +120,8 @@ def _prove(scene, movers, segment, at, within, fine_mm, room, answer):
 
 
 @nb.njit(cache=True)
-def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_mm, clear_mm, order, room, answer):
-    """Check a straight joint segment: fills ``answer``.
+def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_mm, clear_mm, order, scratch, answer):
+    """Check a straight joint segment, and fill ``answer``.
 
     Args:
         scene: See :class:`ProofScene`.
@@ -128,12 +129,12 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
         lengths: Of the arm, see :mod:`puncture_twin.planning.arm.kinematics`.
         start: Shape (6,), rad.
         end: Shape (6,), rad.
-        answered: 0; after a query whose answer was no, how many there were.
+        answered: How many queries FCL has answered with no contact; 0 for the first call.
         halvings: How often the segment is halved for all checks together, at most ``HALVINGS``.
         fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.
-        clear_mm: What the arm is to keep from skin and boxes where both ends do, see :func:`_keep`; 0 for none.
+        clear_mm: Clearance from skin and boxes to keep where both ends do, see :func:`_keep`; 0 for none.
         order: Shape (k,): the checks in the order in which they are tested.
-        room: See :class:`SegmentScratch`.
+        scratch: See :class:`SegmentScratch`.
         answer: See :class:`Answer`.
     """
     step, frames = end - start, np.empty((1, 7, 4, 4))
@@ -143,33 +144,34 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
     if not np.isfinite(frames).all():
         answer.status[STATUS] = NOT_FINITE
         return
-    room.work.axes[:], room.kept[:] = 0.0, 0.0
+    scratch.work.axes[:], scratch.kept[:] = 0.0, 0.0
     if clear_mm > 0.0:
-        _keep(scene, segment, clear_mm, room)
+        _keep(scene, segment, clear_mm, scratch)
     for row in range(len(order)):
-        room.lists[0, row] = order[row]
+        scratch.lists[0, row] = order[row]
     none = np.int64(0)
-    if left_of(scene, movers, segment, (1.0, 0.0), (none, none, len(order)), none, room, answered, answer) < 0:
+    # 1. The whole segment from its middle, all checks; 2. halves of halves, all checks; 3. each check left, alone.
+    if left_of(scene, movers, segment, (1.0, 0.0), (none, none, len(order)), none, scratch, answered, answer) < 0:
         return
-    parts, here = divide(scene, movers, segment, halvings, order, room, answered, answer)
+    parts, here = divide(scene, movers, segment, halvings, order, scratch, answered, answer)
     for part in range(parts):
-        for row in range(room.spans[here, part, 0], room.spans[here, part, 1]):
+        for row in range(scratch.spans[here, part, 0], scratch.spans[here, part, 1]):
             within = part / parts, (part + 1) / parts
-            if _prove(scene, movers, segment, room.lists[here, row], within, fine_mm, room, answer):
+            if _prove(scene, movers, segment, scratch.lists[here, row], within, fine_mm, scratch, answer):
                 return
 
 
 LIKELY = 0.6
-"""Two hulls are seldom farther apart than their spheres and this much of the radii: beyond it a closer look at a part
-is left for when the part is halved."""
+"""Guess of two hulls' gap: that of their spheres and this fraction of the radii. Where that is too small for a part of
+the segment, no closer bound is sought before the part is halved."""
 
 
 @allocation_free()
 def _found(at, gap, kept_mm, fraction, answered, answer):
-    """Whether a bound at a state, which is too small to tell the check clear there, ends the search.
+    """Whether a check that is not proven clear at a state ends the search.
 
-    It does where the check surely finds something or keeps less than it is to, and where it has to be queried and was
-    not yet.
+    It does where the bodies certainly touch or have less than the clearance to keep, and where FCL must be queried and
+    has not been.
     """
     answer.status[CHECK] = at
     if gap == TOUCHING or kept_mm > 0.0:
@@ -184,31 +186,33 @@ def _found(at, gap, kept_mm, fraction, answered, answer):
 
 
 @allocation_free()
-def left_of(scene, movers, segment, part, span, into, room, answered, answer):
-    """Which checks the middle of a part of the segment does not clear all over the part.
+def left_of(scene, movers, segment, part, span, into, scratch, answered, answer):
+    """List the checks that the middle of a part of the segment does not clear in all of the part.
 
-    Each is looked at in the middle as it is. How far spheres and bodies are from one another clears the part where the
-    bodies cannot come as far within it (after Schwarzer, Saha and Latombe 2005, "Adaptive dynamic collision checking
-    for single and multiple articulated robots in complex environments").
+        clear in all of the part: gap in the middle > paths of the bodies within the part + clearance to keep
+
+    After Schwarzer, Saha and Latombe 2005, "Adaptive dynamic collision checking for single and multiple articulated
+    robots in complex environments".
 
     Args:
         scene: See :class:`ProofScene`.
         movers: See :class:`Movers`.
         segment: See :class:`Segment`.
         part: Its middle and half its width, fractions of the segment.
-        span: Which list of ``room.lists``, and from where to where, holds the checks that are to be cleared.
-        into: Where in the other list the rest goes.
-        room: See :class:`SegmentScratch`.
+        span: Which list of ``scratch.lists`` holds the checks to clear, and its first and last (excluded) index.
+        into: Index in the other list at which the checks that are left are written.
+        scratch: See :class:`SegmentScratch`.
         answered: See :func:`check_segment`.
-        answer: Likewise.
+        answer: See :class:`Answer`.
 
     Returns:
-        Where in the other list the rest ends; -1 where the search has ended.
+        The index in the other list after the last check that is left; -1 where the search has ended.
     """
     checks, radii, T_box_base, halves = scene.checks, scene.hulls.radii, scene.T_box_base, scene.halves
-    work, paths, known, spheres, frames = room.work, room.paths, room.known, room.work.spheres, segment.frames[0]
+    work, paths, known, frames = scratch.work, scratch.paths, scratch.known, segment.frames[0]
+    spheres = work.spheres
     of_check, centres, reaches, mover_frames = movers.of_check, movers.centres, movers.radii, movers.frames
-    source, target, kept_mm = room.lists[span[0]], room.lists[1 - span[0]], room.kept
+    source, target, kept_mm = scratch.lists[span[0]], scratch.lists[1 - span[0]], scratch.kept
     place_arm(segment, part[0])
     place_spheres(scene.hulls, frames, spheres)
     known[:] = False
@@ -218,11 +222,11 @@ def left_of(scene, movers, segment, part, span, into, room, answered, answer):
         if not known[mover]:
             known[mover] = True
             paths_about(
-                frames, mover_frames[mover], centres[mover], reaches[mover], segment.turns, part[1], paths[mover]
+                frames, mover_frames[mover], centres[mover], reaches[mover], segment.rotations, part[1], paths[mover]
             )
         kept = kept_mm[at] + MIN_GAP_MM
         needed, gap, most = paths[mover, checks[at, 3]] + kept, 0.0, math.inf
-        if kind != SKIN:
+        if kind != SKIN:  # cheapest first: bounding spheres, then hulls or skin
             gap = sphere_gap(kind == BOX, first, second, spheres, radii, T_box_base, halves)
             if gap > needed:
                 continue
@@ -232,7 +236,7 @@ def left_of(scene, movers, segment, part, span, into, room, answered, answer):
             gap = near_gap(scene, work, at, frames, wanted, wanted + MIN_GAP_MM, wanted)
             if gap > needed:
                 continue
-            if gap <= kept < wanted and gap != TOUCHING:
+            if gap <= kept < wanted and gap != TOUCHING:  # the search for more ended early: ask for the middle alone
                 gap = near_gap(scene, work, at, frames, kept, kept + MIN_GAP_MM, kept)
             if gap <= kept and _found(at, gap, kept_mm[at], part[0], answered, answer):
                 return -1
@@ -242,16 +246,16 @@ def left_of(scene, movers, segment, part, span, into, room, answered, answer):
 
 
 @allocation_free()
-def divide(scene, movers, segment, halvings, order, room, answered, answer):
-    """Halve the segment, and leave of each part the checks that neither its middle nor that of a larger part clears.
+def divide(scene, movers, segment, halvings, order, scratch, answered, answer):
+    """Halve the segment again and again; each part keeps the checks that no middle of its or a larger part clears.
 
-    All parts of one size come before the next, so that what touches is found soon.
+    Breadth first, all parts of one size before the next, so that a contact is found soon.
 
     Returns:
-        How many parts there are, and which list of ``room`` holds the checks left in each; (0, 0) for none, and
+        How many parts there are, and which list of ``scratch`` holds the checks left in each; (0, 0) for none, and
         (-1, 0) where the search has ended.
     """
-    lists, spans, parts, here = room.lists, room.spans, 1, np.int64(0)
+    lists, spans, parts, here = scratch.lists, scratch.spans, 1, np.int64(0)
     for row in range(len(order)):
         lists[0, row] = order[row]
     spans[0, 0, 0], spans[0, 0, 1] = 0, len(order)
@@ -261,7 +265,7 @@ def divide(scene, movers, segment, halvings, order, room, answered, answer):
             begin = top
             if spans[here, part, 0] < spans[here, part, 1]:
                 middle, span = half * (2 * part + 1), (here, spans[here, part, 0], spans[here, part, 1])
-                top = left_of(scene, movers, segment, (middle, half), span, top, room, answered, answer)
+                top = left_of(scene, movers, segment, (middle, half), span, top, scratch, answered, answer)
             if top < 0:
                 return -1, 0
             for side in range(2):
@@ -273,7 +277,7 @@ def divide(scene, movers, segment, halvings, order, room, answered, answer):
 
 
 CLEAR, CONTACT, QUERY, NOT_FINITE = 0, 1, 2, 3
-"""What a segment came to: proven but for the queries, a contact, a query to be made at once, no numbers."""
+"""Results of a segment: proven but for the queries; a contact; a query to be made at once; joints not finite."""
 
 STATUS, CHECK, ANSWERED, QUERIES = 0, 1, 2, 3
 """The entries of an answer's status: one of the above; the check that touches; how many queries were, or are to be,
@@ -303,8 +307,8 @@ class Segment(NamedTuple):
     lengths: Floats
     start: Floats
     step: Floats
-    turns: Floats
-    """Shape (6,), rad: how far each joint turns."""
+    rotations: Floats
+    """Shape (6,), rad: how far each joint rotates."""
     q: Floats
     """Shape (1, 6): scratch."""
     frames: Floats
@@ -333,7 +337,7 @@ def segment_scratch(scene: ProofScene, movers: Movers) -> SegmentScratch:
     """Scratch for segments of a workcell's checks."""
     checks, count = len(scene.checks), len(movers.frames)
     lists, spans = np.empty((2, checks << HALVINGS), np.int64), np.empty((2, 2 << HALVINGS, 2), np.int64)
-    work, paths = scratch(checks, len(scene.hulls.radii)), np.empty((count, 7))
+    work, paths = proof_scratch(checks, len(scene.hulls.radii)), np.empty((count, 7))
     return SegmentScratch(work, np.zeros(checks), lists, spans, paths, np.zeros(count, np.bool_), np.empty((PARTS, 2)))
 
 

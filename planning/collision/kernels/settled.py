@@ -1,8 +1,8 @@
-"""Compiled decisions of single checks: clear, or certainly a contact; FCL is queried where neither is proven.
+"""Compiled decisions of single checks: clear, certainly a contact, or left to FCL where neither is proven.
 
-Where the bounds of :mod:`puncture_twin.planning.collision.kernels.proofs` prove nothing, two more tests follow. Two
-hulls certainly overlap where some differences of their corners enclose the origin; holder and needle are tested against
-each triangle of the skin near them.
+The bounds of :mod:`puncture_twin.planning.collision.kernels.proofs` come first. Where they prove nothing, two more
+tests follow: two hulls certainly overlap where four differences of their corners enclose the origin (GJK); holder and
+needle, which are round, are tested against each triangle of the skin near them.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -21,26 +21,26 @@ from puncture_twin.planning.collision.kernels.hulls import TOUCHING, Hulls, deep
 from puncture_twin.planning.collision.kernels.proofs import MIN_GAP_MM, SKIN, near_gap, place_spheres, state_gap
 
 CLEAR, OPEN, TOUCHES, TOUCHES_OUTSIDE = 0, 1, 2, 3
-"""What a check came to: no contact, the reference is to be queried, a contact, one with what the CT shows besides the
-skin while the skin itself is clear."""
+"""Results of a check: no contact; undecided, FCL is to be queried; a contact; a contact with what the CT shows outside
+of the patient, the skin being clear."""
 
 DEEP_MM = 1e-3
-"""Two bodies surely touch where they overlap by more: far above the rounding of these sums (1e-10 mm) and FCL's
-tolerance."""
+"""Overlap from which on two bodies certainly touch: far above the rounding of these sums (1e-10 mm) and FCL's
+tolerance. Between it and ``MIN_GAP_MM`` FCL decides."""
 
 SLIVER = 1e-6
-"""Of the product of two edges over the sum of their squares: what is less has a normal that is mostly rounding, so its
-plane need not hold it. Of what is more, rounding (1e-16 of those squares) moves the plane by 1e-9 of the edges at most:
-a thousandth of ``MIN_GAP_MM`` for edges of a metre."""
+"""Length of a triangle's cross product of edges over the sum of their squares, below which it is a sliver: its normal
+is mostly rounding. Above, rounding (1e-16 of those squares) moves the plane by 1e-9 of the edges at most, a thousandth
+of ``MIN_GAP_MM`` for edges of a metre."""
 
 
 class Triangle(NamedTuple):
-    """All corners of :class:`Hulls` and behind them the three of a triangle, which takes part as one more hull."""
+    """Scratch in which a triangle is one more hull: the corners of :class:`Hulls`, then the triangle's three."""
 
     corners: Floats
     """Shape (n + 3, 3), mm; the last three are filled in turn."""
     inner: Floats
-    """Shape (n + 3, 3), mm, likewise: see :class:`Hulls`."""
+    """Shape (n + 3, 3), mm: corners of the enclosed hulls, see :class:`Hulls`, and of the triangle."""
     starts: Ints
     ends: Ints
     """Of each corner the neighbours, see :class:`Hulls`."""
@@ -63,10 +63,10 @@ def triangle_scratch(hulls: Hulls, stack: int) -> Triangle:
 
 @allocation_free()
 def _far(lx, ly, lz, hx, hy, hz, line, reach):
-    """Whether a box is farther than ``reach`` from a segment, by the box and by the sphere about it.
+    """Whether a box is certainly farther than ``reach`` from a segment: by its extents, or by the sphere about it.
 
     The box is given by its lowest and its highest corner; ``line`` holds the segment's middle, its unit direction and
-    half of its length.
+    half of its length, mm.
     """
     (mx, my, mz), (ux, uy, uz), half = line
     ex, ey, ez = (hx - lx) / 2.0, (hy - ly) / 2.0, (hz - lz) / 2.0
@@ -76,15 +76,15 @@ def _far(lx, ly, lz, hx, hy, hz, line, reach):
         or abs(y) > ey + half * abs(uy) + reach
         or abs(z) > ez + half * abs(uz) + reach
     ):
-        return True
-    along = min(half, max(-half, x * ux + y * uy + z * uz))
+        return True  # their extents along one axis of the frame are apart
+    along = min(half, max(-half, x * ux + y * uy + z * uz))  # of the segment's point nearest to the sphere's centre
     x, y, z = x - along * ux, y - along * uy, z - along * uz
     return x * x + y * y + z * z > (reach + math.sqrt(ex * ex + ey * ey + ez * ez)) ** 2
 
 
 @allocation_free()
 def _far_triangle(t, line, reach):
-    """As :func:`_far`, of the box about a triangle (3, 3)."""
+    """Whether the box about a triangle (3, 3) is far from a segment: see :func:`_far`."""
     lx, ly, lz = min(t[0, 0], t[1, 0], t[2, 0]), min(t[0, 1], t[1, 1], t[2, 1]), min(t[0, 2], t[1, 2], t[2, 2])
     hx, hy, hz = max(t[0, 0], t[1, 0], t[2, 0]), max(t[0, 1], t[1, 1], t[2, 1]), max(t[0, 2], t[1, 2], t[2, 2])
     return _far(lx, ly, lz, hx, hy, hz, line, reach)
@@ -103,6 +103,7 @@ def _beyond_plane(t, line, reach):
     size = math.sqrt(nx * nx + ny * ny + nz * nz)
     if not size > SLIVER * (ax * ax + ay * ay + az * az + bx * bx + by * by + bz * bz):
         return False
+    # Height of the segment's nearer end above the plane, times |n|: no root, and no division by a small one.
     height = abs((mx - t[0, 0]) * nx + (my - t[0, 1]) * ny + (mz - t[0, 2]) * nz)
     return height - half * abs(ux * nx + uy * ny + uz * nz) > reach * size
 
@@ -128,9 +129,9 @@ def _farthest(corners, begin, end, x, y, z):
 
 @allocation_free()
 def _axis(hulls, hull, T):
-    """The axis of the round body in a hull at ``T`` (4, 4): see :func:`_far`; and a radius that holds it.
+    """Axis of the round body in a hull at ``T`` (4, 4), as the ``line`` of :func:`_far`, and a radius that contains it.
 
-    The hull is a prism: the corners of one end come before those of the other.
+    The hull is a prism about the axis: the corners of one end come before those of the other.
     """
     begin, end = hulls.starts[hull], hulls.starts[hull + 1]
     middle, corners = (begin + end) // 2, hulls.corners
@@ -155,7 +156,10 @@ def _axis(hulls, hull, T):
 
 @allocation_free()
 def _gap_along(hulls, hull, M, triangle, x, y, z):
-    """The gap between a triangle (3, 3) and a hull at ``M``, along a direction, by all corners."""
+    """Gap between a triangle (3, 3) and a hull at ``M``, projected on a direction, over all corners, mm.
+
+    A positive one proves that they are apart (separating axis).
+    """
     far = -math.inf
     for k in range(3):
         far = max(far, triangle[k, 0] * x + triangle[k, 1] * y + triangle[k, 2] * z)
@@ -169,7 +173,7 @@ def _gap_along(hulls, hull, M, triangle, x, y, z):
 
 
 @allocation_free()
-def against_triangle(hulls, hull, M, triangle, line, room):
+def against_triangle(hulls, hull, M, triangle, line, scratch):
     """Whether the round body in a hull touches a triangle: ``CLEAR``, ``TOUCHES``, or ``OPEN`` if undecided.
 
     Args:
@@ -178,13 +182,14 @@ def against_triangle(hulls, hull, M, triangle, line, room):
         M: Shape (3, 4) or (4, 4), mm: pose of its frame.
         triangle: Shape (3, 3), mm: its corners.
         line: The body's axis, see :func:`_far`.
-        room: See :class:`Triangle`.
+        scratch: See :class:`Triangle`.
     """
-    count, axis, at = len(hulls.corners), room.axis, room.at
+    count, axis, at = len(hulls.corners), scratch.axis, scratch.at
     (mx, my, mz), (ux, uy, uz), half = line
-    for k in range(3):
+    for k in range(3):  # the triangle is the hull behind all others
         for i in range(3):
-            room.corners[count + k, i], room.inner[count + k, i] = triangle[k, i], triangle[k, i]
+            scratch.corners[count + k, i], scratch.inner[count + k, i] = triangle[k, i], triangle[k, i]
+    # GJK starts along the line from the triangle's middle to the nearest point of the axis: mostly the answer.
     x = mx - (triangle[0, 0] + triangle[1, 0] + triangle[2, 0]) / 3.0
     y = my - (triangle[0, 1] + triangle[1, 1] + triangle[2, 1]) / 3.0
     z = mz - (triangle[0, 2] + triangle[1, 2] + triangle[2, 2]) / 3.0
@@ -193,25 +198,25 @@ def against_triangle(hulls, hull, M, triangle, line, room):
     size = math.sqrt(x * x + y * y + z * z)
     axis[0], axis[1], axis[2] = (x / size, y / size, z / size) if size > MIN_GAP_MM else (ux, uy, uz)
     at[0], at[1] = count, hulls.starts[hull]
-    lower, _ = distance_bounds(room.corners, room.starts, room.ends, M, axis, at, MIN_GAP_MM, room.S)
-    if lower > MIN_GAP_MM:
+    lower, _ = distance_bounds(scratch.corners, scratch.starts, scratch.ends, M, axis, at, MIN_GAP_MM, scratch.S)
+    if lower > MIN_GAP_MM:  # GJK has seen some corners; `_gap_along` asks all of them along its direction
         return CLEAR if _gap_along(hulls, hull, M, triangle, axis[0], axis[1], axis[2]) > MIN_GAP_MM else OPEN
-    if lower == TOUCHING:
-        lower, _ = distance_bounds(room.inner, room.starts, room.ends, M, axis, at, 0.0, room.S)
-    return TOUCHES if lower == TOUCHING and deep(room.S, DEEP_MM) else OPEN
+    if lower == TOUCHING:  # the enclosing prism touches; a contact is certain where the enclosed one does too
+        lower, _ = distance_bounds(scratch.inner, scratch.starts, scratch.ends, M, axis, at, 0.0, scratch.S)
+    return TOUCHES if lower == TOUCHING and deep(scratch.S, DEEP_MM) else OPEN
 
 
 @allocation_free()
-def on_skin(skin, hulls, hull, T, room):
-    """Result of the round body in a hull at ``T`` (4, 4) against each triangle of the skin.
+def on_skin(skin, hulls, hull, T, scratch):
+    """Result of the round body in a hull at ``T`` (4, 4) against the skin, triangle by triangle.
 
-    It touches as soon as one triangle of the skin does. What the CT shows besides counts where all of the skin is
+    One triangle of the skin in contact decides. Triangles outside of the patient count only where all of the skin is
     clear.
     """
     lows, highs, corners = skin.tree
     line, reach = _axis(hulls, hull, T)
-    inner, stack, top = len(lows) - len(corners), room.stack, 1
-    on_it, beside = CLEAR, CLEAR
+    inner, stack, top = len(lows) - len(corners), scratch.stack, 1  # a full binary tree: the leaves come last
+    on_skin_result, outside_result = CLEAR, CLEAR
     stack[0] = 0
     while top > 0:
         top -= 1
@@ -225,55 +230,55 @@ def on_skin(skin, hulls, hull, T, room):
             continue
         for k in range(corners.shape[1]):
             triangle, outside = corners[node - inner, k], skin.outside[node - inner, k]
-            if outside and beside == TOUCHES:
+            if outside and outside_result == TOUCHES:
                 continue
             if _far_triangle(triangle, line, reach) or _beyond_plane(triangle, line, reach):
                 continue
-            answer = against_triangle(hulls, hull, T, triangle, line, room)
+            answer = against_triangle(hulls, hull, T, triangle, line, scratch)
             if outside:
-                beside = max(beside, answer)
+                outside_result = max(outside_result, answer)  # CLEAR < OPEN < TOUCHES
             elif answer == TOUCHES:
                 return TOUCHES
             else:
-                on_it = max(on_it, answer)
-    if on_it == OPEN or beside == OPEN:
+                on_skin_result = max(on_skin_result, answer)
+    if on_skin_result == OPEN or outside_result == OPEN:
         return OPEN
-    return CLEAR if beside == CLEAR else TOUCHES_OUTSIDE
+    return CLEAR if outside_result == CLEAR else TOUCHES_OUTSIDE
 
 
 @allocation_free()
-def settled(scene, work, room, at, frames, gap):
+def settled(scene, work, scratch, at, frames, gap):
     """Result of a check whose bound ``gap`` proves nothing, the arm at ``frames`` (7, 4, 4).
 
-    Of a bound that is ``TOUCHING``, ``work`` is as the bound has left it.
+    Where ``gap`` is ``TOUCHING``, ``work.S`` must still hold the simplex that encloses the origin.
     """
     first = scene.checks[at, 1]
-    if scene.checks[at, 0] != SKIN:
+    if scene.checks[at, 0] != SKIN:  # hull against hull: a contact where the simplex holds the origin deep enough
         return TOUCHES if gap == TOUCHING and deep(work.S, DEEP_MM) else OPEN
-    return OPEN if first < 0 else on_skin(scene.skin, scene.hulls, first, frames[scene.checks[at, 4]], room)
+    return OPEN if first < 0 else on_skin(scene.skin, scene.hulls, first, frames[scene.checks[at, 4]], scratch)
 
 
 @allocation_free()
-def settled_at(scene, work, room, at, frames):
-    """Result of a check, the arm at ``frames`` (7, 4, 4)."""
+def settled_at(scene, work, scratch, at, frames):
+    """Result of one check, the arm at ``frames`` (7, 4, 4): by its bound, else by `settled`."""
     gap = near_gap(scene, work, at, frames, MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
-    return CLEAR if gap > MIN_GAP_MM else settled(scene, work, room, at, frames, gap)
+    return CLEAR if gap > MIN_GAP_MM else settled(scene, work, scratch, at, frames, gap)
 
 
 @allocation_free()
-def first_not_clear(scene, frames, work, room, tested, of_state, begins, found, answers):
-    """First check that is not proven clear at each of some independent states.
+def first_not_clear(scene, frames, work, scratch, tested, of_state, begins, found, answers):
+    """Find the first check that is not proven clear at each of some independent states.
 
     Args:
         scene: See :class:`ProofScene`.
         frames: Shape (m, 7, 4, 4), mm: the states.
         work: See :class:`ProofScratch`.
-        room: See :class:`Triangle`.
-        tested: Shape (t, k): which checks, in so many choices.
-        of_state: Shape (m,): which of the choices.
-        begins: Shape (m,): the first check at each state; k to pass it over.
-        found: Shape (m,), filled; -1 where all from there on is clear.
-        answers: Shape (m,), filled: what the check that was found comes to; ``CLEAR`` where there is none.
+        scratch: See :class:`Triangle`.
+        tested: Shape (t, k): t selections of checks.
+        of_state: Shape (m,): which selection holds at each state.
+        begins: Shape (m,): the check to begin with at each state; k skips the state.
+        found: Shape (m,), filled: the check; -1 where all from ``begins`` on are clear.
+        answers: Shape (m,), filled: the result of that check; ``CLEAR`` where there is none.
     """
     for row in range(len(frames)):
         found[row], answers[row] = -1, CLEAR
@@ -284,7 +289,7 @@ def first_not_clear(scene, frames, work, room, tested, of_state, begins, found, 
                 continue
             gap = state_gap(scene, work, at, frames[row], MIN_GAP_MM, 2.0 * MIN_GAP_MM, MIN_GAP_MM)
             if not gap > MIN_GAP_MM:
-                answers[row] = settled(scene, work, room, at, frames[row], gap)
+                answers[row] = settled(scene, work, scratch, at, frames[row], gap)
                 if answers[row] != CLEAR:
                     found[row] = at
                     break

@@ -1,6 +1,6 @@
 """Compiled distances to a surface of triangles: of points, and of a tree of bounding spheres that encloses a body.
 
-Each bound for a body is a lower one, in mm: above 0 it proves that nothing touches; at or below, it proves nothing.
+Each bound for a body is a lower bound, mm: above 0 it proves that nothing touches; else it proves nothing.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -20,8 +20,8 @@ HALF_CELL_MM = CELL_MM * math.sqrt(3.0) / 2.0 + 1e-3
 """No point of a cell is farther from its middle; the rounding of float32 included."""
 
 ROUGH = 0.9
-"""How much nearer to the skin the middle of a cell may be than the field has it, as a fraction: far from a surface most
-of the time goes into which of many triangles is the nearest by a hair, and a cell is no smaller than that."""
+"""The distance of a cell's middle from the skin is at least this fraction of the field's value. Far from a surface an
+exact search spends its time on many triangles that are equally near within less than a cell."""
 
 STACK = 64
 """Depth of the descents: deeper than any tree here (a balanced one of 2^40 triangles needs 41)."""
@@ -45,7 +45,7 @@ def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop, fraction):
     ``STACK`` integers.
     """
     best, squared = cutoff * cutoff, fraction * fraction
-    inner = len(lows) - len(corners)
+    inner = len(lows) - len(corners)  # a full binary tree: inner nodes first, the children of n at 2 n + 1 and 2 n + 2
     stack[0] = 0
     top = 1 if _to_box(lows[0], highs[0], x, y, z) < squared * best else 0
     while top > 0 and best > stop * stop:
@@ -63,7 +63,7 @@ def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop, fraction):
         near, far, to_near, to_far = left, right, to_left, to_right
         if to_right < to_left:
             near, far, to_near, to_far = right, left, to_right, to_left
-        if to_far < squared * best:
+        if to_far < squared * best:  # pushed first, so the nearer child is visited next
             stack[top] = far
             top += 1
         if to_near < squared * best:
@@ -74,7 +74,7 @@ def to_surface(lows, highs, corners, x, y, z, cutoff, stack, stop, fraction):
 
 @allocation_free()
 def moved(T, c):
-    """A point (3,) where the frame ``T`` (4, 4) takes it."""
+    """The point T c, of a pose (4, 4) and a point (3,), as three numbers."""
     x = T[0, 0] * c[0] + T[0, 1] * c[1] + T[0, 2] * c[2] + T[0, 3]
     y = T[1, 0] * c[0] + T[1, 1] * c[1] + T[1, 2] * c[2] + T[1, 3]
     z = T[2, 0] * c[0] + T[2, 1] * c[1] + T[2, 2] * c[2] + T[2, 3]
@@ -83,7 +83,7 @@ def moved(T, c):
 
 @allocation_free()
 def _field_distance(tree, field, origin, x, y, z, stack):
-    """Distance to the skin, ``ROUGH``, of the middle of a point's cell: kept in ``field`` once known; -1 outside."""
+    """Distance to the skin, within ``ROUGH``, of the middle of a point's cell, cached in ``field``; -1 outside."""
     i, j, k = (x - origin[0]) / CELL_MM, (y - origin[1]) / CELL_MM, (z - origin[2]) / CELL_MM
     if not (0.0 <= i < field.shape[0] and 0.0 <= j < field.shape[1] and 0.0 <= k < field.shape[2]):
         return -1.0
@@ -99,13 +99,12 @@ def _field_distance(tree, field, origin, x, y, z, stack):
 
 @allocation_free()
 def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
-    """Lower bound on the distance of a body's spheres to the skin, the body's frame standing at ``T`` (4, 4).
+    """Lower bound on the distance of a body's spheres to the skin, the body's frame at ``T`` (4, 4); mm.
 
-    The field is tested first: a sphere's centre is no farther from the middle of its cell than half of its diagonal.
-    What it proves is taken for the distance where that is ``enough``: a later look costs less than a closer one. A
-    sphere as clear as ``enough``, mm, is not divided; no bound exceeds ``far``; the first part that is not clear
-    by ``needed`` ends the search, and then the answer is no bound, only no more than ``needed``. Both stacks are
-    scratch.
+    The field is asked first: a sphere's centre is within half of a cell's diagonal of its cell's middle. Where that
+    proves more than ``enough``, or a sphere is farther than ``enough``, no closer look is taken. No bound exceeds
+    ``far``. The first sphere that cannot be clear by ``needed`` ends the search: the result is then no bound, only no
+    more than ``needed``. Both stacks are scratch.
     """
     tree, field, origin = skin.tree, skin.field, skin.origin
     centres, radii, children = spheres
@@ -118,8 +117,8 @@ def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
         x, y, z = moved(T, c)
         about, cutoff = _field_distance(tree, field, origin, x, y, z, inner_stack), best + r
         if about >= 0.0:
-            at_least = ROUGH * about - HALF_CELL_MM - r
-            if at_least >= best:
+            at_least = ROUGH * about - HALF_CELL_MM - r  # lower bound of the sphere's distance, by the field
+            if at_least >= best:  # it cannot lower the result
                 continue
             if at_least > enough:
                 best = at_least
@@ -127,13 +126,13 @@ def skin_gap(skin, spheres, root, T, enough, far, needed, stack, inner_stack):
             if about + HALF_CELL_MM + r <= needed:  # no part of the body in this sphere is clear by as much
                 return 0.0
             cutoff = min(cutoff, about + HALF_CELL_MM)
-        stop = max(0.0, needed + r)
+        stop = max(0.0, needed + r)  # nearer than this the exact distance does not matter
         gap = to_surface(tree[0], tree[1], tree[2], x, y, z, cutoff, inner_stack, stop, 1.0) - r
         if gap >= best:
             continue
-        if gap > enough or children[node, 0] < 0:
+        if gap > enough or children[node, 0] < 0:  # clear enough, or a leaf
             best = gap
-        else:
+        else:  # two smaller spheres enclose the body more tightly
             stack[top], stack[top + 1] = children[node, 0], children[node, 1]
             top += 2
     return best

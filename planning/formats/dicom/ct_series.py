@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, text
 from puncture_twin.planning.formats.dicom.pixels import PixelLayout, pixel_layout, stored_values
@@ -88,7 +88,7 @@ class CtSeries:
 
     @property
     def stack(self) -> Stack:
-        """Its slices as they were scanned."""
+        """The slices as they were scanned."""
         return self._series.stack
 
     @property
@@ -138,7 +138,7 @@ class CtSeries:
             data = parse_dicom(self.content(file), Path(file))
             header = described(data, Path(file))
             if not header.is_slice:
-                raise InputError(f"{header.sop_class}, no slice of a CT", where=file, allowed="has the file changed?")
+                refuse(f"{header.sop_class}, no slice of a CT", file, "has the file changed?", "not_a_ct")
             stated.add((header.series_uid, header.frame_of_reference))
             layouts[file] = pixel_layout(data, file)
             own = slices_of(data, file, layouts[file].frames)
@@ -170,8 +170,7 @@ def _filled(image: NDArray[np.float32]) -> NDArray[np.float32]:
 def _one(stated: set[tuple[str, str]], path: Path) -> tuple[str, str]:
     if len(stated) != 1:
         series, frames = (len({one[at] for one in stated}) for at in (0, 1))
-        what = f"files of {series} series and {frames} frames of reference"
-        raise InputError(what, where=path, allowed="one of each")
+        refuse(f"files of {series} series and {frames} frames of reference", path, "one of each", "several_series")
     return next(iter(stated))
 
 
@@ -180,7 +179,7 @@ def _one_size(layouts: dict[str, PixelLayout], path: Path) -> tuple[int, int]:
     for file, layout in layouts.items():
         if first and (layout.rows, layout.columns) != size:
             what = f"{first} has {size[0]} x {size[1]} pixels, {file} has {layout.rows} x {layout.columns}"
-            raise InputError(what, where=path, allowed="slices of one size")
+            refuse(what, path, "slices of one size", "mixed_geometry")
         first, size = file, (layout.rows, layout.columns)
     return size
 

@@ -25,7 +25,7 @@ from pydicom.multival import MultiValue
 from pydicom.tag import BaseTag
 from pydicom.uid import UID
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.dicom.storage import BIG_ENDIAN, DEFLATED, IMPLICIT, META_START, is_dicom
 
 MAX_INFLATED_BYTES = 1 << 26
@@ -48,21 +48,19 @@ def refused_if_damaged(where: str | Path) -> Iterator[None]:
         raise
     except Exception as error:  # the library promises no kind of error for bytes that are damaged
         what = f"damaged ({type(error).__name__}: {str(error)[:200]})"
-        raise InputError(what.encode("ascii", "replace").decode(), where=where, allowed=ALLOWED) from error
+        raise InputError(
+            what.encode("ascii", "replace").decode(), where=where, allowed=ALLOWED, code="file_damaged"
+        ) from error
 
 
 def parse_dicom(content: bytes, path: Path) -> Dataset:
     """The data set of a file that has been read, with its ``file_meta``.
 
-    Args:
-        content: The whole file.
-        path: Its name, for messages.
-
     Raises:
         InputError: No DICOM, damaged, cut short, inflating to too much, or big endian.
     """
     if not is_dicom(content[:META_START]):
-        raise InputError("no DICOM file: DICM does not stand at byte 128", where=path, allowed=ALLOWED)
+        refuse("no DICOM file: DICM does not stand at byte 128", path, ALLOWED, "wrong_format")
     with refused_if_damaged(path):
         stream = io.BytesIO(content)
         meta = read_meta(stream)
@@ -90,7 +88,7 @@ def _behind_meta(tag: BaseTag, vr: str | None, length: int) -> bool:
 def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:
     """The data set's own bytes, inflated where they are deflated."""
     if not syntax:
-        raise InputError("its meta information names no transfer syntax", where=path, allowed=ALLOWED)
+        refuse("its meta information names no transfer syntax", path, ALLOWED, "missing_tag")
     if syntax == BIG_ENDIAN:
         refuse_big_endian(path)
     if syntax != DEFLATED:
@@ -102,14 +100,13 @@ def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:
         what = (
             f"inflates to more than {MAX_INFLATED_BYTES} bytes" if more else "cut short: its deflated data do not end"
         )
-        raise InputError(what, where=path, allowed=ALLOWED)
+        refuse(what, path, ALLOWED, "file_damaged")
     return memoryview(inflated)
 
 
 def refuse_big_endian(path: Path) -> NoReturn:
     """Raise the error of a file whose numbers are stored the other way round."""
-    what = f"transfer syntax {UID(BIG_ENDIAN).name} ({BIG_ENDIAN})"
-    raise InputError(what, where=path, allowed=how_to_convert(), code="transfer_syntax")
+    refuse(f"transfer syntax {UID(BIG_ENDIAN).name} ({BIG_ENDIAN})", path, how_to_convert(), "transfer_syntax")
 
 
 def how_to_convert() -> str:
@@ -145,7 +142,12 @@ def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[flo
         plain = tuple(float(one) for one in listed)
     if len(plain) != count or not all(map(math.isfinite, plain)):
         what = f"{name(keyword)} is missing" if found is None else f"{name(keyword)} is {str(found)[:100]}"
-        raise InputError(what, where=where, allowed=f"{count} finite number{'s' if count > 1 else ''}")
+        refuse(
+            what,
+            where,
+            f"{count} finite number{'s' if count > 1 else ''}",
+            "missing_tag" if found is None else "bad_tag",
+        )
     return plain
 
 
@@ -162,7 +164,7 @@ def whole(data: Dataset, keyword: str, *, low: int, high: int, where: str) -> in
     """
     found = number(data, keyword, where=where)
     if found != int(found) or not low <= found <= high:
-        raise InputError(f"{name(keyword)} is {found:g}", where=where, allowed=f"a whole number from {low} to {high}")
+        refuse(f"{name(keyword)} is {found:g}", where, f"a whole number from {low} to {high}", "bad_tag")
     return int(found)
 
 
@@ -198,7 +200,7 @@ def items(data: Dataset, keyword: str, *, where: str) -> list[Dataset]:
     with refused_if_damaged(where):
         listed = list(found)
     if not all(isinstance(one, Dataset) for one in listed):
-        raise InputError(f"{name(keyword)} is no sequence", where=where, allowed="a sequence of items")
+        refuse(f"{name(keyword)} is no sequence", where, "a sequence of items", "bad_tag")
     return listed
 
 
@@ -280,7 +282,9 @@ class _Walk:
                 self._refuse(f"element {_shown(tag)} has no length", at)
             return self._items(at, end, implicit=implicit or kind == b"UN", depth=depth + 1, closed=True)
         if at + length > end:
-            self._refuse(f"cut short: element {_shown(tag)} promises {length} bytes, and {end - at} are left", at)
+            self._refuse(
+                f"cut short: element {_shown(tag)} promises {length} bytes, and {end - at} are left", at, "file_cut"
+            )
         if kind == b"UN" and _known(tag) == b"SQ":
             self._refuse(f"sequence {_shown(tag)} is stored without its value representation", at)
         if kind == b"SQ":
@@ -297,7 +301,7 @@ class _Walk:
         if kind not in LONG_FORM:
             self._refuse(f"element {_shown(tag)} has the unknown value representation {kind!r}", at)
         if at + 12 > end:
-            self._refuse("cut short within an element's head", at)
+            self._refuse("cut short within an element's head", at, "file_cut")
         return kind, at + 12, struct.unpack_from("<L", self._data, at + 8)[0]
 
     def _items(self, at: int, end: int, *, implicit: bool, depth: int, closed: bool) -> int:
@@ -312,7 +316,7 @@ class _Walk:
                 at = self.data_set(at + 8, end, implicit=implicit, depth=depth, closed=True)
                 continue
             if at + 8 + length > end:
-                self._refuse("cut short within a sequence's item", at)
+                self._refuse("cut short within a sequence's item", at, "file_cut")
             at = self.data_set(at + 8, at + 8 + length, implicit=implicit, depth=depth, closed=False)
         return at
 
@@ -323,7 +327,7 @@ class _Walk:
             if tag == SEQUENCE_END:
                 return at + 8
             if tag != ITEM or at + 8 + length > end:
-                self._refuse("cut short within the compressed pixels", at)
+                self._refuse("cut short within the compressed pixels", at, "file_cut")
             at += 8 + length
 
     def _tag(self, at: int, end: int) -> int:
@@ -331,12 +335,12 @@ class _Walk:
         if self._count > MAX_ELEMENTS:
             self._refuse(f"more than {MAX_ELEMENTS} elements", at)
         if at + 8 > end:
-            self._refuse("cut short: it ends within an element", at)
+            self._refuse("cut short: it ends within an element", at, "file_cut")
         group, element = struct.unpack_from("<HH", self._data, at)
         return int(group << 16 | element)
 
-    def _refuse(self, what: str, at: int) -> NoReturn:
-        raise InputError(f"{what} (byte {at} of the data set)", where=self._where, allowed="a complete DICOM file")
+    def _refuse(self, what: str, at: int, code: str = "file_damaged") -> NoReturn:
+        refuse(f"{what} (byte {at} of the data set)", self._where, "a complete DICOM file", code)
 
 
 def _known(tag: int) -> bytes:

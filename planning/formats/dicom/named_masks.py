@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 
@@ -64,11 +64,11 @@ def unique_names(names: Sequence[str], where: Path) -> None:
         InputError: One has none, or two share one.
     """
     if not names:
-        raise InputError("holds no structure", where=where, allowed="a file with structures")
+        refuse("holds no structure", where, "a file with structures", "no_structure")
     for name in names:
         if not name or names.count(name) > 1:
             what = f"{names.count(name)} structures are called {name!r}" if name else "a structure has no name"
-            raise InputError(what, where=where, allowed="a name of its own for each structure")
+            refuse(what, where, "a name of its own for each structure", "duplicate_name" if name else "bad_name")
 
 
 def check_frame_of_reference(stated: str, ct: CtSeries, where: Path) -> None:
@@ -79,8 +79,5 @@ def check_frame_of_reference(stated: str, ct: CtSeries, where: Path) -> None:
     """
     if stated != ct.frame_of_reference or not stated:
         what = f"lies in the frame of reference {stated or 'not stated'}, the CT {ct.path.name} in "
-        raise InputError(
-            f"{what}{ct.frame_of_reference or 'one that is not stated'}",
-            where=where,
-            allowed="structures that were drawn on this CT, or on one that was registered to it",
-        )
+        allowed = "structures that were drawn on this CT, or on one that was registered to it"
+        refuse(f"{what}{ct.frame_of_reference or 'one that is not stated'}", where, allowed, "other_frame_of_reference")

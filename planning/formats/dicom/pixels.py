@@ -11,7 +11,7 @@ from pydicom.dataset import Dataset
 from pydicom.pixels.decoders.base import get_decoder
 from pydicom.uid import UID
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.dicom.dicom_file import (
     has,
     how_to_convert,
@@ -61,11 +61,11 @@ def pixel_layout(data: Dataset, where: str) -> PixelLayout:
     """
     if (meaning := text(data, "PhotometricInterpretation", where=where)) != "MONOCHROME2":
         what = f"{name('PhotometricInterpretation')} is {meaning or 'missing'}"
-        raise InputError(what, where=where, allowed="MONOCHROME2")
+        refuse(what, where, "MONOCHROME2", "unsupported_feature")
     whole(data, "SamplesPerPixel", low=1, high=1, where=where)
     allocated = whole(data, "BitsAllocated", low=8, high=32, where=where)
     if allocated % 8 or allocated == 24:
-        raise InputError(f"{name('BitsAllocated')} is {allocated}", where=where, allowed="8, 16 or 32")
+        refuse(f"{name('BitsAllocated')} is {allocated}", where, "8, 16 or 32", "unsupported_feature")
     stored = whole(data, "BitsStored", low=1, high=allocated, where=where)
     whole(data, "HighBit", low=stored - 1, high=stored - 1, where=where)
     signed = bool(whole(data, "PixelRepresentation", low=0, high=1, where=where))
@@ -94,10 +94,10 @@ def check_length(data: Dataset, promised: int, where: str) -> None:
     """
     pixels = value(data, "PixelData", where=where)
     if not isinstance(pixels, bytes):
-        raise InputError(f"{name('PixelData')} is missing", where=where, allowed="an image with pixels")
+        refuse(f"{name('PixelData')} is missing", where, "an image with pixels", "missing_tag")
     if data.file_meta.TransferSyntaxUID in PLAIN and len(pixels) != promised + promised % 2:
         what = f"{name('PixelData')} has {len(pixels)} bytes where the header promises {promised}"
-        raise InputError(what, where=where, allowed="a complete file")
+        refuse(what, where, "a complete file", "size_mismatch")
 
 
 def stored_values(data: Dataset, layout: PixelLayout, where: str) -> NDArray[Any]:
@@ -113,7 +113,7 @@ def stored_values(data: Dataset, layout: PixelLayout, where: str) -> NDArray[Any
         cells = _decompressed(data, data.file_meta.TransferSyntaxUID, where)
     if cells.size != np.prod(shape) or cells.dtype.itemsize * 8 != layout.allocated:
         what = f"the compressed pixels hold {cells.size} values of {cells.dtype} where {shape} are promised"
-        raise InputError(what, where=where, allowed="a complete file")
+        refuse(what, where, "a complete file", "size_mismatch")
     above = layout.allocated - layout.stored
     typed = cells.reshape(shape).view(f"{'i' if layout.signed else 'u'}{layout.allocated // 8}")
     return typed if above == 0 else (typed << above) >> above
@@ -123,15 +123,14 @@ def _decompressed(data: Dataset, syntax: UID, where: str) -> NDArray[Any]:
     with refused_if_damaged(where):
         named = f"transfer syntax {syntax.name} ({syntax})"
         if not syntax.is_transfer_syntax or not syntax.is_compressed:
-            raise InputError(named, where=where, allowed=how_to_convert())
+            refuse(named, where, how_to_convert(), "transfer_syntax")
         try:
             decoder = get_decoder(syntax)
         except NotImplementedError:
-            raise InputError(named, where=where, allowed=how_to_convert()) from None
+            raise InputError(named, where=where, allowed=how_to_convert(), code="transfer_syntax") from None
         if not decoder.is_available:
-            allowed = f"{how_to_convert()}; or pip install python-gdcm"
             what = f"{named} needs a decoder that is not installed"
-            raise InputError(what, where=where, allowed=allowed, code="no_decoder")
+            refuse(what, where, f"{how_to_convert()}; or pip install python-gdcm", "no_decoder")
         try:
             cells, _ = decoder.as_array(data, raw=True)
         except Exception as error:  # the decoders promise no kind of error

@@ -14,7 +14,7 @@ from pydicom.filereader import read_dataset
 from pydicom.tag import BaseTag
 from pydicom.uid import UID
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import is_folder, read_input
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.formats.dicom.dicom_file import (
@@ -101,7 +101,8 @@ def recognise(path: Path) -> DicomFile | None:
                 if header is not None:
                     header.file_meta = meta
     except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", where=path, allowed="a readable file") from error
+        what = f"cannot be read ({error.strerror})"
+        raise InputError(what, where=path, allowed="a readable file", code="unreadable") from error
     if header is None:
         content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
         return described(parse_dicom(content, path), path)
@@ -163,7 +164,7 @@ def list_folder(folder: Path) -> tuple[tuple[DicomFile, ...], tuple[Entry, ...]]
     found = {one: recognise(folder / one.name) for one in listed if one.what == FILE}
     for one in found.values():
         if one is not None and not one.name.isprintable():
-            raise InputError(f"file name {one.name!a}", where=folder, allowed="names of printable characters")
+            refuse(f"file name {one.name!a}", folder, "names of printable characters", "bad_name")
     files = tuple(one for one in found.values() if one is not None)
     return files, tuple(one for one in listed if found.get(one) is None)
 
@@ -213,19 +214,16 @@ def choose_series(path: Path) -> SeriesFiles:
         named = next((one for one in found if one.name == path.name), None)
         if named is None or not named.is_slice:
             what = "no DICOM file" if named is None else f"{named.sop_class}, no slice of a CT"
-            raise InputError(what, where=path, allowed="a slice of a CT series, or its folder")
+            refuse(what, path, "a slice of a CT series, or its folder", "not_a_ct")
         slices = [one for one in slices if one.series_uid == named.series_uid]
     _check_one_series(slices, found, others, path)
     names = tuple(one.name for one in slices)
     read = {one.name: Entry(one.name, FILE) for one in found}
     left = unaccounted(folder, (*others, *read.values()), lambda path: path.name in read)
     if lost := [one for one in left if _may_be_slice(one, names)]:
-        raise InputError(
-            f"beside the slices lies what is not read, and may be a slice: {first_few([one.line for one in lost])}",
-            where=path,
-            allowed="every slice of the series as a whole DICOM file (fetch it, copy it again, or move it elsewhere)",
-            code="slices_not_read",
-        )
+        what = f"beside the slices lies what is not read, and may be a slice: {first_few([one.line for one in lost])}"
+        allowed = "every slice of the series as a whole DICOM file (fetch it, copy it again, or move it elsewhere)"
+        refuse(what, path, allowed, "slices_not_read")
     aside = [one for one in found if one.name not in set(names)]
     below = [one for one in others if one.what == FOLDER and _holds_dicom(folder / one.name)]
     return SeriesFiles(folder, names, slices[0].series_uid, _notes(aside, below, path))
@@ -249,8 +247,8 @@ def _check_one_series(
     if not slices:
         classes = Counter(one.sop_class for one in found)
         shown = [f"{count} {name}" for name, count in classes.most_common()] or ["no DICOM file"]
-        what = f"no CT series here: {first_few([*shown, *(one.line for one in others)])}"
-        raise InputError(what, where=path, allowed="a folder with a CT series; folders in it are not entered")
+        allowed = "a folder with a CT series; folders in it are not entered"
+        refuse(f"no CT series here: {first_few([*shown, *(one.line for one in others)])}", path, allowed, "no_ct")
     series: dict[str, list[DicomFile]] = {}
     for one in slices:
         series.setdefault(one.series_uid, []).append(one)
@@ -260,8 +258,8 @@ def _check_one_series(
             for uid, files in list(series.items())[:SHOWN]
         ]
         more = f"; and {len(series) - SHOWN} more" if len(series) > SHOWN else ""
-        what = f"{len(series)} CT series: {'; '.join(listed)}{more}"
-        raise InputError(what, where=path, allowed="one series: name one of its files instead of the folder")
+        allowed = "one series: name one of its files instead of the folder"
+        refuse(f"{len(series)} CT series: {'; '.join(listed)}{more}", path, allowed, "several_series")
 
 
 def _notes(aside: Sequence[DicomFile], below: Sequence[Entry], path: Path) -> tuple[str, ...]:

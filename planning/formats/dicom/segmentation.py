@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
 from puncture_twin.planning.formats.dicom.dicom_file import (
     has,
@@ -94,7 +94,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
     data = parse_dicom(content(file), path)
     where = path.name
     if (sop_class := sop_class_of(data, where=where)) != SEGMENTATION:
-        raise InputError(f"SOP class {sop_class or 'missing'}", where=path, allowed="a DICOM SEG")
+        refuse(f"SOP class {sop_class or 'missing'}", path, "a DICOM SEG", "wrong_format")
     kind = _checked_kind(data, path)
     if ct is not None:
         check_frame_of_reference(text(data, "FrameOfReferenceUID", where=where), ct, path)
@@ -117,10 +117,10 @@ def _checked_kind(data: Dataset, path: Path) -> str:
     where = path.name
     kind = text(data, "SegmentationType", where=where)
     if kind not in ("BINARY", "FRACTIONAL"):
-        raise InputError(f"{name('SegmentationType')} is {kind or 'missing'}", where=path, allowed="BINARY, FRACTIONAL")
+        refuse(f"{name('SegmentationType')} is {kind or 'missing'}", path, "BINARY, FRACTIONAL", "unsupported_feature")
     if data.file_meta.TransferSyntaxUID not in PLAIN:
         syntax = data.file_meta.TransferSyntaxUID
-        raise InputError(f"transfer syntax {syntax.name} ({syntax})", where=path, allowed=how_to_convert())
+        refuse(f"transfer syntax {syntax.name} ({syntax})", path, how_to_convert(), "transfer_syntax")
     bits = 1 if kind == "BINARY" else 8
     whole(data, "BitsAllocated", low=bits, high=bits, where=where)
     rows, columns, count = sizes(data, where)
@@ -133,7 +133,7 @@ def _names(data: Dataset, where: str) -> dict[int, str]:
     for item in items(data, "SegmentSequence", where=where):
         segment = whole(item, "SegmentNumber", low=1, high=65535, where=where)
         if segment in found:
-            raise InputError(f"two segments have the number {segment}", where=where, allowed="each number once")
+            refuse(f"two segments have the number {segment}", where, "each number once", "duplicate_number")
         found[segment] = text(item, "SegmentLabel", where=where)
     return found
 
@@ -147,17 +147,17 @@ def _frames(data: Dataset, names: dict[int, str], ct: CtSeries | None, path: Pat
     T, slices = _regular(planes, _stated_step(groups[0], where, ct), path)
     pairs = set(zip(segments.tolist(), slices.tolist(), strict=True))
     if len(pairs) < count:
-        raise InputError("two frames of one segment lie at one place", where=path, allowed="one frame a slice")
+        refuse("two frames of one segment lie at one place", path, "one frame a slice", "duplicate_place")
     return _Frames(segments, slices, T, rows, columns)
 
 
 def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
     found = groups.find("SegmentIdentificationSequence", label)
     if len(found) != 1:
-        raise InputError(f"{len(found)} items say whose segment it is", where=label, allowed="one")
+        refuse(f"{len(found)} items say whose segment it is", label, "one", "wrong_count")
     segment = whole(found[0], "ReferencedSegmentNumber", low=1, high=65535, where=label)
     if segment not in names:
-        raise InputError(f"is of segment {segment}, which is not listed", where=label, allowed=f"{sorted(names)}"[:200])
+        refuse(f"is of segment {segment}, which is not listed", label, f"{sorted(names)}"[:200], "unknown_segment")
     return segment
 
 
@@ -182,7 +182,7 @@ def _regular(planes: list[Plane], stated_mm: float | None, path: Path) -> tuple[
         if np.abs(other.axes_ct - first.axes_ct).max() > AXES_TOLERANCE or not np.allclose(
             other.spacing_mm, first.spacing_mm, rtol=SPACING_TOLERANCE
         ):
-            raise InputError("its frames have several orientations or pixel sizes", where=path, allowed="one of each")
+            refuse("its frames have several orientations or pixel sizes", path, "one of each", "mixed_geometry")
     origins = np.array([plane.origin_ct for plane in planes])
     along = origins @ first.normal_ct
     order = np.argsort(along, kind="stable")
@@ -190,13 +190,13 @@ def _regular(planes: list[Plane], stated_mm: float | None, path: Path) -> tuple[
     step = _least_step(np.diff(along[order]), stated_mm, path)
     count = round(float((along[order[-1]] - along[order[0]]) / step))
     if count > MAX_SLICES:
-        raise InputError(f"{count} slices from its first to its last frame", where=path, allowed=f"{MAX_SLICES}")
+        refuse(f"{count} slices from its first to its last frame", path, f"{MAX_SLICES}", "too_many")
     step_ct = (high - low) / count if count else step * first.normal_ct
     slices = np.round((along - along[order[0]]) / step).astype(np.int64)
     off = np.linalg.norm(origins - low - slices[:, None] * step_ct, axis=1)
     if off.max() > PLACE_TOLERANCE * step:
         what = f"frame {int(np.argmax(off)) + 1} lies {off.max():.2f} mm off the grid of the others"
-        raise InputError(what, where=path, allowed=f"frames at whole steps of {step:.4g} mm along one line")
+        refuse(what, path, f"frames at whole steps of {step:.4g} mm along one line", "off_grid")
     T = np.eye(4)
     T[:3, :2], T[:3, 2], T[:3, 3] = first.axes_ct * first.spacing_mm, step_ct, low
     return T, slices
@@ -210,7 +210,7 @@ def _least_step(gaps: Floats, stated_mm: float | None, path: Path) -> float:
     real = gaps[gaps > 1e-3]
     if not len(real):
         if stated_mm is None:
-            raise InputError("one slice, and how thick it is is not stated", where=path, allowed="SliceThickness")
+            refuse("one slice, and how thick it is is not stated", path, "SliceThickness", "missing_tag")
         return stated_mm
     least = float(real.min())
     if not _keep_to(real, least) and stated_mm is not None and stated_mm <= least * (1 + PLACE_TOLERANCE):
@@ -239,7 +239,6 @@ def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
 
 
 def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: Path) -> Mask:
-    """The voxels of one segment."""
     made = np.zeros(placed.grid.shape, np.uint8, order="F")
     i, j, k = placed.offset
     for frame in np.flatnonzero(frames.segments == segment).tolist():

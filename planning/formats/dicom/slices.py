@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.dicom.dicom_file import has, items, name, number, numbers, sop_class_of, text, texts
 from puncture_twin.planning.formats.dicom.recognise import NO_SLICES
 from puncture_twin.planning.formats.dicom.storage import CLASSIC_CT
@@ -89,7 +89,7 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     if sop_class_of(data, where=file) == CLASSIC_CT:
         if frames != 1:
             what = f"{name('NumberOfFrames')} is {frames} in a CT image of one slice"
-            raise InputError(what, where=file, allowed="one frame, or an Enhanced CT image")
+            refuse(what, file, "one frame, or an Enhanced CT image", "wrong_count")
         return [_slice(file, 0, file, Groups(data, data))]
     found = []
     for frame, groups in enumerate(frame_groups(data, frames, where=file)):
@@ -121,7 +121,7 @@ class Groups:
             return self.own
         found = self.find(keyword, label)
         if len(found) != 1:
-            raise InputError(f"{name(keyword)} has {len(found)} items", where=label, allowed="one for each frame")
+            refuse(f"{name(keyword)} has {len(found)} items", label, "one for each frame", "wrong_count")
         return found[0]
 
 
@@ -134,7 +134,7 @@ def frame_groups(data: Dataset, frames: int, *, where: str) -> list[Groups]:
     own = items(data, "PerFrameFunctionalGroupsSequence", where=where)
     if len(own) != frames:
         what = f"{name('PerFrameFunctionalGroupsSequence')} has {len(own)} items for {frames} frames"
-        raise InputError(what, where=where, allowed="one for each frame")
+        refuse(what, where, "one for each frame", "wrong_count")
     shared = items(data, "SharedFunctionalGroupsSequence", where=where)
     return [Groups(one, shared[0] if shared else Dataset()) for one in own]
 
@@ -151,21 +151,17 @@ def plane_of(groups: Groups, label: str) -> Plane:
         groups.holder("PixelMeasuresSequence", label), "PixelSpacing", 2, where=label
     )
     if max(map(abs, origin)) > MAX_ORIGIN_MM:
-        raise InputError(
-            f"{name('ImagePositionPatient')} is {list(origin)}", where=label, allowed=f"{MAX_ORIGIN_MM} mm"
-        )
+        refuse(f"{name('ImagePositionPatient')} is {list(origin)}", label, f"{MAX_ORIGIN_MM} mm", "too_far")
     if not all(MIN_SPACING_MM <= one <= MAX_SPACING_MM for one in (between_rows, between_columns)):
-        allowed = f"{MIN_SPACING_MM} to {MAX_SPACING_MM} mm"
-        raise InputError(
-            f"{name('PixelSpacing')} is {between_rows:g}, {between_columns:g}", where=label, allowed=allowed
-        )
+        what = f"{name('PixelSpacing')} is {between_rows:g}, {between_columns:g}"
+        refuse(what, label, f"{MIN_SPACING_MM} to {MAX_SPACING_MM} mm", "implausible_spacing")
     if max(map(abs, cosines)) > 2:
-        raise InputError(f"{name('ImageOrientationPatient')} is {list(cosines)}", where=label, allowed="unit vectors")
+        refuse(f"{name('ImageOrientationPatient')} is {list(cosines)}", label, "unit vectors", "not_unit")
     axes = np.array(cosines).reshape(2, 3).T
     lengths = np.linalg.norm(axes, axis=0)
     if np.abs(lengths - 1.0).max() > UNIT_TOLERANCE or abs(axes[:, 0] @ axes[:, 1]) > UNIT_TOLERANCE:
         what = f"{name('ImageOrientationPatient')} is {list(cosines)}"
-        raise InputError(what, where=label, allowed="two unit vectors at a right angle")
+        refuse(what, label, "two unit vectors at a right angle", "axes_not_square")
     row = axes[:, 0] / lengths[0]
     column = axes[:, 1] - (axes[:, 1] @ row) * row
     square = np.stack([row, column / np.linalg.norm(column)], axis=1)
@@ -176,15 +172,15 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
     rescale = groups.holder("PixelValueTransformationSequence", label)
     kind = text(rescale, "RescaleType", where=label)
     if kind not in HOUNSFIELD:
-        raise InputError(f"{name('RescaleType')} is {kind!r}", where=label, allowed="HU (Hounsfield units)")
+        refuse(f"{name('RescaleType')} is {kind!r}", label, "HU (Hounsfield units)", "not_hounsfield")
     for keyword in ("RescaleSlope", "RescaleIntercept"):
         if not has(rescale, keyword):
             what = f"{name(keyword)} is missing, so that nothing tells its Hounsfield units"
-            raise InputError(what, where=label, allowed=WITH_RESCALE, code="no_rescale")
+            refuse(what, label, WITH_RESCALE, "no_rescale")
     slope, intercept = (number(rescale, keyword, where=label) for keyword in ("RescaleSlope", "RescaleIntercept"))
     if slope == 0 or abs(slope) > 1e6 or abs(intercept) > 1e6:
         what = f"rescaling by {slope:g} and {intercept:g}"
-        raise InputError(what, where=label, allowed="a slope other than 0, both within a million")
+        refuse(what, label, "a slope other than 0, both within a million", "out_of_range")
     return Slice(file, frame, label, plane_of(groups, label), slope, intercept)
 
 
@@ -238,7 +234,7 @@ def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
             or uneven steps; the slices are named.
     """
     if len(slices) < 2:
-        raise InputError(f"{len(slices)} slice", where=where, allowed="a series of at least 2 slices")
+        refuse(f"{len(slices)} slice", where, "a series of at least 2 slices", "too_few_slices")
     first = slices[0]
     for other in slices[1:]:
         _check_alike(first, other, where)
@@ -254,7 +250,7 @@ def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
     worst = int(np.argmax(off))
     if off[worst] > _tolerance(step):
         what = f"{ordered[worst].label} lies {off[worst]:.2f} mm off the line of the others"
-        raise InputError(what, where=where, allowed=f"slices along one straight line, to {_tolerance(step):.2g} mm")
+        refuse(what, where, f"slices along one straight line, to {_tolerance(step):.2g} mm", "off_grid")
     return Stack(tuple(ordered), ordered[0].plane, step_ct)
 
 
@@ -263,13 +259,11 @@ def _check_alike(first: Slice, other: Slice, where: Path) -> None:
     if difference > AXES_TOLERANCE:
         angle = np.degrees(np.arccos(np.clip(first.plane.normal_ct @ other.plane.normal_ct, -1.0, 1.0)))
         what = f"{first.label} and {other.label} have other orientations (normals {angle:.1f} degrees apart)"
-        raise InputError(what, where=where, allowed="slices of one orientation")
+        refuse(what, where, "slices of one orientation", "mixed_geometry")
     ratios = np.array(first.plane.spacing_mm) / other.plane.spacing_mm
     if np.abs(ratios - 1.0).max() > SPACING_TOLERANCE:
         what = f"{first.label} and {other.label} have pixels of other sizes"
-        raise InputError(
-            f"{what}: {first.plane.spacing_mm} and {other.plane.spacing_mm} mm", where=where, allowed="one"
-        )
+        refuse(f"{what}: {first.plane.spacing_mm} and {other.plane.spacing_mm} mm", where, "one", "mixed_geometry")
 
 
 def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> None:
@@ -280,8 +274,8 @@ def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> No
         return
     named = [f"{ordered[k].label} and {ordered[k + 1].label}" for k in np.flatnonzero(near).tolist()]
     more = f" and {len(named) - SHOWN} pairs more" if len(named) > SHOWN else ""
-    what = f"several slices at one place: {'; '.join(named[:SHOWN])}{more}"
-    raise InputError(what, where=where, allowed="one slice at each place (one time point, no copies)")
+    allowed = "one slice at each place (one time point, no copies)"
+    refuse(f"several slices at one place: {'; '.join(named[:SHOWN])}{more}", where, allowed, "duplicate_place")
 
 
 def _check_steps(ordered: Sequence[Slice], steps: Floats, step: float, where: Path) -> None:
@@ -298,7 +292,7 @@ def _check_steps(ordered: Sequence[Slice], steps: Floats, step: float, where: Pa
         what = f"uneven steps: {steps[at]:.4g} mm {between}"
     more = f", and at {len(wrong) - 1} places more" if len(wrong) > 1 else ""
     allowed = f"even steps; the usual one here is {step:.4g} mm (resample the series, or export it again)"
-    raise InputError(f"{what}{more}", where=where, allowed=allowed)
+    refuse(f"{what}{more}", where, allowed, "uneven_slices")
 
 
 def _tolerance(step: float) -> float:
@@ -342,7 +336,7 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
     tilt = float(np.degrees(np.arctan2(np.linalg.norm(sideways_mm), along)))
     if tilt > MAX_TILT_DEG:
         what = f"the slices' normal and the way from slice to slice are {tilt:.0f} degrees apart"
-        raise InputError(what, where=where, allowed=f"a tilt of at most {MAX_TILT_DEG:g} degrees")
+        refuse(what, where, f"a tilt of at most {MAX_TILT_DEG:g} degrees", "gantry_tilt")
     if np.linalg.norm(sideways_mm) * (count - 1) <= NO_TILT_MM:
         sideways_mm = np.zeros(2)
         tilt = 0.0

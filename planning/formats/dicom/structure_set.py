@@ -14,7 +14,7 @@ from pydicom.dataset import Dataset
 from skimage.morphology import convex_hull_image
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
 from puncture_twin.planning.formats.dicom.dicom_file import (
@@ -90,7 +90,7 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     data = parse_dicom(content(file), path)
     where = path.name
     if (sop_class := sop_class_of(data, where=where)) != STRUCTURE_SET:
-        raise InputError(f"SOP class {sop_class or 'missing'}", where=path, allowed="a DICOM RTSTRUCT")
+        refuse(f"SOP class {sop_class or 'missing'}", path, "a DICOM RTSTRUCT", "wrong_format")
     names = _names(data, ct, path)
     unique_names(list(names.values()), path)
     grid = _slices_grid(ct)
@@ -113,7 +113,7 @@ def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
     for item in items(data, "StructureSetROISequence", where=path.name):
         roi = whole(item, "ROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
         if roi in found:
-            raise InputError(f"two regions have the number {roi}", where=path, allowed="each number once")
+            refuse(f"two regions have the number {roi}", path, "each number once", "duplicate_number")
         check_frame_of_reference(text(item, "ReferencedFrameOfReferenceUID", where=path.name), ct, path)
         found[roi] = text(item, "ROIName", where=path.name)
     return found
@@ -122,13 +122,13 @@ def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
 def _regions(data: Dataset, names: dict[int, str], grid: VolumeGrid, path: Path) -> dict[int, _Region]:
     found: dict[int, _Region] = {}
     if not has(data, "ROIContourSequence"):
-        raise InputError(f"{name('ROIContourSequence')} is missing: was the file cut?", where=path, allowed="contours")
+        refuse(f"{name('ROIContourSequence')} is missing: was the file cut?", path, "contours", "missing_tag")
     T_index_ct = np.asarray(np.linalg.inv(grid.T_ct_index), np.float64)
     for item in items(data, "ROIContourSequence", where=path.name):
         roi = whole(item, "ReferencedROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
         if roi not in names or roi in found:
             what = f"contours of region {roi}, which is {'listed twice' if roi in found else 'not listed'}"
-            raise InputError(what, where=path, allowed="one list of contours for each region")
+            refuse(what, path, "one list of contours for each region", "unknown_region")
         label = f"{path.name}, {names[roi]!r}"
         listed = items(item, "ContourSequence", where=label)
         closed = [one for one in listed if text(one, "ContourGeometricType", where=label) in CLOSED]
@@ -143,14 +143,14 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
     slices = np.unique(np.round(index[:, 2]))
     at = points_ct[0].round(2).tolist()
     if len(slices) != 1 or np.abs(index[:, 2] - slices[0]).max() > ON_SLICE:
-        allowed = "contours in the slices of the CT on which they were drawn"
-        raise InputError(f"the contour through {at} lies between the CT's slices", where=label, allowed=allowed)
+        what = f"the contour through {at} lies between the CT's slices"
+        refuse(what, label, "contours in the slices of the CT on which they were drawn", "contour_outside_ct")
     if not 0 <= slices[0] < grid.shape[2]:
-        allowed = "contours within the CT on which they were drawn"
-        raise InputError(f"the contour through {at} lies beyond the CT's slices", where=label, allowed=allowed)
+        what = f"the contour through {at} lies beyond the CT's slices"
+        refuse(what, label, "contours within the CT on which they were drawn", "contour_outside_ct")
     length = float(np.abs(index[:, :2] - np.roll(index[:, :2], 1, axis=0)).sum())
     if length > MAX_LENGTH:
-        raise InputError(f"the contour through {at} is {length:.3g} pixels long", where=label, allowed=f"{MAX_LENGTH}")
+        refuse(f"the contour through {at} is {length:.3g} pixels long", label, f"{MAX_LENGTH}", "too_long")
     return Contour(int(slices[0]), index[:, :2])
 
 
@@ -163,15 +163,14 @@ def _points(item: Dataset, label: str) -> Floats:
         flat = np.array(parts, dtype=np.float64) if parts != [b""] else np.zeros(0)
     count = len(flat) // 3
     if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
-        what = f"{name('ContourData')} holds {len(flat)} numbers"
-        raise InputError(what, where=label, allowed="three finite numbers for each of at least three points")
+        allowed = "three finite numbers for each of at least three points"
+        refuse(f"{name('ContourData')} holds {len(flat)} numbers", label, allowed, "wrong_count")
     if has(item, "NumberOfContourPoints"):
         whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
     return flat.reshape(-1, 3)
 
 
 def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> Mask:
-    """The voxels of one region."""
     made = np.zeros(shape, np.uint8, order="F")
     for number in {one.slice for one in contours}:
         made[:, :, number] = _slice_mask([one for one in contours if one.slice == number], shape[:2])

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import is_folder
 from puncture_twin.planning.base.text import check_name, first_few
 from puncture_twin.planning.formats.dicom.named_masks import Mask, MaskVolume, NamedMasks, unique_names
@@ -59,14 +59,14 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
     """
     allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one a structure"
     if not is_folder(folder):
-        raise InputError(f"'{folder.name[:200]}' is no folder", where=where, allowed=allowed)
+        refuse(f"'{folder.name[:200]}' is no folder", where, allowed, "not_a_folder")
     found = entries(folder, most=MAX_ENTRIES, allowed=allowed)
     files = [one.name for one in found if is_mask(one) and not known(folder / one.name)]
     left = unaccounted(folder, found, lambda path: path.name in files or known(path))
     if left:
         raise not_read(left, "masks", where)
     if not 1 <= len(files) <= MAX_MASKS:
-        raise InputError(f"'{folder.name}' holds {len(files)} masks", where=where, allowed=allowed)
+        refuse(f"'{folder.name}' holds {len(files)} masks", where, allowed, "wrong_count")
     refuse_one_name(files, where)
     return tuple(files)
 
@@ -80,9 +80,8 @@ def refuse_one_name(files: Sequence[str], where: str | Path) -> None:
     names: dict[str, str] = {}
     for file in files:
         if (other := names.setdefault(structure_name(file), file)) is not file:
-            what = f"'{other}' and '{file}' are masks of one name"
             allowed = "one mask a structure: move one of the two out of the folder"
-            raise InputError(what, where=where, allowed=allowed, code="masks_of_one_name")
+            refuse(f"'{other}' and '{file}' are masks of one name", where, allowed, "masks_of_one_name")
 
 
 def is_mask(entry: Entry) -> bool:
@@ -108,19 +107,13 @@ def refuse_label_map(mask: LabelMap) -> None:
     """
     present = mask.labels_present()
     if len(present) > 1:
-        raise InputError(
-            f"is no mask: its voxels have the labels {first_few(list(map(str, present)))}",
-            where=mask.path,
-            allowed="0 and one other value; a label map is named with labelmap, outside of a folder of masks",
-        )
+        what = f"is no mask: its voxels have the labels {first_few(list(map(str, present)))}"
+        allowed = "0 and one other value; a label map is named with labelmap, outside of a folder of masks"
+        refuse(what, mask.path, allowed, "not_a_mask")
 
 
 def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> None:
     """Whether all masks of a folder lie on one grid: what lies beyond a smaller one would count as free.
-
-    Args:
-        headers: File name to header.
-        where: The folder, for the error.
 
     Raises:
         InputError: Two differ in shape or place; names both.
@@ -134,11 +127,8 @@ def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> N
             difference = f"up to {apart:.1f} mm away"
         else:
             continue
-        raise InputError(
-            f"mask {name} lies on another grid than {first}: {difference}",
-            where=where,
-            allowed="masks of one CT, all on one grid; others as [[structure]] with labelmap and label",
-        )
+        allowed = "masks of one CT, all on one grid; others as [[structure]] with labelmap and label"
+        refuse(f"mask {name} lies on another grid than {first}: {difference}", where, allowed, "other_grid")
 
 
 SEGMENT_ENDING = ".nrrd"
@@ -161,21 +151,14 @@ class Segment(NamedTuple):
 def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
     """The segments of a Slicer segmentation, each by its name.
 
-    Args:
-        path: Its name.
-        file: Its key in ``content``.
-        content: Gives its bytes.
-
     Raises:
         InputError: No such file, no segment, or segments that share a name or a label.
     """
     header = parse_layered_header(content(file), path)
     if header.data_path != path:
-        raise InputError(
-            f"its voxels lie in {header.data_path.name}", where=path, allowed="header and voxels in one file"
-        )
+        refuse(f"its voxels lie in {header.data_path.name}", path, "header and voxels in one file", "data_elsewhere")
     if header.cells.dtype.kind not in "iu":
-        raise InputError(f"voxels of type {header.cells.dtype}", where=path, allowed="whole numbers")
+        refuse(f"voxels of type {header.cells.dtype}", path, "whole numbers", "wrong_type")
     found = listed_segments(header.fields, header.layers, path)
     listed = frozenset(found.values())
     masks = {
@@ -203,7 +186,7 @@ def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict
     for name, segment in zip(names, segments, strict=True):
         if segments.count(segment) > 1:
             what = f"segment {name!r} shares label {segment.label} of layer {segment.layer}"
-            raise InputError(what, where=path, allowed="a label of its own in its layer for each segment")
+            refuse(what, path, "a label of its own in its layer for each segment", "duplicate_label")
     return dict(zip(names, segments, strict=True))
 
 
@@ -211,15 +194,15 @@ def _segment(remarks: Mapping[str, str], number: int, layers: int, path: Path) -
     label = _number(remarks, f"Segment{number}_LabelValue", None, path)
     layer = _number(remarks, f"Segment{number}_Layer", "0" if layers == 1 else None, path)
     if not (1 <= label <= MAX_LABEL and layer < layers):
-        what = f"segment {number} has label {label} in layer {layer}"
-        raise InputError(what, where=path, allowed=f"labels from 1 to {MAX_LABEL}, layers from 0 to {layers - 1}")
+        allowed = f"labels from 1 to {MAX_LABEL}, layers from 0 to {layers - 1}"
+        refuse(f"segment {number} has label {label} in layer {layer}", path, allowed, "out_of_range")
     return Segment(layer, label)
 
 
 def _number(remarks: Mapping[str, str], key: str, default: str | None, path: Path) -> int:
     text = remarks.get(key, default)
     if text is None or not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise InputError(f"{key} is {'missing' if text is None else repr(text[:20])}", where=path, allowed=ALLOWED)
+        refuse(f"{key} is {'missing' if text is None else repr(text[:20])}", path, ALLOWED, "bad_value")
     return int(text)
 
 
@@ -229,5 +212,5 @@ def _mask(content: Content, file: str, header: VolumeHeader, segment: Segment, l
     lost = layer[~np.isin(layer, [0, *(one.label for one in listed if one.layer == segment.layer)])]
     if lost.size:
         what = f"layer {segment.layer} has voxels of {np.unique(lost)[:8].tolist()}, which are no segment's"
-        raise InputError(what, where=header.data_path, allowed="a segment for each label", code="label_without_segment")
+        refuse(what, header.data_path, "a segment for each label", "label_without_segment")
     return np.asarray(layer == segment.label).astype(np.uint8)

@@ -13,16 +13,15 @@ left holes in random masks.
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from skimage.measure import marching_cubes
 
 from puncture_twin.planning.base.arrays import Bools
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
 from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.volumes.volume_files import canonical
@@ -48,16 +47,16 @@ def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> Triangle
     if box is None:
         named = labelmap.names or {}
         shown = ", ".join(f"{n} {named[n]}" if n in named else str(n) for n in labelmap.labels_present())
-        raise InputError(f"no voxel has label {label}", where=where, allowed=f"the labels present: {shown}")
+        refuse(f"no voxel has label {label}", where, f"the labels present: {shown}", "label_absent")
     mask = labelmap.labels[box] == label
     T_ct_box = labelmap.T_ct_index.copy()
     T_ct_box[:3, 3] += labelmap.T_ct_index[:3, :3] @ [axis.start for axis in box]
     oriented = canonical(mask, T_ct_box)
-    return field_surface(oriented.values.astype(np.float32, order="C") - 0.5, oriented.T_ct_index, where=where)
+    return mask_surface(oriented.values, oriented.T_ct_index, where=where)
 
 
 def mask_surface(mask: Bools, T_ct_index: NDArray[np.float64], *, where: str | Path) -> TriangleMesh:
-    """The closed surface of a mask's voxels, as `field_surface` of one that is 1/2 inside and -1/2 outside.
+    """The closed surface of a mask's voxels, as `framed_surface` of a field that is 1/2 inside and -1/2 outside.
 
     Args:
         mask: Shape (ni, nj, nk), somewhere True; only the box of what is True is looked at.
@@ -65,24 +64,30 @@ def mask_surface(mask: Bools, T_ct_index: NDArray[np.float64], *, where: str | P
         where: For messages.
     """
     box = box_in(mask)
-    return field_surface(
-        mask[box].astype(np.float32) - 0.5, T_ct_index, where=where, first=[axis.start for axis in box]
-    )
+    framed, field = frame([axis.stop - axis.start for axis in box])
+    np.subtract(mask[box], np.float32(0.5), out=field)
+    return framed_surface(framed, T_ct_index, where=where, first=[axis.start for axis in box])
 
 
-def box_in(mask: Bools, beside: ArrayLike = 0) -> Box:
-    """The smallest index box about what is True in a mask, somewhere, with so many voxels beside it along each axis."""
+def box_in(mask: Bools, margin: ArrayLike = 0) -> Box:
+    """The smallest index box about the True voxels of a mask, and ``margin`` voxels more along each axis."""
     i = np.flatnonzero([plane.any() for plane in mask])
     seen: Bools = np.asarray(mask[i[0] : i[-1] + 1].any(axis=0))
     j, k = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    x, y, z = np.broadcast_to(beside, 3).tolist()
+    x, y, z = np.broadcast_to(margin, 3).tolist()
     ends = ((i, x, 0), (j, y, 1), (k, z, 2))
     a, b, c = (slice(max(0, n[0] - m), min(n[-1] + 1 + m, mask.shape[axis])) for n, m, axis in ends)
     return a, b, c
 
 
-def field_surface(
-    field: NDArray[Any], T_ct_index: NDArray[np.float64], *, where: str | Path, first: ArrayLike = 0
+def frame(shape: Sequence[int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """An array for `framed_surface`, not filled, and the view of it within the frame, of a shape (3,)."""
+    framed = np.empty([count + 2 for count in shape], np.float32)
+    return framed, framed[1:-1, 1:-1, 1:-1]
+
+
+def framed_surface(
+    framed: NDArray[np.float32], T_ct_index: NDArray[np.float64], *, where: str | Path, first: ArrayLike = 0
 ) -> TriangleMesh:
     """The closed surface around where a field is positive, in LPS mm, normals outward.
 
@@ -90,16 +95,14 @@ def field_surface(
     the border voxels.
 
     Args:
-        field: Shape (ni, nj, nk), never 0, positive inside, somewhere positive.
+        framed: Of `frame`: within, the field, never 0, positive inside, somewhere positive; its frame is written here.
         T_ct_index: Shape (4, 4), determinant positive.
         where: For messages.
         first: Shape (3,), index of the field's first voxel, where it is part of a larger one.
     """
-    padded = np.pad(np.asarray(field, np.float32), 1, mode="edge")
-    for axis, side in itertools.product(range(3), (0, -1)):
-        border = [slice(None)] * 3
-        border[axis] = slice(side, None) if side else slice(0, 1)
-        padded[tuple(border)] = -np.abs(padded[tuple(border)])
-    found = marching_cubes(padded, level=0.0, method="lorensen", gradient_direction="ascent")
+    for axis in range(3):
+        planes = np.moveaxis(framed, axis, 0)
+        planes[0], planes[-1] = -np.abs(planes[1]), -np.abs(planes[-2])
+    found = marching_cubes(framed, level=0.0, method="lorensen", gradient_direction="ascent")
     index, faces = found[0].astype(np.float64) - 1.0 + first, found[1]
     return guard_mesh(apply(T_ct_index, index), faces, where=where)

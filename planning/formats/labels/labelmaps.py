@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 
 MAX_LABEL = 65_535
@@ -77,16 +77,12 @@ def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
     names = segment_names(volume.fields, volume.path)
     labels, rounded_by = whole_labels(volume.values, volume.path)
     if not may_be_empty and not labels.any():
-        raise InputError("the label map is empty: every voxel is 0", where=volume.path, allowed=ALLOWED)
+        refuse("the label map is empty: every voxel is 0", volume.path, ALLOWED, "empty")
     return LabelMap(labels, volume.T_ct_index, names, volume.path, rounded_by)
 
 
 def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer], float]:
     """Voxels as whole numbers, and how far they were off, at most.
-
-    Args:
-        values: Of any type.
-        path: The file, for errors.
 
     Raises:
         InputError: Values that are negative, too large, or farther from whole numbers than `ROUNDED_BY`; those of a
@@ -94,7 +90,7 @@ def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer],
     """
     low, high = values.min(), values.max()
     if low < -ROUNDED_BY or high > MAX_LABEL:
-        raise InputError(f"values from {low} to {high} are no labels", where=path, allowed=ALLOWED, code="no_labels")
+        refuse(f"values from {low} to {high} are no labels", path, ALLOWED, "no_labels")
     if values.dtype.kind != "f":
         return values, 0.0
     rounded = np.rint(values)
@@ -105,9 +101,8 @@ def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer],
         whole = np.count_nonzero((values > ROUNDED_BY) & ~between)
         if high > 1.5 and whole > LEAST_WHOLE * np.count_nonzero(values > ROUNDED_BY):
             what = f"holds values between its labels, such as {example:.3g}: they were blended by an interpolation"
-            allowed = f"{ALLOWED}: resample it again, with nearest neighbours"
-            raise InputError(what, where=path, allowed=allowed, code="labels_blended")
-        raise InputError(f"value {example} is not whole", where=path, allowed=ALLOWED, code="no_labels")
+            refuse(what, path, f"{ALLOWED}: resample it again, with nearest neighbours", "labels_blended")
+        refuse(f"value {example} is not whole", path, ALLOWED, "no_labels")
     return rounded.astype(np.uint16), float(off.max())
 
 
@@ -124,9 +119,9 @@ def segment_names(fields: dict[str, str], path: Path) -> dict[int, str] | None:
             continue
         value = fields.get(f"Segment{number[1]}_LabelValue", "")
         if not (value.isascii() and value.isdigit() and 0 < int(value) <= MAX_LABEL):
-            raise InputError(f"segment {name!r} has label value {value!r}", where=path, allowed=f"1 to {MAX_LABEL}")
+            refuse(f"segment {name!r} has label value {value!r}", path, f"1 to {MAX_LABEL}", "out_of_range")
         if int(value) in names:
             what = f"segments {names[int(value)]!r} and {name!r} share label {value}"
-            raise InputError(what, where=path, allowed="one label per segment")
+            refuse(what, path, "one label per segment", "duplicate_label")
         names[int(value)] = name
     return names or None

@@ -15,7 +15,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL
 
@@ -60,10 +61,10 @@ def parse_names(data: bytes, path: Path) -> dict[int, str]:
         if label is None:
             continue
         if label in names:
-            raise InputError(f"id {label} stands twice", where=entry.where, allowed="each id once")
+            refuse(f"id {label} stands twice", entry.where, "each id once", "duplicate_label")
         names[label] = entry.name.strip()
     if not names:
-        raise InputError("the naming holds no label", where=path, allowed=allowed)
+        refuse("the naming holds no label", path, allowed, "empty")
     return names
 
 
@@ -71,10 +72,10 @@ def _label(entry: _Entry, allowed: str) -> int | None:
     """The number of an entry; None for the background."""
     text = entry.number.strip()
     if not (text.isascii() and text.isdigit() and len(text) < 7 and int(text) <= MAX_LABEL):
-        raise InputError(f"label {text[:40]!r} of {entry.name[:60]!r}", where=entry.where, allowed=allowed)
+        refuse(f"label {text[:40]!r} of {entry.name[:60]!r}", entry.where, allowed, "bad_label")
     if int(text) == 0:
         if _plain(entry.name) not in BACKGROUND:
-            raise InputError(f"label 0 is {entry.name[:60]!r}", where=entry.where, allowed="0 for the background only")
+            refuse(f"label 0 is {entry.name[:60]!r}", entry.where, "0 for the background only", "bad_label")
         return None
     return int(text)
 
@@ -91,18 +92,18 @@ def _csv_entries(data: bytes, path: Path) -> Iterator[_Entry]:
             continue
         where = f"{path}, line {line}"
         if len(row) != len(rows[0]):
-            raise InputError(f"{len(row)} fields, not {len(rows[0])}: {row}", where=where, allowed=ALLOWED_CSV)
+            refuse(f"{len(row)} fields, not {len(rows[0])}: {row}", where, ALLOWED_CSV, "ragged_row")
         yield _Entry(row[number], row[name], where)
 
 
 def _rows(data: bytes, path: Path) -> list[list[str]]:
+    text = decode_text(data, str(path))
     try:
-        text = data.decode("utf-8-sig")
         first = text.partition("\n")[0]
         separator = max((",", ";", "\t"), key=first.count)
         return list(csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"is no CSV text ({error})", where=path, allowed=ALLOWED_CSV) from error
+    except csv.Error as error:
+        raise InputError(f"is no CSV text ({error})", where=path, allowed=ALLOWED_CSV, code="not_csv") from error
 
 
 def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
@@ -112,7 +113,7 @@ def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
     number = next((plain.index(one) for one in NUMBER_COLUMNS if one in plain and plain.index(one) != name), None)
     if name is None or number is None:
         shown = ",".join(header)[:100] or "missing"
-        raise InputError(f"header {shown!r} names no column of labels and names", where=path, allowed=ALLOWED_CSV)
+        refuse(f"header {shown!r} names no column of labels and names", path, ALLOWED_CSV, "wrong_columns")
     return number, name
 
 
@@ -120,25 +121,19 @@ def _json_entries(data: bytes, path: Path) -> Iterator[_Entry]:
     tree = parse_json(data, where=path, allowed=ALLOWED_JSON)
     table = tree.get("labels", tree) if isinstance(tree, dict) else None
     if not isinstance(table, dict):
-        raise InputError("no object of labels", where=path, allowed=ALLOWED_JSON)
+        refuse("no object of labels", path, ALLOWED_JSON, "wrong_format")
     for key, value in table.items():
         number, name = (key, value) if isinstance(value, str) else (value, key)
         if isinstance(value, list):
             what = f"{str(key)[:60]!r} is a list of labels (a region): name its labels one by one"
-            raise InputError(what, where=path, allowed=ALLOWED_JSON, code="labels_of_regions")
+            refuse(what, path, ALLOWED_JSON, "labels_of_regions")
         if isinstance(number, bool) or not isinstance(number, str | int) or not isinstance(name, str):
-            raise InputError(
-                f"entry {str(key)[:60]!r} is no pair of a number and a name", where=path, allowed=ALLOWED_JSON
-            )
+            refuse(f"entry {str(key)[:60]!r} is no pair of a number and a name", path, ALLOWED_JSON, "wrong_format")
         yield _Entry(str(number), name, str(path))
 
 
 def _list_entries(data: bytes, path: Path) -> Iterator[_Entry]:
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"is no text ({error})", where=path, allowed=ALLOWED_LIST) from error
-    for line, text in enumerate(lines, start=1):
+    for line, text in enumerate(decode_text(data, str(path)).splitlines(), start=1):
         if text.strip() and not text.lstrip().startswith("#"):
             yield _list_entry(text, f"{path}, line {line}")
 
@@ -147,12 +142,12 @@ def _list_entry(text: str, where: str) -> _Entry:
     try:
         fields = shlex.split(text)
     except ValueError as error:
-        raise InputError(f"{text[:60]!r} ({error})", where=where, allowed=ALLOWED_LIST) from error
+        raise InputError(f"{text[:60]!r} ({error})", where=where, allowed=ALLOWED_LIST, code="unknown_line") from error
     if len(fields) == 8 and all(_is_number(one) for one in fields[:7]):
         return _Entry(fields[0], fields[7], where)
     if len(fields) == 6 and all(_is_number(one) for one in fields[2:]):
         return _Entry(fields[0], fields[1], where)
-    raise InputError(f"{text[:60]!r}", where=where, allowed=ALLOWED_LIST)
+    raise InputError(f"{text[:60]!r}", where=where, allowed=ALLOWED_LIST, code="unknown_line")
 
 
 def _is_number(text: str) -> bool:

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Generic, Protocol, TypeVar
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import check_name, did_you_mean, first_few
 from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
 
@@ -172,7 +172,7 @@ def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes],
     allowed = f"{', '.join(BUILT_IN)}, a table of names ({', '.join(NAME_ENDINGS)}), or a .seg.nrrd with names"
     if naming is None or naming == OWN_NAMES:
         if labelmap.names is None:
-            raise InputError("the label map holds no names", where=labelmap.path, allowed=allowed)
+            refuse("the label map holds no names", labelmap.path, allowed, "labels_without_names")
         return _unique(labelmap.names, labelmap.path)
     if naming in BUILT_IN:
         return dict(BUILT_IN[naming])
@@ -180,7 +180,7 @@ def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes],
         return _unique(parse_names(content(naming), folder / naming), folder / naming)
     near = difflib.get_close_matches(naming, BUILT_IN, n=1)
     hint = f" (nearest: {near[0]})" if near else ""
-    raise InputError(f"unknown naming {naming!r}{hint}", where=labelmap.path, allowed=allowed)
+    raise InputError(f"unknown naming {naming!r}{hint}", where=labelmap.path, allowed=allowed, code="unknown_naming")
 
 
 def select(
@@ -205,7 +205,7 @@ def select(
         names: Label to name.
         present: The labels of the map.
         avoid: Pattern to margin in mm.
-        unknown: Likewise, for which it is unknown whether a path may cross it.
+        unknown: Patterns of structures of which it is unknown whether a path may cross them.
         traverse: Patterns of what may be crossed.
         target: Patterns of what holds the lesion.
         ignore: Patterns of what does not count.
@@ -226,12 +226,12 @@ def select(
         _refuse_unknown(patterns, names, where)
     nameless = [label for label in sorted(present) if label not in names]
     if nameless:
-        raise InputError(f"labels without a name: {_listed(nameless)}", where=where, allowed="labels of the naming")
+        refuse(f"labels without a name: {_listed(nameless)}", where, "labels of the naming", "labels_without_names")
     rules = [_rule(label, names[label], patterns, where) for label in sorted(present)]
     missing = [names[label] for label, rule in zip(sorted(present), rules, strict=True) if rule is None]
     if missing:
-        what = f"no rule names these labels, which are present: {_listed(missing)}"
-        raise InputError(what, where=where, allowed="a pattern in avoid, unknown, traverse, target or ignore for each")
+        allowed = "a pattern in avoid, unknown, traverse, target or ignore for each"
+        refuse(f"no rule names these labels, which are present: {_listed(missing)}", where, allowed, "no_rule")
     here = [names[label] for label in present]
     unused = [p for p in patterns if not any(fnmatchcase(name, p.pattern) for name in here)]
     absent = [f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused]
@@ -243,8 +243,7 @@ def select(
 def _check_margins(patterns: Sequence[LabelRule], where: str | Path) -> None:
     for rule in patterns:
         if not (math.isfinite(rule.margin_mm) and rule.margin_mm >= 0):
-            what = f"margin {rule.margin_mm} of pattern {rule.pattern!r}"
-            raise InputError(what, where=where, allowed="mm, 0 or more")
+            refuse(f"margin {rule.margin_mm} of pattern {rule.pattern!r}", where, "mm, 0 or more", "out_of_range")
 
 
 def _refuse_unknown(patterns: Sequence[LabelRule], names: Mapping[int, str], where: str | Path) -> None:
@@ -252,8 +251,7 @@ def _refuse_unknown(patterns: Sequence[LabelRule], names: Mapping[int, str], whe
         if rule.pattern != REST and not any(fnmatchcase(name, rule.pattern) for name in names.values()):
             near = difflib.get_close_matches(rule.pattern.strip("*?"), names.values(), n=3, cutoff=0.4)
             allowed = f"names like {', '.join(near)}" if near else f"one of {_listed(sorted(names.values()))}"
-            what = f"{rule.kind} pattern {rule.pattern!r} matches no name of the naming"
-            raise InputError(what, where=where, allowed=allowed)
+            refuse(f"{rule.kind} pattern {rule.pattern!r} matches no name of the naming", where, allowed, "no_match")
 
 
 def specificity(pattern: str, name: str) -> float:
@@ -275,7 +273,7 @@ def _rule(label: int, name: str, patterns: Sequence[LabelRule], where: str | Pat
     other = next((p for p in closest if p.kind is not first.kind), None)
     if other is not None:
         what = f"label {name!r} is named by {first.kind} {first.pattern!r} and by {other.kind} {other.pattern!r}"
-        raise InputError(what, where=where, allowed="one of the two, or its full name under the kind that is meant")
+        refuse(what, where, "one of the two, or its full name under the kind that is meant", "two_roles")
     return LabelRule(label, name, first.kind, first.margin_mm, first.pattern)
 
 
@@ -304,7 +302,7 @@ def _unique(names: Mapping[int, str], where: Path) -> dict[int, str]:
         check_name(name, f"label {label}", where=where)
         if name in seen:
             what = f"labels {seen[name]} and {label} are both named {name!r}"
-            raise InputError(what, where=where, allowed="a name of its own for each label")
+            refuse(what, where, "a name of its own for each label", "duplicate_name")
         seen[name] = label
     return dict(names)
 
@@ -346,13 +344,11 @@ class ByName(Generic[T]):
         """
         names, known = list(names), [*names, *others]
         if missing := [name for name in names if self.of(name) is None]:
-            message = f"{key}: nothing for {first_few(missing)}"
-            raise InputError(message, where=where, allowed='a pattern for each; "*" is the rest')
+            refuse(f"{key}: nothing for {first_few(missing)}", where, 'a pattern for each; "*" is the rest', "no_rule")
         for pattern in self.of_pattern:
             if not any(fnmatchcase(name, pattern) for name in known):
                 near = did_you_mean(pattern.strip("*?"), known)
-                message = f"{key}: pattern '{pattern}' matches no structure{near}"
-                raise InputError(message, where=where, allowed=first_few(known))
+                refuse(f"{key}: pattern '{pattern}' matches no structure{near}", where, first_few(known), "no_match")
         for name in names:
             _refuse_contradiction(self.of_pattern, name, key, where)
 
@@ -364,4 +360,4 @@ def _refuse_contradiction(of_pattern: Mapping[str, T], name: str, key: str, wher
     equal = [pattern for pattern in matching if specificity(pattern, name) == best]
     if any(of_pattern[pattern] != of_pattern[equal[0]] for pattern in equal):
         message = f"{key}: {' and '.join(map(repr, equal))} both name '{name}', and differ"
-        raise InputError(message, where=where, allowed="one pattern that is more specific than the others")
+        refuse(message, where, "one pattern that is more specific than the others", "ambiguous_patterns")

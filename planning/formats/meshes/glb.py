@@ -17,10 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
-from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join, refuse
+from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join
 
 _GLB_ALLOWED = "glTF, version 2: its length, then a JSON chunk and at most one BIN chunk, as long as they say"
 _DOCUMENT_ALLOWED = "a glTF 2.0 document in JSON"
@@ -148,21 +148,21 @@ def read_document(data: bytes, where: str) -> GlbFile:
 def _chunks(data: bytes, where: str) -> tuple[bytes, bytes]:
     """The JSON chunk and the BIN chunk, which may be empty."""
     if len(data) < 20 or data[:4] != b"glTF" or int.from_bytes(data[4:8], "little") != 2:
-        refuse(f"not a GLB file of version 2 ({len(data)} bytes, {data[:4]!r})", where, _GLB_ALLOWED)
+        refuse(f"not a GLB file of version 2 ({len(data)} bytes, {data[:4]!r})", where, _GLB_ALLOWED, "wrong_format")
     stated = int.from_bytes(data[8:12], "little")
     if stated != len(data):
-        refuse(f"header states {stated} bytes, but the file has {len(data)}", where, _GLB_ALLOWED)
+        refuse(f"header states {stated} bytes, but the file has {len(data)}", where, _GLB_ALLOWED, "size_mismatch")
     chunks, position = [], 12
     while position < len(data):
         length, kind = int.from_bytes(data[position : position + 4], "little"), data[position + 4 : position + 8]
         end = position + 8 + length
         if end > len(data):
-            refuse(f"chunk {kind!r} states {length} bytes, beyond the file's end", where, _GLB_ALLOWED)
+            refuse(f"chunk {kind!r} states {length} bytes, beyond the file's end", where, _GLB_ALLOWED, "file_cut")
         chunks.append((kind, data[position + 8 : end]))
         position = end
     binaries = [body for kind, body in chunks if kind == _BIN_CHUNK]
     if chunks[0][0] != _JSON_CHUNK or len(binaries) > 1:
-        refuse(f"chunks {[kind for kind, _ in chunks]}", where, _GLB_ALLOWED)
+        refuse(f"chunks {[kind for kind, _ in chunks]}", where, _GLB_ALLOWED, "wrong_format")
     return chunks[0][1], binaries[0] if binaries else b""
 
 
@@ -173,34 +173,38 @@ def _parse(text: bytes, where: str) -> Document:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ascii(".".join(str(step) for step in first["loc"]))
-        raise InputError(f"{place}: {first['msg']}", where=where, allowed=_DOCUMENT_ALLOWED) from error
+        what = f"{place}: {first['msg']}"
+        raise InputError(what, where=where, allowed=_DOCUMENT_ALLOWED, code="bad_value") from error
 
 
 def _check_supported(document: Document, where: str) -> None:
     """Refuse what would change the surface in a way that this reader does not know."""
     if not document.asset.version.startswith("2."):
-        refuse(f"glTF version {document.asset.version[:20]!r}", where, "version 2")
+        refuse(f"glTF version {document.asset.version[:20]!r}", where, "version 2", "unknown_version")
     for name in document.extensions_required:
         if not name.startswith(_HARMLESS):
-            refuse(f"needs the extension {name[:60]!r}", where, "glTF without compression or other extensions")
+            what = f"needs the extension {name[:60]!r}"
+            refuse(what, where, "glTF without compression or other extensions", "unsupported_feature")
     for index, node in enumerate(document.nodes):
         if node.skin is not None or _INSTANCING in node.extensions:
-            refuse(f"node {index} is bent by a skin or instanced", where, "rigid meshes, one per node")
+            what = f"node {index} is bent by a skin or instanced"
+            refuse(what, where, "rigid meshes, one per node", "unsupported_feature")
 
 
 def _check_sizes(document: Document, size: int, where: str) -> None:
     """Hold the buffer against the BIN chunk, and the views against the buffer."""
     for buffer in document.buffers:
         if buffer.uri is not None:
-            refuse(f"the buffer lies outside of the BIN chunk ({buffer.uri[:60]!r})", where, "one whole GLB file")
+            what = f"the buffer lies outside of the BIN chunk ({buffer.uri[:60]!r})"
+            refuse(what, where, "one whole GLB file", "data_elsewhere")
         if buffer.byte_length > size:
             what = f"buffer 0 states {buffer.byte_length} bytes, {size} are there"
-            refuse(what, where, "a buffer as long as it says")
+            refuse(what, where, "a buffer as long as it says", "size_mismatch")
     for index, view in enumerate(document.buffer_views):
         end = view.byte_offset + view.byte_length
         if view.buffer >= len(document.buffers) or end > document.buffers[view.buffer].byte_length:
             what = f"bufferView {index} ends at byte {end} of buffer {view.buffer}, which does not reach there"
-            refuse(what, where, "views inside their buffer")
+            refuse(what, where, "views inside their buffer", "size_mismatch")
 
 
 _TREE_ALLOWED = "nodes that form trees below one scene"
@@ -218,10 +222,6 @@ _VERTEX_BYTES, _TRIANGLE_BYTES = 12, 3
 
 def read_glb(data: bytes, where: str) -> RawMesh:
     """The triangles of a GLB file's scene, in the unit of the file and its axes, y up by the standard (section 3.4).
-
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
 
     Raises:
         InputError: If it is cut, contradicts itself, or uses what is not supported.
@@ -254,30 +254,32 @@ class _Glb:
             if node.mesh is None:
                 continue
             if node.mesh >= len(meshes):
-                refuse(f"node {index} uses mesh {node.mesh}", self.where, f"one of the {len(meshes)} meshes")
+                what = f"node {index} uses mesh {node.mesh}"
+                refuse(what, self.where, f"one of the {len(meshes)} meshes", "index_out_of_range")
             if index not in T_scene_node:
-                refuse(f"node {index} holds a mesh but is not in the scene", self.where, "every mesh in the one scene")
+                what = f"node {index} holds a mesh but is not in the scene"
+                refuse(what, self.where, "every mesh in the one scene", "mesh_not_placed")
             placed.append((node.mesh, T_scene_node[index]))
         lost = set(range(len(meshes))) - {mesh for mesh, _ in placed}
         if lost or not placed:
             what = f"mesh {min(lost)} is placed by no node" if lost else "no mesh"
-            refuse(what, self.where, "at least one mesh, each placed by a node of the scene")
+            refuse(what, self.where, "at least one mesh, each placed by a node of the scene", "mesh_not_placed")
         return placed
 
     def _walk(self) -> dict[int, Floats]:
         """The transform of every node that is below the scene's top."""
         scenes, nodes = self.document.scenes, self.document.nodes
         if self.document.scene is None and len(scenes) != 1:
-            refuse(f"{len(scenes)} scenes and none of them chosen", self.where, _TREE_ALLOWED)
+            refuse(f"{len(scenes)} scenes and none of them chosen", self.where, _TREE_ALLOWED, "several_scenes")
         number = self.document.scene or 0
         if number >= len(scenes):
-            refuse(f"scene {number} of {len(scenes)}", self.where, _TREE_ALLOWED)
+            refuse(f"scene {number} of {len(scenes)}", self.where, _TREE_ALLOWED, "index_out_of_range")
         found: dict[int, Floats] = {}
         waiting = [(index, np.eye(4)) for index in scenes[number].nodes]
         while waiting:
             index, T_scene_parent = waiting.pop()
             if index >= len(nodes) or index in found:
-                refuse(f"node {index} is missing, or reached twice", self.where, _TREE_ALLOWED)
+                refuse(f"node {index} is missing, or reached twice", self.where, _TREE_ALLOWED, "not_a_tree")
             found[index] = T_scene_parent @ _local(nodes[index], f"{self.where}, node {index}")
             waiting.extend((child, found[index]) for child in nodes[index].children)
         return found
@@ -287,13 +289,13 @@ class _Glb:
         sizes = [self._size(mesh) for mesh in self.document.meshes]
         total = _Size(*(sum(sizes[mesh][kind] for mesh, _ in placed) for kind in range(3)))
         if total.parts > MAX_PARTS:
-            refuse(f"{total.parts} parts in all places", self.where, f"at most {MAX_PARTS}")
+            refuse(f"{total.parts} parts in all places", self.where, f"at most {MAX_PARTS}", "too_many")
         size = len(self.binary)
         vertices = min(MAX_VERTICES, size // _VERTEX_BYTES + MAX_REPEATED_VERTICES)
         triangles = min(MAX_TRIANGLES, size // _TRIANGLE_BYTES + MAX_REPEATED_VERTICES // 3)
         if total.triangles > triangles or total.vertices > vertices:
             what = f"{total.triangles} triangles and {total.vertices} vertices in all places"
-            refuse(what, self.where, f"at most {triangles} and {vertices} from {size} bytes of data")
+            refuse(what, self.where, f"at most {triangles} and {vertices} from {size} bytes of data", "too_many")
 
     def _size(self, mesh: Mesh) -> _Size:
         corners = [self._count(primitive.attributes.get("POSITION")) for primitive in mesh.primitives]
@@ -321,44 +323,50 @@ class _Glb:
     def _primitive(self, primitive: Primitive, where: str) -> RawMesh:
         position = primitive.attributes.get("POSITION")
         if primitive.mode != TRIANGLES:
-            refuse(f"primitive mode {primitive.mode}", where, f"{TRIANGLES} (separate triangles)")
+            what = f"primitive mode {primitive.mode}"
+            refuse(what, where, f"{TRIANGLES} (separate triangles)", "unsupported_feature")
         if position is None or primitive.targets:
-            refuse("no POSITION, or morph targets", where, "a rigid mesh with POSITION")
+            refuse("no POSITION, or morph targets", where, "a rigid mesh with POSITION", "unsupported_feature")
         accessor = self._accessor(position, where)
         if (accessor.component_type, accessor.type) != (_FLOAT, "VEC3"):
-            refuse(f"POSITION of type {accessor.component_type} {accessor.type}", where, f"{_FLOAT} VEC3")
+            refuse(f"POSITION of type {accessor.component_type} {accessor.type}", where, f"{_FLOAT} VEC3", "wrong_type")
         vertices = self._array(position, np.dtype("<f4"), 3, where).astype(np.float64)
         indices = np.arange(len(vertices)) if primitive.indices is None else self._indices(primitive.indices, where)
         if len(indices) % 3 or len(indices) > 3 * MAX_TRIANGLES:
-            refuse(f"{len(indices)} indices", where, f"three per triangle, at most {MAX_TRIANGLES} triangles")
+            what = f"{len(indices)} indices"
+            refuse(what, where, f"three per triangle, at most {MAX_TRIANGLES} triangles", "wrong_count")
         if indices.max() >= len(vertices):
-            refuse(f"index {indices.max()} out of range", where, f"0 to {len(vertices) - 1}")
+            refuse(f"index {indices.max()} out of range", where, f"0 to {len(vertices) - 1}", "index_out_of_range")
         return RawMesh(vertices, indices.reshape(-1, 3))
 
     def _indices(self, index: int, where: str) -> Ints:
         kind = self._accessor(index, where)
         if kind.component_type not in _INDEX_TYPES or kind.type != "SCALAR":
-            refuse(f"indices of type {kind.component_type} {kind.type}", where, f"SCALAR of {list(_INDEX_TYPES)}")
+            what = f"indices of type {kind.component_type} {kind.type}"
+            refuse(what, where, f"SCALAR of {list(_INDEX_TYPES)}", "wrong_type")
         return self._array(index, _INDEX_TYPES[kind.component_type], 1, where).reshape(-1).astype(np.int64)
 
     def _accessor(self, index: int, where: str) -> Accessor:
         if index >= len(self.document.accessors):
-            refuse(f"accessor {index} of {len(self.document.accessors)}", where, "an accessor of the file")
+            what = f"accessor {index} of {len(self.document.accessors)}"
+            refuse(what, where, "an accessor of the file", "index_out_of_range")
         return self.document.accessors[index]
 
     def _array(self, index: int, dtype: np.dtype[Any], width: int, where: str) -> NDArray[Any]:
         """The numbers of an accessor, shape (count, width)."""
         accessor, views = self._accessor(index, where), self.document.buffer_views
         if accessor.buffer_view is None or accessor.sparse is not None or accessor.normalized:
-            refuse(f"accessor {index} is sparse, normalized or without data", where, "plain data in a buffer view")
+            what = f"accessor {index} is sparse, normalized or without data"
+            refuse(what, where, "plain data in a buffer view", "unsupported_feature")
         if accessor.buffer_view >= len(views):
-            refuse(f"accessor {index} uses bufferView {accessor.buffer_view}", where, "a view of the file")
+            what = f"accessor {index} uses bufferView {accessor.buffer_view}"
+            refuse(what, where, "a view of the file", "index_out_of_range")
         view, row = views[accessor.buffer_view], dtype.itemsize * width
         stride = view.byte_stride or row
         needed = accessor.byte_offset + (accessor.count - 1) * stride + row
         if needed > view.byte_length or stride < row:
             what = f"accessor {index} takes {needed} bytes of a view of {view.byte_length}, {stride} per row"
-            refuse(what, where, "accessors inside their view")
+            refuse(what, where, "accessors inside their view", "size_mismatch")
         start, strides = view.byte_offset + accessor.byte_offset, (stride, dtype.itemsize)
         return np.ndarray((accessor.count, width), dtype, self.binary, offset=start, strides=strides)
 
@@ -370,11 +378,12 @@ def _local(node: Node, where: str) -> Floats:
         T = np.array(node.matrix, dtype=np.float64).reshape(4, 4).T
     else:
         if np.linalg.norm(node.rotation) == 0.0:
-            refuse("rotation quaternion of length 0", where, allowed)
+            refuse("rotation quaternion of length 0", where, allowed, "not_invertible")
         T = np.eye(4)
         T[:3, :3] = scipy.spatial.transform.Rotation.from_quat(node.rotation).as_matrix() * np.array(node.scale)
         T[:3, 3] = node.translation
     determinant = np.linalg.det(T[:3, :3])
     if not np.isfinite(determinant) or determinant == 0.0 or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-        refuse(f"transform with determinant {determinant:.4g}, last row {T[3].tolist()}", where, allowed)
+        what = f"transform with determinant {determinant:.4g}, last row {T[3].tolist()}"
+        refuse(what, where, allowed, "not_invertible")
     return T

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import read_input
-from puncture_twin.planning.formats.mesh_guard import guard_mesh, twice_areas
+from puncture_twin.planning.formats.mesh_guard import guard_mesh
 from puncture_twin.planning.formats.meshes.obj import read_obj
 from puncture_twin.planning.formats.meshes.ply import read_ply
 from puncture_twin.planning.formats.meshes.stl import read_stl
@@ -92,7 +92,7 @@ def parse_mesh(
     up: Up | None = None,
     stretch: NDArray[np.float64] | None = None,
 ) -> TriangleMesh:
-    """As `read_mesh`, of a file that has been read; it is not opened again.
+    """Parse a mesh file that has been read, like `read_mesh`; it is not opened again.
 
     Args:
         data: The whole file.
@@ -121,7 +121,7 @@ def _z_up(vertices: NDArray[np.float64], up: Up | None, path: Path) -> NDArray[n
     """Points (n, 3) of a file, rotated by a quarter about x where its y is up."""
     if up is None and path.suffix.lower() == ".glb":
         allowed = 'up = "y" (turned to z up) or up = "z" (kept as it is), or another format'
-        raise InputError(UP_NOT_STATED, where=path, allowed=allowed, code="up_not_stated")
+        refuse(UP_NOT_STATED, path, allowed, "up_not_stated")
     return vertices if up is not Up.Y else vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
 
 
@@ -137,7 +137,8 @@ def _actual_space(stated: Space, space: Space, *, default: bool, where: str) -> 
     if default and space is not Space.LOCAL:
         return stated
     allowed = 'space = "local" where that is meant' if space is Space.LOCAL else f'space = "{stated}"'
-    raise InputError(f"the file states SPACE={stated}, the case {space}", where=where, allowed=allowed)
+    what = f"the file states SPACE={stated}, the case {space}"
+    raise InputError(what, where=where, allowed=allowed, code="other_space")
 
 
 class MeshExtent(NamedTuple):
@@ -162,7 +163,7 @@ def mesh_extent(path: Path) -> MeshExtent:
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     raw = reader(data, str(path))
     if not np.isfinite(raw.vertices).all() or len(raw.vertices) == 0:
-        raise InputError("a vertex is not finite, or there is none", where=path, allowed="finite vertices")
+        refuse("a vertex is not finite, or there is none", path, "finite vertices", "not_finite")
     box = np.stack([raw.vertices.min(axis=0), raw.vertices.max(axis=0)]).astype(np.float64)
     return MeshExtent(box, raw.space or _stated_space(data))
 
@@ -171,7 +172,7 @@ def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
     suffix = path.suffix.lower()
     if suffix not in _READERS:
         allowed = "a file ending in " + ", ".join(MESH_SUFFIXES)
-        raise InputError(f"unknown mesh format {path.suffix!r}", where=path, allowed=allowed)
+        refuse(f"unknown mesh format {path.suffix!r}", path, allowed, "unknown_format")
     return _READERS[suffix]
 
 
@@ -183,7 +184,7 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
         name: Its name, for the text.
     """
     warnings = []
-    flat = int((twice_areas(mesh.vertices, mesh.faces) == 0.0).sum())
+    flat = np.count_nonzero(mesh.areas == 0.0)
     if flat:
         warnings.append(f"{name}: {flat} of {len(mesh.faces)} triangles have no area (kept)")
     if not mesh.closed:

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import decode_text
-from puncture_twin.planning.formats.raw_mesh import RawMesh, refuse, triangulate
+from puncture_twin.planning.formats.raw_mesh import RawMesh, triangulate
 
 _IGNORED = frozenset({"vt", "vn", "vp", "o", "g", "s", "mg", "usemtl", "mtllib", "l", "p", "usemap", "maplib"})
 """Lines without a surface in them: texture, normals, names, groups, materials, polylines, points."""
@@ -31,16 +32,12 @@ class _Content:
 def read_obj(data: bytes, where: str) -> RawMesh:
     """The faces of an OBJ file, of all its objects and groups; polygons are cut into fans.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If a line is not understood, an index is out of range, or the file shows that it was cut.
     """
     text = decode_text(data, where)
     if not text.endswith("\n"):
-        refuse("the last line has no line end: the file may be cut", where, "a line end after every line")
+        refuse("the last line has no line end: the file may be cut", where, "a line end after every line", "file_cut")
     content = _Content()
     text = text.replace("\\\r\n", " ").replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), start=1):
@@ -60,7 +57,7 @@ def _read_line(line: str, content: _Content, where: str) -> None:
         content.corners.extend(_corner(token, len(content.vertices), where) for token in tokens[1:])
         content.counts.append(len(tokens) - 1)
     else:
-        refuse(f"line starts with {tokens[0][:20]!r}", where, _ALLOWED)
+        refuse(f"line starts with {tokens[0][:20]!r}", where, _ALLOWED, "unknown_line")
 
 
 def _vertex(tokens: list[str], where: str) -> tuple[float, float, float]:
@@ -68,9 +65,9 @@ def _vertex(tokens: list[str], where: str) -> tuple[float, float, float]:
     try:
         numbers = [float(token) for token in tokens]
     except ValueError:
-        refuse(f"vertex {' '.join(tokens)[:60]!r}", where, allowed)
+        refuse(f"vertex {' '.join(tokens)[:60]!r}", where, allowed, "not_a_number")
     if len(numbers) not in (3, 4, 6, 7) or (len(numbers) in (4, 7) and numbers[3] != 1.0):
-        refuse(f"vertex of {len(numbers)} numbers {tokens[:7]}", where, allowed)
+        refuse(f"vertex of {len(numbers)} numbers {tokens[:7]}", where, allowed, "wrong_count")
     return numbers[0], numbers[1], numbers[2]
 
 
@@ -78,10 +75,10 @@ def _corner(token: str, n_vertices: int, where: str) -> int:
     """The vertex of ``v``, ``v/vt``, ``v/vt/vn`` or ``v//vn``, from 0; negative ones count back from this line."""
     allowed = "v, v/vt, v/vt/vn or v//vn of a vertex above this line, counted from 1, or back from -1"
     if not re.fullmatch(r"-?\d{1,18}(/(-?\d{1,18})?){0,2}", token, re.ASCII):
-        refuse(f"face corner {token[:40]!r}", where, allowed)
+        refuse(f"face corner {token[:40]!r}", where, allowed, "not_a_number")
     index = int(token.split("/")[0])
     if index == 0 or abs(index) > n_vertices:
-        refuse(f"face uses vertex {index} of {n_vertices}, out of range", where, allowed)
+        refuse(f"face uses vertex {index} of {n_vertices}, out of range", where, allowed, "index_out_of_range")
     return index - 1 if index > 0 else n_vertices + index
 
 
@@ -89,7 +86,9 @@ def _check_complete(content: _Content, text: str, where: str) -> None:
     unused = len(content.vertices) - len(set(content.corners))
     if unused:
         what = f"{unused} vertices that no face uses: the face list may be cut"
-        refuse(what, where, "an OBJ whose faces use every vertex, or a format that states its counts")
+        allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
+        refuse(what, where, allowed, "unused_vertices")
     stated = sum(int(first or second) for first, second in _STATED_COUNT.findall(text))
     if stated > len(content.counts):
-        refuse(f"comments count {stated} faces, {len(content.counts)} are there", where, "as many as counted")
+        what = f"comments count {stated} faces, {len(content.counts)} are there"
+        refuse(what, where, "as many as counted", "size_mismatch")

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import decode_text
-from puncture_twin.planning.formats.raw_mesh import RawMesh, refuse, token_array, triangulate
+from puncture_twin.planning.formats.raw_mesh import RawMesh, token_array, triangulate
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 _TYPES = {
@@ -61,10 +61,6 @@ class _Lists(NamedTuple):
 def read_ply(data: bytes, where: str) -> RawMesh:
     """The faces of a PLY file; polygons are cut into fans, other elements are passed over.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If header and data do not fit each other, or there are no faces.
     """
@@ -79,13 +75,13 @@ def read_ply(data: bytes, where: str) -> RawMesh:
             vertices = _vertices(columns, where)
         elif element.name == "face":
             if element.rows == 0:
-                refuse("no face", where, "at least one face")
+                refuse("no face", where, "at least one face", "empty")
             faces = _faces(columns, where)
         elif element.name == "tristrips" and element.rows:
-            refuse("triangle strips", where, "an element face with lists of vertex indices")
+            refuse("triangle strips", where, "an element face with lists of vertex indices", "unsupported_feature")
     cursor.check_end()
     if vertices is None or faces is None:
-        refuse("no element vertex, or none face", where, _ALLOWED)
+        refuse("no element vertex, or none face", where, _ALLOWED, "bad_header")
     return RawMesh(vertices, triangulate(faces.values.astype(np.int64), faces.counts, where))
 
 
@@ -93,12 +89,12 @@ def _header(data: bytes, where: str) -> _Header:
     end = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     line_end = data.find(b"\n", end)
     if not data.startswith(b"ply") or end < 0 or line_end < 0:
-        refuse("no complete header", where, _ALLOWED)
+        refuse("no complete header", where, _ALLOWED, "bad_header")
     lines = [line.split() for line in data[:end].decode("latin-1").splitlines()]
     lines = [line for line in lines if line and line[0] not in ("comment", "obj_info")]
     formats = [line[1] for line in lines if line[0] == "format" and len(line) == 3]
     if lines[0] != ["ply"] or len(formats) != 1 or formats[0] not in _FORMATS:
-        refuse(f"format {formats}", where, "one of " + ", ".join(_FORMATS))
+        refuse(f"format {formats}", where, "one of " + ", ".join(_FORMATS), "unsupported_feature")
     elements = _elements(lines, _FORMATS[formats[0]], is_ascii=formats[0] == "ascii", where=where)
     return _Header(formats[0] == "ascii", elements, line_end + 1)
 
@@ -117,28 +113,29 @@ def _elements(lines: list[list[str]], order: str, *, is_ascii: bool, where: str)
             case ["ply"] | ["format", _, _]:
                 pass
             case _:
-                refuse(f"header line {' '.join(line)[:60]!r}", where, _ALLOWED)
+                refuse(f"header line {' '.join(line)[:60]!r}", where, _ALLOWED, "bad_header")
     names = [element.name for element in elements]
     for each in [names, *([p.name for p in element.properties] for element in elements)]:
         if len(set(each)) != len(each) or not each:
-            refuse(f"header names {each} repeat, or are missing", where, _ALLOWED)
+            refuse(f"header names {each} repeat, or are missing", where, _ALLOWED, "bad_header")
     return elements
 
 
 def _dtype(kind: str, order: str, is_ascii: bool, where: str) -> np.dtype[Any]:
     if kind not in _TYPES:
-        refuse(f"property type {kind[:20]!r}", where, ", ".join(_TYPES))
+        refuse(f"property type {kind[:20]!r}", where, ", ".join(_TYPES), "unknown_type")
     return np.dtype("<f8" if is_ascii else order + _TYPES[kind])
 
 
 def _ascii_as_doubles(body: bytes, where: str) -> bytes:
     if not body.endswith(b"\n"):
-        refuse("the last line has no line end: the file may be cut", where, "a line end after every line")
+        refuse("the last line has no line end: the file may be cut", where, "a line end after every line", "file_cut")
     tokens = token_array(decode_text(body, where).split(), where)
     try:
         return tokens.astype("<f8").tobytes()
     except ValueError as error:
-        raise InputError(f"the data holds no number ({error})", where=where, allowed=_ALLOWED) from error
+        what = f"the data holds no number ({error})"
+        raise InputError(what, where=where, allowed=_ALLOWED, code="not_a_number") from error
 
 
 @dataclass
@@ -155,7 +152,7 @@ class _Cursor:
         left = len(self.body) - self.position
         if smallest * element.rows > left:
             what = f"{element.rows} x {element.name} take at least {smallest * element.rows} bytes, {left} are left"
-            refuse(what, self.where, _ALLOWED)
+            refuse(what, self.where, _ALLOWED, "file_cut")
         if element.rows == 0:
             return {}
         lengths = self._first_row(element)
@@ -163,10 +160,10 @@ class _Cursor:
         return even if even is not None else self._take_row_by_row(element)
 
     def check_end(self) -> None:
-        """Nothing but white space may follow."""
+        """Refuse anything but white space behind the last element."""
         rest = self.body[self.position :].strip()
         if rest:
-            refuse(f"{len(rest)} bytes after the stated data", self.where, _ALLOWED)
+            refuse(f"{len(rest)} bytes after the stated data", self.where, _ALLOWED, "size_mismatch")
 
     def _first_row(self, element: _Element) -> list[int]:
         position, lengths = self.position, []
@@ -183,17 +180,18 @@ class _Cursor:
         else:
             start = position + prop.count_dtype.itemsize
             if start > len(self.body):
-                refuse(f"data ends inside {prop.name}", self.where, _ALLOWED)
+                refuse(f"data ends inside {prop.name}", self.where, _ALLOWED, "file_cut")
             stated = np.frombuffer(self.body, prop.count_dtype, 1, position)[0]
             if not 0 <= stated <= len(self.body) or stated != int(stated):
-                refuse(f"{prop.name} of length {stated}", self.where, "lengths from 0, whole, inside the file")
+                what = f"{prop.name} of length {stated}"
+                refuse(what, self.where, "lengths from 0, whole, inside the file", "out_of_range")
             length = int(stated)
         if start + length * prop.dtype.itemsize > len(self.body):
-            refuse(f"data ends inside {prop.name}", self.where, _ALLOWED)
+            refuse(f"data ends inside {prop.name}", self.where, _ALLOWED, "file_cut")
         return length, start
 
     def _take_even(self, element: _Element, lengths: list[int]) -> dict[str, NDArray[Any] | _Lists] | None:
-        """All rows at once, if each has lists as long as the first row's; None otherwise."""
+        """Read all rows at once, if each has lists as long as the first row's; None otherwise."""
         fields: list[tuple[str, Any]] = []
         for number, (prop, length) in enumerate(zip(element.properties, lengths, strict=True)):
             if prop.count_dtype is None:
@@ -234,17 +232,17 @@ class _Cursor:
 def _vertices(columns: dict[str, NDArray[Any] | _Lists], where: str) -> NDArray[np.float64]:
     axes = [columns.get(axis) for axis in "xyz"]
     if any(axis is None or isinstance(axis, _Lists) for axis in axes):
-        refuse("vertices without x, y and z", where, _ALLOWED)
+        refuse("vertices without x, y and z", where, _ALLOWED, "bad_header")
     return np.stack([np.asarray(axis, dtype=np.float64) for axis in axes], axis=1)
 
 
 def _faces(columns: dict[str, NDArray[Any] | _Lists], where: str) -> _Lists:
     lists = [columns[name] for name in _INDEX_NAMES if name in columns]
     if len(lists) != 1 or not isinstance(lists[0], _Lists):
-        refuse("faces without one list of vertex indices", where, " or ".join(_INDEX_NAMES))
+        refuse("faces without one list of vertex indices", where, " or ".join(_INDEX_NAMES), "bad_header")
     values = lists[0].values
     if not (np.isfinite(values) & (values == np.trunc(values)) & (np.abs(values) < _MAX_ROWS)).all():
-        refuse("a vertex index is not a whole number", where, "indices from 0")
+        refuse("a vertex index is not a whole number", where, "indices from 0", "not_whole")
     return lists[0]
 
 

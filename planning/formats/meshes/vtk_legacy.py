@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
-from puncture_twin.planning.formats.raw_mesh import MAX_TOKEN_LENGTH, MAX_VERTICES, RawMesh, refuse, triangulate
+from puncture_twin.planning.formats.raw_mesh import MAX_TOKEN_LENGTH, MAX_VERTICES, RawMesh, triangulate
 
 _ALLOWED = "a legacy VTK file, ASCII or BINARY, of DATASET POLYDATA whose points and polygons are as many as it states"
 _VERSION = re.compile(rb"# vtk DataFile Version ([1-5])\.\d\s*")
@@ -50,10 +50,6 @@ class _Polygons(NamedTuple):
 def read_vtk(data: bytes, where: str) -> RawMesh:
     """The polygons of a legacy VTK file; polygons are cut into fans; lines and lone points carry no surface.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If it is cut, of another kind, has fewer numbers than it states, or holds triangle strips.
     """
@@ -62,15 +58,16 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
     cursor.line()  # the title, which anything may be
     form = cursor.line().strip().upper()
     if version is None or form not in (b"ASCII", b"BINARY"):
-        refuse("no header of a legacy VTK file", where, _ALLOWED)
+        refuse("no header of a legacy VTK file", where, _ALLOWED, "wrong_format")
     cursor.is_ascii = form == b"ASCII"
     if cursor.words() != ["DATASET", "POLYDATA"]:
-        refuse("the data set is no POLYDATA", where, _ALLOWED)
+        refuse("the data set is no POLYDATA", where, _ALLOWED, "wrong_format")
     points, polygons = _sections(cursor, offsets=int(version[1]) >= _OFFSETS_SINCE, where=where)
     if points is None or polygons is None:
-        refuse("no points or no polygons: the file is cut, or holds no surface", where, _ALLOWED)
+        refuse("no points or no polygons: the file is cut, or holds no surface", where, _ALLOWED, "empty")
     if polygons.corners.min() < 0 or polygons.corners.max() >= len(points):
-        refuse(f"vertex indices {polygons.corners.min()} to {polygons.corners.max()}", where, f"0 to {len(points) - 1}")
+        what = f"vertex indices {polygons.corners.min()} to {polygons.corners.max()}"
+        refuse(what, where, f"0 to {len(points) - 1}", "index_out_of_range")
     return RawMesh(points, triangulate(polygons.corners, polygons.counts, where))
 
 
@@ -85,20 +82,20 @@ def _sections(cursor: _Cursor, *, offsets: bool, where: str) -> tuple[NDArray[np
         elif key in _CELLS:
             cells = _cells(cursor, words, offsets=offsets, where=where)
             if key == "TRIANGLE_STRIPS" and len(cells.counts):
-                refuse("triangle strips", where, "polygons")
+                refuse("triangle strips", where, "polygons", "unsupported_feature")
             if key == "POLYGONS" and polygons is None:
                 polygons = cells
         elif key in ("METADATA", "FIELD"):
             _pass_over(cursor, words, where)
         else:
-            refuse(f"unknown line {' '.join(words)[:60]!r}", where, _ALLOWED)
+            refuse(f"unknown line {' '.join(words)[:60]!r}", where, _ALLOWED, "unknown_line")
     return points, polygons if polygons is not None and len(polygons.counts) else None
 
 
 def _points(cursor: _Cursor, words: list[str], where: str) -> NDArray[np.float64]:
     count, kind = _count(words, 1, MAX_VERTICES, where), words[2].lower() if len(words) == 3 else ""
     if kind not in ("float", "double"):
-        refuse(f"points of type {kind[:20]!r}", where, "float, double")
+        refuse(f"points of type {kind[:20]!r}", where, "float, double", "unknown_type")
     return cursor.numbers(3 * count, kind).astype(np.float64).reshape(-1, 3)
 
 
@@ -114,7 +111,7 @@ def _cells(cursor: _Cursor, words: list[str], *, offsets: bool, where: str) -> _
         _find_starts(table, starts, where)
     counts = table[starts]
     if int(counts.sum()) + first != size:
-        refuse(f"{first} cells that do not fill their {size} numbers", where, _ALLOWED)
+        refuse(f"{first} cells that do not fill their {size} numbers", where, _ALLOWED, "size_mismatch")
     keep = np.ones(size, bool)
     keep[starts] = False
     return _Polygons(table[keep], counts)
@@ -125,11 +122,11 @@ def _find_starts(table: NDArray[np.int64], starts: NDArray[np.int64], where: str
     at = 0
     for cell in range(len(starts)):
         if not 0 <= at < len(table) or table[at] < 1:
-            refuse(f"cell {cell} is cut, or has no corner", where, _ALLOWED)
+            refuse(f"cell {cell} is cut, or has no corner", where, _ALLOWED, "file_cut")
         starts[cell] = at
         at += int(table[at]) + 1
     if at != len(table):
-        refuse(f"cells of {at} numbers instead of {len(table)}", where, _ALLOWED)
+        refuse(f"cells of {at} numbers instead of {len(table)}", where, _ALLOWED, "size_mismatch")
 
 
 def _offset_cells(cursor: _Cursor, first: int, size: int, where: str) -> _Polygons:
@@ -139,7 +136,7 @@ def _offset_cells(cursor: _Cursor, first: int, size: int, where: str) -> _Polygo
     if first == 0:
         return _Polygons(corners[:0], corners[:0])
     if ends[0] != 0 or ends[-1] != size or (np.diff(ends) < 1).any():
-        refuse("offsets that do not rise from 0 to the number of corners", where, _ALLOWED)
+        refuse("offsets that do not rise from 0 to the number of corners", where, _ALLOWED, "bad_offsets")
     return _Polygons(corners, np.diff(ends))
 
 
@@ -152,7 +149,7 @@ def _pass_over(cursor: _Cursor, words: list[str], where: str) -> None:
     for _ in range(_count(words, 2, 1000, where)):
         array = cursor.words()
         if len(array) != 4:
-            refuse(f"field array {' '.join(array)[:60]!r}", where, _ALLOWED)
+            refuse(f"field array {' '.join(array)[:60]!r}", where, _ALLOWED, "unknown_line")
         count = _count(array, 1, 1000, where) * _count(array, 2, 3 * MAX_VERTICES, where)
         if array[3] == "string" and cursor.is_ascii:
             _ = [cursor.words() for _line in range(min(count, 1000))]
@@ -163,7 +160,8 @@ def _pass_over(cursor: _Cursor, words: list[str], where: str) -> None:
 def _count(words: list[str], index: int, most: int, where: str) -> int:
     text = words[index] if index < len(words) else ""
     if not (text.isascii() and text.isdigit() and len(text) <= 12 and int(text) <= most):
-        refuse(f"count {text[:20]!r} in {' '.join(words)[:60]!r}", where, f"a whole number from 0 to {most}")
+        what = f"count {text[:20]!r} in {' '.join(words)[:60]!r}"
+        refuse(what, where, f"a whole number from 0 to {most}", "out_of_range")
     return int(text)
 
 
@@ -193,7 +191,7 @@ class _Cursor:
     def numbers(self, count: int, kind: str) -> NDArray[Any]:
         """The next numbers, of a type of the format."""
         if kind.lower() not in _TYPES:
-            refuse(f"numbers of type {kind[:20]!r}", self._where, ", ".join(_TYPES))
+            refuse(f"numbers of type {kind[:20]!r}", self._where, ", ".join(_TYPES), "unknown_type")
         dtype = np.dtype(_TYPES[kind.lower()])
         if self.is_ascii:
             return self._from_text(count, np.dtype(np.float64 if dtype.kind == "f" else np.int64))
@@ -203,15 +201,16 @@ class _Cursor:
         """The numbers of an array with a line of its own: its name and type."""
         words = self.words()
         if len(words) != 2 or words[0].upper() != key:
-            refuse(f"{' '.join(words)[:60]!r} instead of {key}", self._where, _ALLOWED)
+            refuse(f"{' '.join(words)[:60]!r} instead of {key}", self._where, _ALLOWED, "unknown_line")
         if words[1].lower() in ("float", "double"):
-            refuse(f"{key} of type {words[1]}", self._where, "whole numbers")
+            refuse(f"{key} of type {words[1]}", self._where, "whole numbers", "wrong_type")
         return self.numbers(count, words[1])
 
     def _from_bytes(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         size = count * dtype.itemsize
         if self._at + size > len(self._data):
-            refuse(f"{count} numbers of {size} bytes do not fit into the file: it is cut", self._where, _ALLOWED)
+            what = f"{count} numbers of {size} bytes do not fit into the file: it is cut"
+            refuse(what, self._where, _ALLOWED, "file_cut")
         values = np.frombuffer(self._data, dtype, count, self._at)
         self._at += size
         return values
@@ -221,10 +220,11 @@ class _Cursor:
         while len(words) < count and self._at < len(self._data):
             words += self.line().split()
         if len(words) != count or max(map(len, words), default=0) > MAX_TOKEN_LENGTH:
-            refuse(f"{len(words)} numbers instead of {count}", self._where, _ALLOWED)
+            refuse(f"{len(words)} numbers instead of {count}", self._where, _ALLOWED, "size_mismatch")
         if self._at > len(self._data):  # its last number may be the beginning of one
-            refuse("the last line has no end: the file is cut", self._where, _ALLOWED)
+            refuse("the last line has no end: the file is cut", self._where, _ALLOWED, "file_cut")
         try:
             return np.array(words, dtype=np.bytes_).astype(dtype)
         except (ValueError, OverflowError) as error:
-            raise InputError(f"no number ({error})", where=self._where, allowed=_ALLOWED) from error
+            what = f"no number ({error})"
+            raise InputError(what, where=self._where, allowed=_ALLOWED, code="not_a_number") from error

@@ -16,9 +16,9 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
-from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join, refuse, token_array, triangulate
+from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join, token_array, triangulate
 from puncture_twin.planning.geometry.spaces import Space
 
 _ALLOWED = "a complete VTKFile of type PolyData whose arrays are as long as it states"
@@ -38,28 +38,24 @@ class _Split(NamedTuple):
 def read_vtp(data: bytes, where: str) -> RawMesh:
     """The polygons of a VTP file; polygons are cut into fans; points and lines in it carry no surface.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-
     Raises:
         InputError: If it is cut, an array is shorter or longer than stated, or it holds triangle strips.
     """
     split = _split_appended(data, where)
     if b"<!" in split.text.replace(b"<!--", b""):
-        refuse("a document type or CDATA section", where, "VTK's own XML, without either")
+        refuse("a document type or CDATA section", where, "VTK's own XML, without either", "xml_doctype")
     try:
         root = ElementTree.fromstring(split.text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # no XML, or an unknown text encoding
-        raise InputError(f"XML cannot be read ({error})", where=where, allowed=_ALLOWED) from error
+        raise InputError(f"XML cannot be read ({error})", where=where, allowed=_ALLOWED, code="xml_damaged") from error
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
-        refuse(f"{root.tag} of type {root.get('type')}", where, _ALLOWED)
+        refuse(f"{root.tag} of type {root.get('type')}", where, _ALLOWED, "wrong_format")
     encoding = _encoding(root, split.appended, where)
     pieces = root.findall("PolyData/Piece")
     parts = [_piece(piece, encoding, f"{where}, piece {i}") for i, piece in enumerate(pieces)]
     filled = [part for part in parts if part is not None]
     if not filled:
-        refuse("no polygon in any piece", where, _ALLOWED)
+        refuse("no polygon in any piece", where, _ALLOWED, "empty")
     return join(filled)._replace(space=_space(root, encoding, where))
 
 
@@ -72,7 +68,7 @@ def _space(root: ElementTree.Element, encoding: Encoding, where: str) -> Space |
     letters.text = fields[0].text
     text = array_values(letters, len(Space.LPS) + 1, encoding, f"{where}, field SPACE").tobytes()
     if text not in _SPACES or len(fields) > 1:
-        refuse(f"field SPACE is {text!r}", where, "LPS or RAS, once")
+        refuse(f"field SPACE is {text!r}", where, "LPS or RAS, once", "unknown_space")
     return _SPACES[text]
 
 
@@ -84,7 +80,7 @@ def _split_appended(data: bytes, where: str) -> _Split:
     end = data.rfind(_APPENDED_END)
     mark = data.find(b"_", start.end())
     if end < 0 or not start.end() <= mark < end or data[start.end() : mark].strip():
-        refuse("AppendedData without its mark or end: the file is cut", where, _ALLOWED)
+        refuse("AppendedData without its mark or end: the file is cut", where, _ALLOWED, "file_cut")
     return _Split(data[: start.end()] + data[end:], data[mark + 1 : end])
 
 
@@ -95,9 +91,9 @@ def _encoding(root: ElementTree.Element, appended: bytes, where: str) -> Encodin
     compressor = root.get("compressor")
     if order not in _BYTE_ORDERS or header not in _HEADER_TYPES or appended_form not in ("raw", "base64"):
         what = f"byte_order {order!r}, header_type {header!r}, appended {appended_form!r}"
-        refuse(what, where, "LittleEndian or BigEndian, UInt32 or UInt64, raw or base64")
+        refuse(what, where, "LittleEndian or BigEndian, UInt32 or UInt64, raw or base64", "unsupported_feature")
     if compressor not in _COMPRESSORS:
-        refuse(f"compressor {compressor!r}", where, "none or vtkZLibDataCompressor")
+        refuse(f"compressor {compressor!r}", where, "none or vtkZLibDataCompressor", "unsupported_feature")
     return Encoding(
         byte_order=_BYTE_ORDERS[order],
         header_type=np.dtype(_BYTE_ORDERS[order] + _HEADER_TYPES[header]),
@@ -110,32 +106,33 @@ def _encoding(root: ElementTree.Element, appended: bytes, where: str) -> Encodin
 def _piece(piece: ElementTree.Element, encoding: Encoding, where: str) -> RawMesh | None:
     """One piece; None if it states no polygon at all, as empty pieces of a parallel writer do."""
     if _stated(piece, "NumberOfStrips", where):
-        refuse("triangle strips", where, "polygons")
+        refuse("triangle strips", where, "polygons", "unsupported_feature")
     n_polygons = _stated(piece, "NumberOfPolys", where)
     if n_polygons == 0:
         return None
     n_points = _stated(piece, "NumberOfPoints", where)
     if n_points > MAX_VERTICES or n_polygons > MAX_TRIANGLES:
         what = f"{n_points} points and {n_polygons} polygons"
-        refuse(what, where, f"at most {MAX_VERTICES} points and {MAX_TRIANGLES} polygons")
+        refuse(what, where, f"at most {MAX_VERTICES} points and {MAX_TRIANGLES} polygons", "too_many")
     points = _values(piece, "Points/DataArray", 3 * n_points, encoding, where)
     components = _one(piece, "Points/DataArray", where).get("NumberOfComponents")
     if components != "3":
-        refuse(f"points with {components} components", where, "3")
+        refuse(f"points with {components} components", where, "3", "wrong_shape")
     offsets = _whole(piece, "offsets", n_polygons, encoding, where)
     if offsets.min() < 3 or offsets.max() > MAX_VERTICES or (np.diff(offsets) < 3).any():
-        refuse("offsets do not rise by 3 or more per polygon", where, _ALLOWED)
+        refuse("offsets do not rise by 3 or more per polygon", where, _ALLOWED, "bad_offsets")
     counts = np.diff(offsets, prepend=0)
     corners = _whole(piece, "connectivity", int(offsets[-1]), encoding, where)
     if corners.min() < 0 or corners.max() >= n_points:
-        refuse(f"vertex indices {corners.min()} to {corners.max()}", where, f"0 to {n_points - 1}")
+        what = f"vertex indices {corners.min()} to {corners.max()}"
+        refuse(what, where, f"0 to {n_points - 1}", "index_out_of_range")
     return RawMesh(points.reshape(-1, 3).astype(np.float64), triangulate(corners, counts, where))
 
 
 def _whole(piece: ElementTree.Element, name: str, count: int, encoding: Encoding, where: str) -> NDArray[np.int64]:
     values = _values(piece, f"Polys/DataArray[@Name='{name}']", count, encoding, where)
     if values.dtype.kind not in "iu":
-        refuse(f"{name} of type {values.dtype}", where, "whole numbers")
+        refuse(f"{name} of type {values.dtype}", where, "whole numbers", "wrong_type")
     return values.astype(np.int64)
 
 
@@ -146,14 +143,14 @@ def _values(piece: ElementTree.Element, path: str, count: int, encoding: Encodin
 def _one(piece: ElementTree.Element, path: str, where: str) -> ElementTree.Element:
     found = piece.findall(path)
     if len(found) != 1:
-        refuse(f"{len(found)} arrays {path}", where, "exactly one")
+        refuse(f"{len(found)} arrays {path}", where, "exactly one", "wrong_count")
     return found[0]
 
 
 def _stated(piece: ElementTree.Element, name: str, where: str) -> int:
     text = piece.get(name, "0")
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
-        refuse(f"{name} is {text[:20]!r}", where, "a whole number from 0")
+        refuse(f"{name} is {text[:20]!r}", where, "a whole number from 0", "not_whole")
     return int(text)
 
 
@@ -200,7 +197,7 @@ def array_values(element: ElementTree.Element, count: int, encoding: Encoding, w
     """
     kind = element.get("type", "")
     if kind not in _TYPES:
-        refuse(f"type {kind[:20]!r}", where, ", ".join(_TYPES))
+        refuse(f"type {kind[:20]!r}", where, ", ".join(_TYPES), "unknown_type")
     dtype = np.dtype(encoding.byte_order + _TYPES[kind])
     form = element.get("format")
     if form == "ascii":
@@ -209,9 +206,9 @@ def array_values(element: ElementTree.Element, count: int, encoding: Encoding, w
         raw = _from_binary(_stream(element, form, encoding, where), count * dtype.itemsize, encoding, where)
         values = np.frombuffer(raw, dtype)
     else:
-        refuse(f"format {form!r}", where, _ALLOWED_ARRAYS)
+        refuse(f"format {form!r}", where, _ALLOWED_ARRAYS, "unsupported_feature")
     if len(values) != count:
-        refuse(f"{len(values)} numbers instead of {count}", where, _ALLOWED_ARRAYS)
+        refuse(f"{len(values)} numbers instead of {count}", where, _ALLOWED_ARRAYS, "size_mismatch")
     return values
 
 
@@ -225,7 +222,8 @@ def _stream(element: ElementTree.Element, form: str, encoding: Encoding, where: 
         return _Stream((element.text or "").strip().encode(), base64=True)
     offset = element.get("offset", "")
     if not (offset.isascii() and offset.isdigit() and len(offset) <= 15) or int(offset) >= len(encoding.appended):
-        refuse(f"offset {offset[:20]!r} into {len(encoding.appended)} appended bytes", where, _ALLOWED_ARRAYS)
+        what = f"offset {offset[:20]!r} into {len(encoding.appended)} appended bytes"
+        refuse(what, where, _ALLOWED_ARRAYS, "index_out_of_range")
     return _Stream(encoding.appended[int(offset) :], encoding.appended_base64)
 
 
@@ -235,7 +233,8 @@ def _from_text(text: str, dtype: np.dtype[Any], where: str) -> NDArray[Any]:
             return token_array(text.split(), where).astype(np.float64)
         return np.array([int(token) for token in text.split()], dtype=dtype)
     except (ValueError, OverflowError) as error:
-        raise InputError(f"no number of type {dtype} ({error})", where=where, allowed=_ALLOWED_ARRAYS) from error
+        what = f"no number of type {dtype} ({error})"
+        raise InputError(what, where=where, allowed=_ALLOWED_ARRAYS, code="not_a_number") from error
 
 
 def _from_binary(stream: _Stream, size: int, encoding: Encoding, where: str) -> bytes:
@@ -244,7 +243,7 @@ def _from_binary(stream: _Stream, size: int, encoding: Encoding, where: str) -> 
     header = encoding.header_type.itemsize
     stated = int(np.frombuffer(_take(stream, 0, header, where), encoding.header_type)[0])
     if stated != size:
-        refuse(f"array of {stated} bytes instead of {size}", where, _ALLOWED_ARRAYS)
+        refuse(f"array of {stated} bytes instead of {size}", where, _ALLOWED_ARRAYS, "size_mismatch")
     return _take(stream, 0, header + size, where)[header:]
 
 
@@ -253,14 +252,14 @@ def _decompressed(stream: _Stream, size: int, header_type: np.dtype[Any], where:
     step = header_type.itemsize
     n_blocks = int(np.frombuffer(_take(stream, 0, step, where), header_type)[0])
     if n_blocks > len(stream.data) or (n_blocks == 0) != (size == 0):
-        refuse(f"{n_blocks} compressed blocks", where, _ALLOWED_ARRAYS)
+        refuse(f"{n_blocks} compressed blocks", where, _ALLOWED_ARRAYS, "size_mismatch")
     header = np.frombuffer(_take(stream, 0, (3 + n_blocks) * step, where), header_type)
     block, last, packed = int(header[1]), int(header[2]), [int(each) for each in header[3:]]
     sizes = [block] * n_blocks
     if last and n_blocks:
         sizes[-1] = last
     if sum(sizes) != size:
-        refuse(f"blocks of {sum(sizes)} bytes instead of {size}", where, _ALLOWED_ARRAYS)
+        refuse(f"blocks of {sum(sizes)} bytes instead of {size}", where, _ALLOWED_ARRAYS, "size_mismatch")
     start = _encoded_length(len(header) * step) if stream.base64 else len(header) * step
     body = _take(stream, start, sum(packed), where)
     out, position = [], 0
@@ -276,9 +275,11 @@ def _inflate(data: bytes, size: int, where: str) -> bytes:
     try:
         block = unpacker.decompress(data, size + 1)
     except zlib.error as error:
-        raise InputError(f"compressed block is damaged ({error})", where=where, allowed=_ALLOWED_ARRAYS) from error
+        what = f"compressed block is damaged ({error})"
+        raise InputError(what, where=where, allowed=_ALLOWED_ARRAYS, code="file_damaged") from error
     if len(block) != size or not unpacker.eof:
-        refuse(f"compressed block of {len(block)} bytes instead of {size}, or cut", where, _ALLOWED_ARRAYS)
+        what = f"compressed block of {len(block)} bytes instead of {size}, or cut"
+        refuse(what, where, _ALLOWED_ARRAYS, "size_mismatch")
     return block
 
 
@@ -290,13 +291,14 @@ def _take(stream: _Stream, start: int, size: int, where: str) -> bytes:
     """Decoded bytes; in base64 they start a group of their own at character ``start``."""
     end = start + (_encoded_length(size) if stream.base64 else size)
     if end > len(stream.data):
-        refuse(f"array data end at byte {len(stream.data)} of {end}", where, _ALLOWED_ARRAYS)
+        refuse(f"array data end at byte {len(stream.data)} of {end}", where, _ALLOWED_ARRAYS, "file_cut")
     if not stream.base64:
         return stream.data[start:end]
     try:
         decoded = base64.b64decode(stream.data[start:end], validate=True)
     except binascii.Error as error:
-        raise InputError(f"base64 data is damaged ({error})", where=where, allowed=_ALLOWED_ARRAYS) from error
+        what = f"base64 data is damaged ({error})"
+        raise InputError(what, where=where, allowed=_ALLOWED_ARRAYS, code="file_damaged") from error
     if len(decoded) < size:
-        refuse(f"base64 data of {len(decoded)} bytes instead of {size}", where, _ALLOWED_ARRAYS)
+        refuse(f"base64 data of {len(decoded)} bytes instead of {size}", where, _ALLOWED_ARRAYS, "size_mismatch")
     return decoded[:size]

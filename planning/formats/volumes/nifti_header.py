@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.volumes.volume_header import (
     VolumeHeader,
     VoxelLayout,
@@ -78,10 +78,6 @@ def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
     Where sform and qform are both given they must agree, so that it does not matter which one a program takes
     (SimpleITK takes the sform if its code is 1, else the qform).
 
-    Args:
-        content: The whole file.
-        path: Its name.
-
     Raises:
         InputError: Whatever is wrong with the header.
     """
@@ -92,12 +88,12 @@ def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
     shape = _shape(fields, path)
     if BITS_OF_DATATYPE.get(fields.datatype) != fields.bitpix:
         what = f"datatype {fields.datatype} with {fields.bitpix} bits"
-        raise InputError(what, where=path, allowed=f"(datatype: bits) {BITS_OF_DATATYPE}")
+        refuse(what, path, f"(datatype: bits) {BITS_OF_DATATYPE}", "unknown_type")
     slope, intercept = _scaling(fields, path)
     T_ct_index = check_affine(_affine(fields, shape, path), where=path)
     offset = fields.vox_offset
     if not (np.isfinite(offset) and offset >= FIRST_VOXEL_BYTE and offset == int(offset)):
-        raise InputError(f"vox_offset {offset}", where=path, allowed=f"a whole number >= {FIRST_VOXEL_BYTE}")
+        refuse(f"vox_offset {offset}", path, f"a whole number >= {FIRST_VOXEL_BYTE}", "out_of_range")
     dtype = np.dtype(fields.order + TYPES[fields.datatype])
     encoding = "gzip" if compressed else "raw"
     cells = VoxelLayout(dtype, encoding, offset=int(offset), slope=slope, intercept=intercept)
@@ -105,24 +101,24 @@ def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
 
 
 def _scaling(fields: _Fields, path: Path) -> tuple[float, float]:
-    """What stored values are multiplied with, and what is added: 1 and 0 where the header says nothing."""
+    """Slope and intercept of stored values; 1 and 0 where the header states none."""
     slope, intercept = fields.scaling
     if not np.isfinite(fields.scaling).all():
-        raise InputError("scl_slope or scl_inter is not finite", where=path, allowed="finite numbers")
+        refuse("scl_slope or scl_inter is not finite", path, "finite numbers", "not_finite")
     if slope == 0.0 and intercept == 0.0:
         return 1.0, 0.0
     if abs(slope) <= LEAST_SLOPE:
         what = f"scl_slope {slope:g} with scl_inter {intercept:g}: some programs scale by it and others do not"
-        raise InputError(what, where=path, allowed="both 0, or a slope that is not")
+        refuse(what, path, "both 0, or a slope that is not", "scaling_ambiguous")
     return slope, intercept
 
 
 def _parse(data: bytes, path: Path) -> _Fields:
     if len(data) < HEADER_BYTES:
-        raise InputError(f"the file ends inside the header ({len(data)} bytes)", where=path, allowed=PLAIN)
+        refuse(f"the file ends inside the header ({len(data)} bytes)", path, PLAIN, "file_cut")
     order = {348: "<", 1543569408: ">"}.get(struct.unpack_from("<i", data, 0)[0])
     if order is None or data[344:348] != b"n+1\0":
-        raise InputError("no NIfTI-1 header (header size and magic 'n+1')", where=path, allowed=PLAIN)
+        refuse("no NIfTI-1 header (header size and magic 'n+1')", path, PLAIN, "wrong_format")
 
     def get(layout: str, offset: int) -> tuple[float, ...]:
         return struct.unpack_from(order + layout, data, offset)
@@ -147,23 +143,22 @@ def _parse(data: bytes, path: Path) -> _Fields:
 def _shape(fields: _Fields, path: Path) -> tuple[int, int, int]:
     count = fields.dim[0]
     if not 3 <= count <= 7 or set(fields.dim[4 : count + 1]) - {1}:
-        what = f"{count} dimensions, sizes {fields.dim[1 : max(count, 3) + 1]}"
         allowed = "one volume with 3 dimensions (further ones of length 1), no time series, no components"
-        raise InputError(what, where=path, allowed=allowed)
+        refuse(f"{count} dimensions, sizes {fields.dim[1 : max(count, 3) + 1]}", path, allowed, "wrong_dimension")
     return check_shape(fields.dim[1:4], where=path)
 
 
 def _affine(fields: _Fields, shape: tuple[int, int, int], path: Path) -> NDArray[np.float64]:
     """Voxel index to LPS mm, from the sform where it is given, else from the qform. Not checked yet."""
     if fields.units not in MM_PER_UNIT:
-        what = f"unit code {fields.units} in xyzt_units"
-        raise InputError(what, where=path, allowed="0 unknown (taken as mm), 1 metre, 2 mm, 3 micrometre")
+        allowed = "0 unknown (taken as mm), 1 metre, 2 mm, 3 micrometre"
+        refuse(f"unit code {fields.units} in xyzt_units", path, allowed, "unknown_unit")
     scale = MM_PER_UNIT[fields.units]
     if not (np.isfinite(fields.pixdim[1:4]).all() and min(fields.pixdim[1:4]) > 0):
-        raise InputError(f"pixdim {fields.pixdim[1:4]}", where=path, allowed="positive voxel sizes")
+        refuse(f"pixdim {fields.pixdim[1:4]}", path, "positive voxel sizes", "not_positive")
     if fields.sform_code <= 0 and fields.qform_code <= 0:
         what = "neither sform nor qform is set (both codes 0): the file does not say its space"
-        raise InputError(what, where=path, allowed="sform_code or qform_code > 0")
+        refuse(what, path, "sform_code or qform_code > 0", "space_not_stated")
     candidates = []
     if fields.sform_code > 0:
         candidates.append(_to_lps_mm(_sform(fields), scale))
@@ -174,7 +169,7 @@ def _affine(fields: _Fields, shape: tuple[int, int, int], path: Path) -> NDArray
     apart = corner_deviation_mm(checked[0], checked[-1], shape)
     if apart > QFORM_TOLERANCE_MM:
         what = f"sform and qform place a corner of the volume {apart:.3g} mm apart"
-        raise InputError(what, where=path, allowed=f"both agree within {QFORM_TOLERANCE_MM} mm, or one is unset")
+        refuse(what, path, f"both agree within {QFORM_TOLERANCE_MM} mm, or one is unset", "geometry_contradicted")
     return checked[0]
 
 
@@ -184,7 +179,7 @@ def _check_pixdim(T_ct_index: NDArray[np.float64], pixdim_mm: NDArray[np.float64
     plausible = np.isfinite(spacing).all() and spacing.min() > 0
     if plausible and np.abs(spacing / pixdim_mm - 1).max() > PIXDIM_TOLERANCE:
         what = f"pixdim says voxels of {pixdim_mm.round(4)} mm, the sform {spacing.round(4)} mm"
-        raise InputError(what, where=path, allowed=f"both agree within {PIXDIM_TOLERANCE:.1%}")
+        refuse(what, path, f"both agree within {PIXDIM_TOLERANCE:.1%}", "geometry_contradicted")
 
 
 def _to_lps_mm(T_ras_index: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
@@ -202,7 +197,7 @@ def _qform(fields: _Fields, path: Path) -> NDArray[np.float64]:
     b, c, d = fields.quaternion
     square = b * b + c * c + d * d
     if not square <= 1 + 1e-6:  # float32 rounding of a unit quaternion; NaN lands here too
-        raise InputError(f"quaternion {(b, c, d)} of the qform", where=path, allowed="b^2 + c^2 + d^2 <= 1")
+        refuse(f"quaternion {(b, c, d)} of the qform", path, "b^2 + c^2 + d^2 <= 1", "not_unit")
     a = max(0.0, 1.0 - square) ** 0.5
     R = np.array(
         [

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import absence, is_plain_file
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader, VoxelLayout, check_affine, check_shape
 
@@ -72,19 +72,19 @@ def split_header(content: bytes, path: Path) -> NrrdText:
     """
     head = content[:MAX_HEADER_BYTES]
     if re.match(rb"NRRD000[1-5]\r?\n", head) is None:
-        raise InputError("no NRRD header (magic NRRD0001 to NRRD0005)", where=path, allowed="a .nrrd or .nhdr file")
+        refuse("no NRRD header (magic NRRD0001 to NRRD0005)", path, "a .nrrd or .nhdr file", "wrong_format")
     end = re.search(rb"\n\r?\n", head)
     if end is None and len(head) == MAX_HEADER_BYTES:
-        raise InputError("the header has no end", where=path, allowed=f"at most {MAX_HEADER_BYTES} bytes")
+        refuse("the header has no end", path, f"at most {MAX_HEADER_BYTES} bytes", "bad_header")
     try:
         lines = head[: end.start() if end else None].decode("utf-8").split("\n")[1:]
     except UnicodeDecodeError as error:
-        raise InputError(f"the header is not text ({error})", where=path, allowed="UTF-8") from error
+        raise InputError(f"the header is not text ({error})", where=path, allowed="UTF-8", code="not_text") from error
     fields, remarks = _lines(lines, path)
     if "datafile" in fields:
         return NrrdText(fields, remarks, _beside(fields["datafile"], path), 0)
     if end is None:
-        raise InputError("the file ends inside the header", where=path, allowed="a complete file")
+        refuse("the file ends inside the header", path, "a complete file", "file_cut")
     return NrrdText(fields, remarks, path, end.end())
 
 
@@ -101,9 +101,9 @@ def _lines(lines: list[str], path: Path) -> tuple[dict[str, str], dict[str, str]
             continue
         key = field.lower().replace(" ", "")
         if not mark or key not in KNOWN_FIELDS:
-            raise InputError(f"unknown header line {line[:60]!r}", where=where, allowed=", ".join(sorted(KNOWN_FIELDS)))
+            refuse(f"unknown header line {line[:60]!r}", where, ", ".join(sorted(KNOWN_FIELDS)), "unknown_line")
         if key in fields:
-            raise InputError(f"the field {field!r} stands twice", where=where, allowed="each field once")
+            refuse(f"the field {field!r} stands twice", where, "each field once", "duplicate_key")
         fields[key] = value.strip()
     return fields, remarks
 
@@ -115,7 +115,7 @@ def stated_field(fields: dict[str, str], key: str, path: Path) -> str:
         InputError: It has not.
     """
     if not fields.get(key):
-        raise InputError(f"the header has no field {key!r}", where=path, allowed="a complete NRRD header")
+        refuse(f"the header has no field {key!r}", path, "a complete NRRD header", "missing_key")
     return fields[key]
 
 
@@ -126,7 +126,7 @@ def whole_number(text: str, path: Path) -> int:
         InputError: Anything but digits.
     """
     if not (text.isascii() and text.isdigit() and len(text) < 19):
-        raise InputError(f"size {text[:30]!r}", where=path, allowed="positive whole numbers")
+        refuse(f"size {text[:30]!r}", path, "positive whole numbers", "not_whole")
     return int(text)
 
 
@@ -134,14 +134,14 @@ def _beside(name: str, path: Path) -> Path:
     """The data file of a detached header: a plain name in the same folder, or nothing."""
     allowed = "the name of one file in the same folder"
     if not name or re.search(r"[/\\%\s\0]", name) or name in (".", "..") or name.upper().startswith("LIST"):
-        raise InputError(f"data file {name[:80]!r}", where=path, allowed=allowed)
+        refuse(f"data file {name[:80]!r}", path, allowed, "outside_folder")
     data_path = path.parent / name
     if not is_plain_file(data_path):
-        raise InputError(f"data file {name!r} {absence(data_path)}", where=path, allowed=allowed)
+        refuse(f"data file {name!r} {absence(data_path)}", path, allowed, "no_such_file")
     if data_path.resolve().parent != path.parent.resolve():
-        raise InputError(f"data file {name!r} is a link to another folder", where=path, allowed=allowed)
+        refuse(f"data file {name!r} is a link to another folder", path, allowed, "outside_folder")
     if data_path.resolve() == path.resolve():
-        raise InputError("the data file is the header itself", where=path, allowed=allowed)
+        refuse("the data file is the header itself", path, allowed, "data_elsewhere")
     return data_path
 
 
@@ -180,11 +180,7 @@ UNNAMED_SPACE = "its header names no patient space; read as LPS, as ITK and Slic
 
 
 def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
-    """What the header of a volume in three dimensions says.
-
-    Args:
-        content: The file that holds the header.
-        path: Its name.
+    """Parse the header of a volume in three dimensions.
 
     Raises:
         InputError: A damaged header, an unknown field, a space that is not patient space, or data elsewhere than in
@@ -200,10 +196,6 @@ def parse_layered_header(content: bytes, path: Path) -> VolumeHeader:
     """What the header of a segmentation says whose segments may overlap: one volume, or several as layers.
 
     Layers are the first axis, which runs fastest in the file (Slicer, "Segmentations", file format).
-
-    Args:
-        content: The file that holds the header.
-        path: Its name.
 
     Raises:
         InputError: As `parse_nrrd_header`; a first axis of four that is none of layers.
@@ -222,7 +214,7 @@ def is_layered(content: bytes, path: Path) -> bool:
 
 
 def _without_last(raw: NrrdText) -> NrrdText:
-    """The same header without a fourth axis of length 1 behind the three of space."""
+    """The header without a fourth axis of length 1 behind the three of space."""
     fields = dict(raw.fields)
     sizes, directions = fields.get("sizes", "").split(), fields.get("spacedirections", "")
     if fields.get("dimension") != "4" or sizes[3:] != ["1"] or not directions.endswith("none"):
@@ -237,8 +229,8 @@ def _wrong_dimension(fields: dict[str, str], path: Path) -> InputError:
     stated = fields.get("dimension")
     if stated == "4":
         what = 'dimension 4: segments that overlap lie in layers; name such a file in [[structures]] seg = "FILE"'
-        return InputError(what, where=path, allowed="dimension: 3, or a .seg.nrrd as seg")
-    return InputError(f"dimension {stated}", where=path, allowed="dimension: 3")
+        return InputError(what, where=path, allowed="dimension: 3, or a .seg.nrrd as seg", code="wrong_dimension")
+    return InputError(f"dimension {stated}", where=path, allowed="dimension: 3", code="wrong_dimension")
 
 
 def _header(raw: NrrdText, path: Path, layers: int = 1) -> VolumeHeader:
@@ -259,11 +251,11 @@ def _layers(raw: NrrdText, path: Path) -> int:
     sizes, kinds = raw.fields.get("sizes", "").split(), raw.fields.get("kinds", "").lower().split()
     directions = raw.fields.get("spacedirections", "")
     if not (kinds and kinds[0] in LAYER_KINDS and sizes and directions.startswith("none")):
-        what = "dimension 4 whose first axis is none of layers"
-        raise InputError(what, where=path, allowed="kinds: list domain domain domain, space directions: none (...)")
+        allowed = "kinds: list domain domain domain, space directions: none (...)"
+        refuse("dimension 4 whose first axis is none of layers", path, allowed, "wrong_dimension")
     layers = whole_number(sizes[0], path)
     if not 1 <= layers <= MAX_LAYERS:
-        raise InputError(f"{layers} layers", where=path, allowed=f"1 to {MAX_LAYERS}")
+        refuse(f"{layers} layers", path, f"1 to {MAX_LAYERS}", "out_of_range")
     return layers
 
 
@@ -284,10 +276,6 @@ def _without_layers(raw: NrrdText, path: Path) -> NrrdText:
 def data_file(content: bytes, path: Path) -> str | None:
     """The name of the file beside a detached header that holds its data; None where header and data are one file.
 
-    Args:
-        content: The file, or its beginning.
-        path: Its name.
-
     Raises:
         InputError: A damaged header, or data elsewhere than in the file or beside it.
     """
@@ -299,14 +287,14 @@ def _check_units(fields: dict[str, str], path: Path) -> None:
     for key in ("spaceunits", "units"):
         named = set(re.findall(r'"([^"]*)"', fields.get(key, ""))) - {""}
         if (fields.get(key) and not named and key == "spaceunits") or named - {"mm"}:
-            raise InputError(f"{key} {fields[key]!r}", where=path, allowed='"mm" "mm" "mm"')
+            refuse(f"{key} {fields[key]!r}", path, '"mm" "mm" "mm"', "unknown_unit")
 
 
 def _affine(fields: dict[str, str], path: Path) -> NDArray[np.float64]:
     space = _space(fields, path)
     if space not in LPS_SIGNS:
         allowed = "left-posterior-superior, right-anterior-superior, left-anterior-superior"
-        raise InputError(f"space {space!r} is not patient space", where=path, allowed=allowed)
+        refuse(f"space {space!r} is not patient space", path, allowed, "unknown_space")
     directions = _vectors(stated_field(fields, "spacedirections", path), 3, path)
     origin = _vectors(stated_field(fields, "spaceorigin", path), 1, path)
     T = np.eye(4)
@@ -321,9 +309,9 @@ def _space(fields: dict[str, str], path: Path) -> str:
     if "spacedimension" not in fields:
         return stated_field(fields, "space", path).lower()
     if "space" in fields:
-        raise InputError("both space and space dimension", where=path, allowed="one of the two")
+        refuse("both space and space dimension", path, "one of the two", "stated_twice")
     if fields["spacedimension"] != "3":
-        raise InputError(f"space dimension {fields['spacedimension'][:20]!r}", where=path, allowed="3")
+        refuse(f"space dimension {fields['spacedimension'][:20]!r}", path, "3", "wrong_dimension")
     return "lps"
 
 
@@ -331,13 +319,13 @@ def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
     allowed = f"{count} of (x,y,z) in mm"
     rows = VECTOR.findall(text)
     if len(rows) != count or VECTOR.sub("", text).strip():
-        raise InputError(f"{text[:80]!r}", where=path, allowed=allowed)
+        refuse(f"{text[:80]!r}", path, allowed, "not_a_number")
     try:
         vectors = np.array([[float(cell) for cell in row.split(",")] for row in rows])
     except ValueError as error:
-        raise InputError(f"{text[:80]!r} ({error})", where=path, allowed=allowed) from error
+        raise InputError(f"{text[:80]!r} ({error})", where=path, allowed=allowed, code="not_a_number") from error
     if vectors.shape != (count, 3):
-        raise InputError(f"{text[:80]!r}", where=path, allowed=allowed)
+        refuse(f"{text[:80]!r}", path, allowed, "not_a_number")
     return vectors
 
 
@@ -345,31 +333,31 @@ def _check_axes(fields: dict[str, str], path: Path) -> None:
     """Refuse axes that hold several values per voxel, or that are placed in two ways."""
     kinds = fields.get("kinds", "domain domain domain").lower().split()
     if len(kinds) != 3 or not AXIS_KINDS.issuperset(kinds):
-        raise InputError(f"kinds {fields['kinds'][:80]!r}", where=path, allowed="domain domain domain")
+        refuse(f"kinds {fields['kinds'][:80]!r}", path, "domain domain domain", "unsupported_feature")
     for key in ("axismins", "axismaxs"):
         if set(fields.get(key, "nan").lower().split()) != {"nan"}:
-            raise InputError(f"{key} beside a space", where=path, allowed="space origin and space directions alone")
+            refuse(f"{key} beside a space", path, "space origin and space directions alone", "stated_twice")
 
 
 def _cells(raw: NrrdText, path: Path) -> VoxelLayout:
     for key in ("byteskip", "lineskip"):
         if raw.fields.get(key, "0") != "0":
-            raise InputError(f"{key} {raw.fields[key]!r}", where=path, allowed="0")
+            refuse(f"{key} {raw.fields[key]!r}", path, "0", "unsupported_feature")
     stated = stated_field(raw.fields, "encoding", path).lower()
     encoding = "gzip" if stated in GZIP else "ascii" if stated in ASCII else stated
     if encoding not in {"raw", "gzip", "ascii"}:
-        raise InputError(f"encoding {stated!r}", where=path, allowed="raw, gzip, ascii")
+        refuse(f"encoding {stated!r}", path, "raw, gzip, ascii", "unsupported_feature")
     return VoxelLayout(_dtype(raw.fields, encoding, path), encoding, start=raw.data_offset)
 
 
 def _dtype(fields: dict[str, str], encoding: str, path: Path) -> np.dtype[Any]:
     name = TYPES.get(stated_field(fields, "type", path).lower())
     if name is None:
-        raise InputError(f"type {fields['type']!r}", where=path, allowed="an integer type, float or double")
+        refuse(f"type {fields['type']!r}", path, "an integer type, float or double", "unknown_type")
     dtype = np.dtype(name)
     if encoding == "ascii" or dtype.itemsize == 1:
         return dtype
     order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower())
     if order is None:
-        raise InputError("the byte order is not said", where=path, allowed="endian: little or big")
+        refuse("the byte order is not said", path, "endian: little or big", "missing_key")
     return np.dtype(order + name)

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import absence, is_plain_file, read_input
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.formats.volumes import nrrd_header
@@ -69,10 +69,6 @@ class Volume:
 def data_file(content: bytes, path: Path) -> str | None:
     """The name of the file beside this one that holds its voxels; None for a volume in one file.
 
-    Args:
-        content: The file that was named.
-        path: Its name.
-
     Raises:
         InputError: A header that is damaged, or names data elsewhere.
     """
@@ -97,7 +93,7 @@ def read_volume(path: Path) -> Volume:
         InputError: Anything wrong with the file; nothing else comes out, whatever its bytes.
     """
     if not is_plain_file(path):
-        raise InputError(f"the file {absence(path)}", where=path, allowed="a volume file")
+        refuse(f"the file {absence(path)}", path, "a volume file", "no_such_file")
     _parser(path)  # an unknown ending is refused before anything is read
     content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     beside = data_file(content, path)
@@ -108,7 +104,7 @@ def read_volume(path: Path) -> Volume:
 
 
 def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volume:
-    """The same of a file that has been read; it is not opened again.
+    """Parse a volume file that has been read; it is not opened again.
 
     Args:
         content: The file that was named.
@@ -123,9 +119,10 @@ def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volum
     try:
         values = _scaled(decoded(memoryview(stored), header), header.cells)
     except MemoryError as error:
-        raise InputError("it does not fit this machine's memory", where=path, allowed="a smaller one") from error
+        what = "it does not fit this machine's memory"
+        raise InputError(what, where=path, allowed="a smaller one", code="out_of_memory") from error
     if values.dtype.kind == "f" and not np.isfinite(values).all():
-        raise InputError("a voxel is NaN or infinite", where=path, allowed="finite values")
+        refuse("a voxel is NaN or infinite", path, "finite values", "not_finite")
     return Volume(values, header.T_ct_index, path, header.fields)
 
 
@@ -135,7 +132,8 @@ def _parser(path: Path) -> Callable[[bytes, Path], VolumeHeader]:
         return parse_nifti_header
     if name.endswith(NRRD_ENDINGS):
         return parse_nrrd_header
-    raise InputError("unknown file ending", where=path, allowed=", ".join(NIFTI_ENDINGS + NRRD_ENDINGS))
+    what = "unknown file ending"
+    raise InputError(what, where=path, allowed=", ".join(NIFTI_ENDINGS + NRRD_ENDINGS), code="unknown_format")
 
 
 def _scaled(stored: NDArray[Any], cells: VoxelLayout) -> NDArray[Any]:
@@ -249,7 +247,7 @@ def in_order(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
 
 
 def canonical(values: NDArray[Any], T_ct_index: NDArray[np.float64]) -> Oriented:
-    """The same voxels with their axes permuted and flipped so that they run along +L, +P, +S as nearly as can be.
+    """The voxels with their axes permuted and flipped so that they run along +L, +P, +S as nearly as can be.
 
     What an algorithm makes of a volume may depend on the array's order (ambiguous cells of marching cubes do);
     after this step it cannot depend on how the file stored it.

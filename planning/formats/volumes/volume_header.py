@@ -1,4 +1,4 @@
-"""What the header of a volume promises: its shape, its cells' type and size, and where its voxels lie."""
+"""The checked header of a volume: its shape, its cells' type and size, and where its voxels lie."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply
 
 MAX_VOXELS = 1_000_000_000
@@ -95,10 +95,10 @@ def check_shape(shape: tuple[int, ...], *, where: Path) -> tuple[int, int, int]:
         InputError: An axis with fewer than two voxels, or more than ``MAX_VOXELS`` in all.
     """
     if len(shape) != 3 or min(shape) < 2:
-        raise InputError(f"a volume of size {shape}", where=where, allowed="3 axes with at least 2 voxels each")
+        refuse(f"a volume of size {shape}", where, "3 axes with at least 2 voxels each", "wrong_dimension")
     count = shape[0] * shape[1] * shape[2]
     if count > MAX_VOXELS:
-        raise InputError(f"the header claims {count} voxels", where=where, allowed=f"at most {MAX_VOXELS}")
+        refuse(f"the header claims {count} voxels", where, f"at most {MAX_VOXELS}", "too_many")
     return shape[0], shape[1], shape[2]
 
 
@@ -114,22 +114,22 @@ def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.
     """
     T = np.array(T_ct_index, dtype=np.float64)
     if not np.isfinite(T).all():
-        raise InputError("the affine holds NaN or infinity", where=where, allowed="finite numbers")
+        refuse("the affine holds NaN or infinity", where, "finite numbers", "not_finite")
     with np.errstate(over="ignore"):  # float32 headers reach 1e38; the spacing check below refuses them
         spacing = np.linalg.norm(T[:3, :3], axis=0)
     if not np.all((spacing >= MIN_SPACING_MM) & (spacing <= MAX_SPACING_MM)):
         shown = " x ".join(f"{s:.3g}" for s in spacing)
         kind = "a zero or singular affine, " if spacing.min() == 0 else ""
         allowed = f"{MIN_SPACING_MM} to {MAX_SPACING_MM} mm (is the unit right?)"
-        raise InputError(f"{kind}voxel spacing {shown} mm", where=where, allowed=allowed)
+        refuse(f"{kind}voxel spacing {shown} mm", where, allowed, "implausible_spacing")
     axes = T[:3, :3] / spacing
     shear = float(np.abs(axes.T @ axes - np.eye(3)).max())
     if shear > SHEAR_TOLERANCE:
         kind = "singular" if abs(np.linalg.det(axes)) < SHEAR_TOLERANCE else "sheared"
         what = f"the affine is {kind}: two voxel axes are {shear:.2g} (cosine) from being perpendicular"
-        raise InputError(what, where=where, allowed=f"axes perpendicular within {SHEAR_TOLERANCE}")
+        refuse(what, where, f"axes perpendicular within {SHEAR_TOLERANCE}", "sheared")
     if np.abs(T[:3, 3]).max() > MAX_ORIGIN_MM:
-        raise InputError(f"origin at {T[:3, 3]} mm", where=where, allowed=f"within {MAX_ORIGIN_MM:.0f} mm")
+        refuse(f"origin at {T[:3, 3]} mm", where, f"within {MAX_ORIGIN_MM:.0f} mm", "too_far")
     T.setflags(write=False)
     return T
 
@@ -155,13 +155,11 @@ def refuse_lost_grid(labels: VolumeGrid, image: VolumeGrid, *, where: Path) -> N
     apart = max(float(np.abs(np.subtract(*ends)).max()) for ends in (boxes.min(axis=1), boxes.max(axis=1)))
     if sorted(labels.shape) == sorted(image.shape) and not labels.T_ct_index[:3, 3].any() and apart > ONE_PLACE_MM:
         sizes, steps = (" x ".join(f"{one:.4g}" for one in some) for some in (labels.shape, labels.spacing_mm))
-        raise InputError(
+        what = (
             f"has the CT's {sizes} voxels, but begins at 0, 0, 0 in steps of {steps} mm, up to {apart:.0f} mm away: "
-            "where its voxels lie was lost",
-            where=where,
-            allowed="labels on the grid of their CT: copy its origin, spacing and direction",
-            code="grid_lost",
+            "where its voxels lie was lost"
         )
+        refuse(what, where, "labels on the grid of their CT: copy its origin, spacing and direction", "grid_lost")
 
 
 def check_exact_size(actual: int, promised: int, *, where: Path) -> None:
@@ -173,4 +171,4 @@ def check_exact_size(actual: int, promised: int, *, where: Path) -> None:
     if actual != promised:
         kind = "cut short" if actual < promised else "longer than its header says"
         what = f"the file is {kind}: {actual} bytes where the header promises {promised}"
-        raise InputError(what, where=where, allowed="a complete file")
+        refuse(what, where, "a complete file", "size_mismatch")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.volumes.volume_header import VolumeHeader, check_exact_size
 
 DEFLATE_RATIO = 1033
@@ -23,7 +23,7 @@ PART_BYTES = 1 << 20
 
 
 def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.uint8]:
-    """All bytes of gzip data, which may have several members one after the other, padded with zeros.
+    """Inflate gzip data, which may have several members one after the other, padded with zeros.
 
     Stops one byte after the promised length, so what a bomb would inflate to is never made.
 
@@ -40,7 +40,7 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
     """
     if promised > len(content) * DEFLATE_RATIO:
         what = f"{len(content)} compressed bytes cannot hold the {promised} bytes that the header promises"
-        raise InputError(what, where=where, allowed="a complete file")
+        refuse(what, where, "a complete file", "size_mismatch")
     found = np.empty(promised, np.uint8)
     count = 0
     try:
@@ -50,7 +50,7 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
             count += len(part)
     except (EOFError, zlib.error) as error:
         what = f"the compressed data are damaged or cut short after {count} of {promised} bytes ({error})"
-        raise InputError(what, where=where, allowed="a complete gzip file") from error
+        raise InputError(what, where=where, allowed="a complete gzip file", code="file_damaged") from error
     check_exact_size(count, promised, where=where)
     return found
 
@@ -64,7 +64,8 @@ def first_bytes(content: memoryview, count: int, *, where: Path, allowed: str) -
     try:
         return b"".join(_parts(content, count))
     except (EOFError, zlib.error) as error:
-        raise InputError(f"not a readable gzip file ({error})", where=where, allowed=allowed) from error
+        what = f"not a readable gzip file ({error})"
+        raise InputError(what, where=where, allowed=allowed, code="file_damaged") from error
 
 
 def _parts(content: memoryview, most: int) -> Iterator[bytes]:
@@ -126,7 +127,7 @@ def _numbers(text: bytes, count: int, dtype: np.dtype[Any], where: Path) -> NDAr
     allowed = f"plain numbers of type {dtype}"
     pattern = FLOAT_TEXT if dtype.kind == "f" else INTEGER_TEXT
     if len(text) > count * TEXT_BYTES or pattern.fullmatch(text) is None:
-        raise InputError("the data hold something else than numbers", where=where, allowed=allowed)
+        refuse("the data hold something else than numbers", where, allowed, "not_a_number")
     words = text.split()
     check_exact_size(len(words), count, where=where)
     try:
@@ -134,4 +135,5 @@ def _numbers(text: bytes, count: int, dtype: np.dtype[Any], where: Path) -> NDAr
         with np.errstate(over="ignore"):  # what becomes infinite is refused
             return np.array(numbers, dtype=dtype)
     except (ValueError, OverflowError) as error:
-        raise InputError(f"the data hold no number of their type ({error})", where=where, allowed=allowed) from error
+        what = f"the data hold no number of their type ({error})"
+        raise InputError(what, where=where, allowed=allowed, code="not_a_number") from error

@@ -1,4 +1,4 @@
-"""What residuals cannot show of markers: permuted names, slipped axes, markers off the skin.
+"""Errors of markers that residuals cannot show: permuted names, slipped axes, markers off the skin.
 
 And what a stated transform, which has no residuals, is held against.
 

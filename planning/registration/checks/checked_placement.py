@@ -8,7 +8,7 @@ readings of its keys.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,12 +16,12 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import load_couch, load_skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.tables import NO_RESIDUALS, MarkerSection, RegistrationSection, other_readings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.checks.markers import MarkerFindings, Surroundings, check_markers
+from puncture_twin.planning.registration.checks.markers import Surroundings, check_markers
 from puncture_twin.planning.registration.checks.places import (
     OF_MARKERS,
     OF_MOUNT,
@@ -33,7 +33,7 @@ from puncture_twin.planning.registration.placement import Placement, load_placem
 from puncture_twin.planning.registration.registration import Registration
 
 UPRIGHT = np.radians(30.0)
-"""An arm whose z axis lies so near to up stands on a floor, a rail or a cart, as most do."""
+"""Angle of the base's z axis from up up to which an arm is upright: on a floor, a rail or a cart, as most are."""
 
 EXPLAINED = 3.29
 """Times the expected (rms) error of a point: normal errors exceed it at most once in 1,000, in whatever directions they
@@ -55,7 +55,7 @@ ALLOWED = "a transform between this CT and this robot's base, with transform_map
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What the file would say under some keys.
+    """The transform that the file would state under some of its keys.
 
     Attributes:
         keys: Those that differ from the case's; empty as stated.
@@ -80,12 +80,12 @@ class Reading:
 
     @property
     def upright(self) -> bool:
-        """Whether the arm stands; others hang, or reach out of a wall."""
+        """Whether the arm is mounted upright, not hanging or on a wall."""
         return self.tilt <= UPRIGHT
 
     @property
     def usual(self) -> tuple[bool, bool]:
-        """What speaks for it: the patient lies on something, and the arm stands."""
+        """Whether it is usual: the patient lies on something, and the arm is mounted upright."""
         return bool(self.rests_on), self.upright
 
     def better_than(self, other: Reading) -> bool:
@@ -98,8 +98,8 @@ class Reading:
         return f"the patient lies {lies} and the robot's z axis {np.degrees(self.tilt):.0f} deg from up"
 
 
-def markers_beside(case: Case, stated: RegistrationSection) -> Registration | None:
-    """What the markers beside a stated transform say; None without them.
+def marker_registration(case: Case, stated: RegistrationSection) -> Registration | None:
+    """The registration by the markers that a case states besides a transform; None without them.
 
     Raises:
         InputError: As `registered`.
@@ -109,36 +109,34 @@ def markers_beside(case: Case, stated: RegistrationSection) -> Registration | No
 
 def check_transform(
     case: Case, skin: TriangleMesh, T_base_ct: Floats, registration: Registration | None = None
-) -> MarkerFindings:
+) -> Iterator[Finding]:
     """Compare a stated transform with the markers beside it, if any, and with what physics excludes.
 
     Args:
         case: Nothing is done where it states no transform.
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm, as stated.
-        registration: Of `markers_beside`, whose own checks are `check_markers`.
+        registration: Of `marker_registration`, whose own checks are `check_markers`.
 
-    Returns:
-        Warnings, one sentence each; how far markers that agree are from it is a note.
+    Yields:
+        Warnings; how far markers that agree are from it is a note.
 
     Raises:
         InputError: Base or a box of the robot's frame would be in the patient; or markers are elsewhere.
     """
     stated = case.robot.stated
     if stated is None:
-        return MarkerFindings((), ())
+        return
     given = _reading(case, skin, "", T_base_ct)
     others = [_reading(case, skin, keys, T) for keys, T in other_readings(stated, T_base_ct).items()]
     if given.impossible:
         _refuse(case, f"{given.impossible}: {CAUSES}{_better(others)}")
     if registration is None:
-        return MarkerFindings(tuple(_unmeasured(case, given, others)), ())
-    told_apart = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
-    doubts = (*_doubts(case, given, told_apart), *_alike(case, given, told_apart))
-    compared = _held_against_markers(case, registration, given, others)
-    if _apart(case, registration, given.T_base_ct).unexplained:
-        return MarkerFindings((compared, *doubts), ())
-    return MarkerFindings(doubts, (compared,))
+        yield from _unmeasured(case, given, others)
+        return
+    distinct = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
+    yield _held_against_markers(case, registration, given, others)
+    yield from (*_doubts(case, given, distinct), *_alike(case, given, distinct))
 
 
 def _reading(case: Case, skin: TriangleMesh, keys: str, T_base_ct: Floats) -> Reading:
@@ -157,25 +155,28 @@ def _named(readings: Sequence[Reading]) -> str:
     return ", or ".join(f"{one.keys} ({one.text()})" for one in usual_first)
 
 
-def _unmeasured(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
-    """Without markers: that nothing measures it, and what it cannot be told from, in one line; then what is doubted."""
-    alike = "".join(f"; {one.removeprefix('registration: ')}" for one in _alike(case, given, others))
-    yield f"registration: {NO_RESIDUALS.format(file=case.robot.transform)}{MARKERS_TELL}{alike}"
+def _unmeasured(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[Finding]:
+    """Warning of a transform without markers, which nothing measures; then the reasons to doubt it."""
+    alike = "".join(f"; {one.sentence.removeprefix('registration: ')}" for one in _alike(case, given, others))
+    said = f"registration: {NO_RESIDUALS.format(file=case.robot.transform)}{MARKERS_TELL}{alike}"
+    yield Finding("transform_not_measured", Severity.WARNING, said)
     yield from _doubts(case, given, others)
 
 
-def _doubts(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
+def _doubts(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[Finding]:
     """What hardly is so as stated; else the other readings that are more usual."""
     if given.unlikely:
-        yield f"registration: by the stated transform {given.unlikely}: {CAUSES}{_better(others)}"
+        said = f"registration: by the stated transform {given.unlikely}: {CAUSES}{_better(others)}"
+        yield Finding("transform_unlikely", Severity.WARNING, said)
     elif better := [one for one in _rivals(given, others) if one.better_than(given) and not given.better_than(one)]:
-        yield (
+        said = (
             f"registration: more usual than what is stated ({given.text()}; place.up says which way is up) would be "
             f"{_named(better)}: {CAUSES}"
         )
+        yield Finding("transform_unlikely", Severity.WARNING, said)
 
 
-def _alike(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[str]:
+def _alike(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[Finding]:
     """The other readings that are as plausible as what is stated, where no other is more so."""
     rivals = _rivals(given, others)
     if given.unlikely or any(one.better_than(given) and not given.better_than(one) for one in rivals):
@@ -183,10 +184,11 @@ def _alike(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[st
     if alike := [one for one in rivals if one.better_than(given) == given.better_than(one)]:
         away = [np.linalg.norm(apply(one.T_base_ct - given.T_base_ct, case.target_ct)) for one in alike]
         named = ", ".join(f"{one.keys} ({mm:.0f} mm away)" for one, mm in zip(alike, away, strict=True))
-        yield (
+        said = (
             f"registration: nothing tells the stated transform from other readings, by which the target is elsewhere: "
             f"{named}{BOX_TELLS}"
         )
+        yield Finding("transform_alike", Severity.WARNING, said)
 
 
 def _rivals(given: Reading, others: Sequence[Reading]) -> list[Reading]:
@@ -194,8 +196,8 @@ def _rivals(given: Reading, others: Sequence[Reading]) -> list[Reading]:
     return [one for one in others if one.plausible and not np.allclose(one.T_base_ct, given.T_base_ct, atol=1e-6)]
 
 
-def _held_against_markers(case: Case, registration: Registration, given: Reading, others: Sequence[Reading]) -> str:
-    """How far the transform is from what the markers say.
+def _held_against_markers(case: Case, registration: Registration, given: Reading, others: Sequence[Reading]) -> Finding:
+    """How far the transform is from what the markers say: a warning where their errors do not explain it, else a note.
 
     Raises:
         InputError: Too far for both to be of one patient and robot.
@@ -210,12 +212,14 @@ def _held_against_markers(case: Case, registration: Registration, given: Reading
         better = "".join(f"; with {one.keys} they agree" for one in fitting)
         _refuse(case, f"{said}: {CAUSES}{better}")
     doubt = ", more than their errors explain" if found.unexplained else ""
-    return f"registration: stated transform: {said}{doubt}; its own expected error is unknown"
+    said = f"registration: stated transform: {said}{doubt}; its own expected error is unknown"
+    severity = Severity.WARNING if found.unexplained else Severity.NOTE
+    return Finding("transform_and_markers", severity, said, {"apart_mm": found.apart_mm})
 
 
 @dataclass(frozen=True)
 class Apart:
-    """Where markers and a transform differ most, measured by what is expected of the markers there.
+    """Where markers and a stated transform differ most, over the error expected of the markers there.
 
     Attributes:
         where: The target or a marker.
@@ -247,18 +251,18 @@ def _apart(case: Case, registration: Registration, T_base_ct: Floats) -> Apart:
 
 
 def _refuse(case: Case, what: str) -> None:
-    raise InputError(what, where=f"{case.path}: registration.transform", allowed=ALLOWED)
+    refuse(what, f"{case.path}: registration.transform", ALLOWED, "transform_implausible")
 
 
 class CheckedPlacement(NamedTuple):
     """A placement and what its checks found."""
 
     placement: Placement
-    findings: MarkerFindings
+    findings: tuple[Finding, ...]
 
 
 def checked_placement(case: Case, cache: Cache) -> CheckedPlacement | None:
-    """Where the patient lies for the robot, with its markers checked; None where the case does not say it.
+    """The patient's pose for the robot, its markers checked; None where the case does not say it.
 
     Raises:
         InputError: As `load_placement` and `placement_findings`, or a skin or CT that cannot be read.
@@ -273,7 +277,7 @@ def checked_placement(case: Case, cache: Cache) -> CheckedPlacement | None:
 
 def placement_findings(
     case: Case, around: Surroundings, placement: Placement, cache: Cache = NO_CACHE
-) -> MarkerFindings:
+) -> tuple[Finding, ...]:
     """Check what places the robot: the markers, a mount, or a stated transform and the markers beside it.
 
     However it is stated, what physics says of the place of the base is told (`base_place`).
@@ -286,15 +290,18 @@ def placement_findings(
     """
     skin = around.skin
     if placement.registration is not None:
-        found = check_markers(case, around, placement.registration, cache)
-        place = place_warnings(case, skin.mesh, placement.T_base_ct, OF_MARKERS)
-        return MarkerFindings((*place, *found.warnings), found.notes)
+        own = tuple(check_markers(case, around, placement.registration, cache))
+        return (*place_warnings(case, skin.mesh, placement.T_base_ct, OF_MARKERS), *own)
     if case.robot.stated is None:
-        return MarkerFindings(tuple(place_warnings(case, skin.mesh, placement.T_base_ct, OF_MOUNT)), ())
-    registration = markers_beside(case, case.robot.stated)
-    said = check_transform(case, skin.mesh, placement.T_base_ct, registration)
+        return tuple(place_warnings(case, skin.mesh, placement.T_base_ct, OF_MOUNT))
+    registration = marker_registration(case, case.robot.stated)
+    said = tuple(check_transform(case, skin.mesh, placement.T_base_ct, registration))
     if registration is None:
         return said
-    weak = tuple(f"registration: {flag}" for flag in registration.flags)
-    own = check_markers(case, around, registration, cache)
-    return MarkerFindings((*said.warnings, *weak, *own.warnings), (*said.notes, *own.notes))
+    return (*said, *weak_points(registration), *check_markers(case, around, registration, cache))
+
+
+def weak_points(registration: Registration) -> Iterator[Finding]:
+    """The flags of a registration, each naming it: they stand among findings of other things."""
+    for flag in registration.flags:
+        yield replace(flag, sentence=f"registration: {flag.sentence}")

@@ -11,7 +11,7 @@ so only after a half turn is refused; one that does so before and after it is na
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from scipy.special import fdtri
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -35,7 +35,7 @@ from puncture_twin.planning.registration.method import Renaming, renamings
 from puncture_twin.planning.registration.registration import Registration
 
 MARKER_ON_SKIN_MM = 30.0
-"""A skin marker's centre lies within its own height of the skin; one farther off stands on a frame, or is misread."""
+"""Height of a skin marker: one whose centre is farther from the skin is on a frame, or is misread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ Signs = tuple[float, float, float]
 
 
 class Surroundings(NamedTuple):
-    """What markers are held against, CT frame."""
+    """Surfaces that markers are compared with, CT frame."""
 
     skin: Skin
     couch: TriangleMesh | None
@@ -159,8 +159,11 @@ ALLOWED_NAMES = (
 )
 
 
-def check_names(case: Case, skin: Skin, registration: Registration) -> tuple[str, ...]:
-    """Compare the names with their permutations; returns warnings, one sentence each.
+def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[Finding]:
+    """Compare the names with their permutations.
+
+    Yields:
+        Warnings.
 
     Raises:
         InputError: Permuted names fit much better; or they fit as well, nothing excludes them, and the case does not
@@ -172,18 +175,21 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> tuple[str
     given = f"as named, FRE is {test.fre_mm:.2f} mm"
     if better:
         what = f"the marker names look permuted: {min(better, key=lambda one: one.fre_mm).text()}; {given}"
-        raise InputError(what, where=where, allowed="the names as the markers were touched")
+        refuse(what, where, "the names as the markers were touched", "markers_permuted")
     excluded = [place_excluded(case, skin.mesh, one.T_base_ct) for one in found]
     possible = [one for one, why in zip(found, excluded, strict=True) if not why]
     if possible and not _accepted(case):
         what = f"a slip in the marker names would pass unnoticed: {_worst(possible)}; {given}"
-        raise InputError(what, where=where, allowed=ALLOWED_NAMES)
-    warnings = () if complete else (f"of {len(registration.markers)} markers only swaps of two names were tested",)
+        refuse(what, where, ALLOWED_NAMES, "markers_ambiguous")
+    if not complete:
+        said = f"of {len(registration.markers)} markers only swaps of two names were tested"
+        yield Finding("names_not_all_tested", Severity.WARNING, said)
     if possible:
-        return (*warnings, f"marker names: {_worst(possible)}; accepted by accept_symmetry, {given}")
-    if found:
-        return (*warnings, f"marker names: {_worst(found)}; told apart by this alone: then {excluded[0]}")
-    return warnings
+        said = f"marker names: {_worst(possible)}; accepted by accept_symmetry, {given}"
+        yield Finding("marker_names_alike", Severity.WARNING, said)
+    elif found:
+        said = f"marker names: {_worst(found)}; told apart by this alone: then {excluded[0]}"
+        yield Finding("marker_names_alike", Severity.WARNING, said)
 
 
 def _accepted(case: Case) -> bool:
@@ -206,8 +212,8 @@ HALF_TURNS: Mapping[str, Signs] = MappingProxyType(
 )
 """The slips of axes that are proper rotations; a list with one or three axes negated is refused as mirrored."""
 
-REFUSING_DOUBT = 0.01
-"""A list is refused at 99 %. Honest lists less often: the more symmetric a body, the more alike are both lists."""
+REFUSING_LEVEL = 0.01
+"""Significance level at which a list is refused; honest lists are less often: on a symmetric body both are alike."""
 
 SCATTER_MM = 0.25
 """No skin is known better: a third of a millimetre's voxel, and the marker's own reading."""
@@ -215,14 +221,17 @@ SCATTER_MM = 0.25
 USUAL_SCATTER_MM = 3.0
 """Markers of one kind on the skin of their own CT scatter less."""
 
-EXCLUDING_DOUBT = 0.001
-"""A half turn is no more mentioned at 99.9 %."""
+EXCLUDING_LEVEL = 0.001
+"""Significance level at which a half turn is excluded, and no more mentioned."""
 
 
 def check_axes(
     case: Case, around: Surroundings, registration: Registration, given: MarkerList, cache: Cache = NO_CACHE
-) -> tuple[str, ...]:
-    """Compare the given list with its half turns; returns warnings, one sentence each.
+) -> Iterator[Finding]:
+    """Compare the given list with its half turns.
+
+    Yields:
+        Warnings.
 
     Raises:
         InputError: The list lies on the skin, or where it can be touched, only after a half turn.
@@ -235,99 +244,100 @@ def check_axes(
         fits = ", or ".join(
             f"with {name} they lie on the skin to {one.fit.scatter_mm:.1f} mm (rms)" for name, one in alike.items()
         )
-        raise InputError(
+        refuse(
             f"markers_ct look like coordinates of other axes: {fits}, as given {_as_given(registration, given, best)}",
-            where=f"{case.path}: registration",
-            allowed="markers_ct in the axes (LPS, RAS) that the case or their file states",
+            f"{case.path}: registration",
+            "markers_ct in the axes (LPS, RAS) that the case or their file states",
+            "other_axes",
         )
-    return tuple(
-        f"markers_ct with {name} would lie on the skin to {slip.fit.scatter_mm:.1f} mm rms, as given to "
-        f"{given.fit.scatter_mm:.1f} mm: too alike to tell, and the target would be {slip.target_mm:.0f} mm away; "
-        "check the axes of their file"
-        for name, slip in slips.items()
-        if not _excluded(slip, given)
-    )
+    for name, slip in slips.items():
+        if not _excluded(slip, given):
+            said = (
+                f"markers_ct with {name} would lie on the skin to {slip.fit.scatter_mm:.1f} mm rms, as given to "
+                f"{given.fit.scatter_mm:.1f} mm: too alike to tell, and the target would be {slip.target_mm:.0f} mm "
+                "away; check the axes of their file"
+            )
+            yield Finding("marker_axes_alike", Severity.WARNING, said, {"target_mm": slip.target_mm})
 
 
 def _explains(slip: MarkerList, given: MarkerList) -> bool:
     """Whether the given list is likely the other one, slipped: off the skin, or on it where no needle touches it."""
     if not slip.plausible:
         return False
-    hidden = bool(given.behind) and not _worse(slip.fit, given.fit, doubt=REFUSING_DOUBT)
-    return hidden or _worse(given.fit, slip.fit, doubt=REFUSING_DOUBT)
+    hidden = bool(given.behind) and not _worse(slip.fit, given.fit, level=REFUSING_LEVEL)
+    return hidden or _worse(given.fit, slip.fit, level=REFUSING_LEVEL)
 
 
 def _excluded(slip: MarkerList, given: MarkerList) -> bool:
     """Whether a list is implausible, or so much farther off the skin than the given one that it is not meant."""
     unusual = slip.fit.scatter_mm > USUAL_SCATTER_MM >= given.fit.scatter_mm
-    return unusual or not slip.plausible or _worse(slip.fit, given.fit, doubt=EXCLUDING_DOUBT)
+    return unusual or not slip.plausible or _worse(slip.fit, given.fit, level=EXCLUDING_LEVEL)
 
 
-def _worse(fit: SkinFit, other: SkinFit, *, doubt: float) -> bool:
+def _worse(fit: SkinFit, other: SkinFit, *, level: float) -> bool:
     """Whether the same markers scatter more in one list than in another beyond chance, by an F-test.
 
     Args:
         fit: Of one list.
         other: Of the same markers, read in other axes.
-        doubt: How often two lists of one scatter would seem so different.
+        level: How often two lists of one scatter would seem so different.
     """
     freedom = len(fit.gaps_mm) - 1
-    limit = float(np.sqrt(fdtri(freedom, freedom, 1 - doubt)))
+    limit = float(np.sqrt(fdtri(freedom, freedom, 1 - level)))
     return fit.scatter_mm > limit * max(other.scatter_mm, SCATTER_MM)
 
 
 def _as_given(registration: Registration, given: MarkerList, slip: MarkerList) -> str:
-    if _worse(given.fit, slip.fit, doubt=REFUSING_DOUBT):
+    if _worse(given.fit, slip.fit, level=REFUSING_LEVEL):
         return f"to {given.fit.scatter_mm:.1f} mm"
     row, before = given.behind[0]
     return f"{registration.markers.names[row]} lies behind {before}, where no needle touches it"
 
 
-def off_the_skin(registration: Registration, given: MarkerList) -> tuple[str, ...]:
-    """Markers far from the skin, or behind an obstacle: warnings, one sentence each."""
+def off_the_skin(registration: Registration, given: MarkerList) -> Iterator[Finding]:
+    """Markers far from the skin, or behind an obstacle: warnings."""
     names = registration.markers.names
     gaps = zip(names, np.abs(given.fit.gaps_mm), strict=True)
     far = [f"{name} ({gap:.0f} mm)" for name, gap in gaps if gap > MARKER_ON_SKIN_MM]
-    behind = tuple(
-        f"marker {names[row]} lies behind {before}: no needle can touch it there" for row, before in given.behind
-    )
-    if not far:
-        return behind
-    said = f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?"
-    return (said, *behind)
+    if far:
+        said = f"markers far from the skin: {', '.join(far)}; is their file in the case's space (LPS/RAS) and unit?"
+        yield Finding("markers_off_skin", Severity.WARNING, said)
+    for row, before in given.behind:
+        said = f"marker {names[row]} lies behind {before}: no needle can touch it there"
+        yield Finding("marker_behind", Severity.WARNING, said, {"marker": names[row]})
 
 
-LOCAL_AXES = 'space "local": nothing tells whether the axes of markers_ct have slipped by a half turn'
-
-BASE_AXES = (
-    "not checked: a half turn of markers_base (such as ROS base_link for the controller's base); residuals, skin and "
-    "couch are blind to it"
+LOCAL_AXES = Finding(
+    "axes_not_checked",
+    Severity.NOTE,
+    'space "local": nothing tells whether the axes of markers_ct have slipped by a half turn',
 )
-
-
-class MarkerFindings(NamedTuple):
-    """What is to be known about a case's markers or transform."""
-
-    warnings: tuple[str, ...]
-    """What these markers leave open, one sentence each."""
-    notes: tuple[str, ...]
-    """What no markers can show."""
+BASE_AXES = Finding(
+    "axes_not_checked",
+    Severity.NOTE,
+    "not checked: a half turn of markers_base (such as ROS base_link for the controller's base); residuals, skin and "
+    "couch are blind to it",
+)
 
 
 def check_markers(
     case: Case, around: Surroundings, registration: Registration, cache: Cache = NO_CACHE
-) -> MarkerFindings:
+) -> Iterator[Finding]:
     """Check a registration's markers against permuted names, half turns, skin and couch.
 
     How the markers lie on the skin depends on no target: ``cache`` keeps it.
+
+    Yields:
+        What these markers leave open, warnings; and what no markers can show, notes.
 
     Raises:
         InputError: Names that fit much better permuted, or as well where nothing tells them apart; a list that lies on
             the skin only after a half turn.
     """
-    names = check_names(case, around.skin, registration)
+    yield from check_names(case, around.skin, registration)
     given = marker_list(case, around, registration, cache=cache)
     local = case.space is Space.LOCAL
-    axes = () if local else check_axes(case, around, registration, given, cache)
-    warnings = (*names, *axes, *off_the_skin(registration, given))
-    return MarkerFindings(warnings, (LOCAL_AXES, BASE_AXES) if local else (BASE_AXES,))
+    if not local:
+        yield from check_axes(case, around, registration, given, cache)
+    yield from off_the_skin(registration, given)
+    yield from (LOCAL_AXES, BASE_AXES) if local else (BASE_AXES,)

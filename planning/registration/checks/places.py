@@ -1,4 +1,4 @@
-"""Where a registration puts robot and patient: could they lie so, and could the needle's tip have touched a marker?
+"""Plausibility of a registration's poses: could robot and patient be there, and could the tip have touched a marker?
 
 Physics tells it: nothing stands in a patient, and a patient lies in no box of the robot's frame, but on one. It is
 asked however a placement is stated, and of what slipped names or axes would make of it.
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.case.case import Case, up_axis
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.collision.bodies import surface, touch
@@ -135,7 +136,7 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
         T_base_ct: Shape (4, 4), mm.
     """
     column = _column_ct(case, T_base_ct)
-    if stands_in_patient(case, skin, T_base_ct):
+    if base_in_patient(case, skin, T_base_ct):
         return "the robot's base would stand in the patient"
     for box in _boxes_ct(case):
         if any(np.all(np.abs(point - box.center_mm) <= box.size_mm / 2) for point in column):
@@ -143,7 +144,7 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     return "the target would be out of the arm's reach" if out_of_reach(case, T_base_ct) else ""
 
 
-def stands_in_patient(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> bool:
+def base_in_patient(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> bool:
     """Whether base or shoulder lie in the patient; arguments as of `place_excluded`."""
     return any(side_of(skin, point) is Side.INSIDE for point in _column_ct(case, T_base_ct))
 
@@ -156,7 +157,7 @@ def out_of_reach(case: Case, T_base_ct: Floats) -> bool:
 
 
 def shoulder_within(case: Case, T_base_ct: Floats) -> str:
-    """The obstacle of frame ``ct`` that the shoulder lies in; a base that stands on one is in none. Empty for none."""
+    """Name of the obstacle of frame ``ct`` that contains the shoulder, or ""; a base on top of one is in none."""
     shoulder = _column_ct(case, T_base_ct)[1]
     boxes = (box for box in _boxes_ct(case) if np.all(np.abs(shoulder - box.center_mm) < box.size_mm / 2))
     return next((box.name for box in boxes), "")
@@ -266,7 +267,7 @@ OF_MARKERS = (
 
 
 class BasePlace(NamedTuple):
-    """What speaks against a place of the base."""
+    """Arguments for and against a position of the base."""
 
     impossible: str
     """Why nothing can be so, or empty."""
@@ -277,7 +278,7 @@ class BasePlace(NamedTuple):
 
 
 def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> BasePlace:
-    """What speaks against a place of the base.
+    """Check a position of the base for plausibility.
 
     Args:
         case: For arm, needle, target and obstacles.
@@ -285,7 +286,7 @@ def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> BasePlace:
         T_base_ct: Shape (4, 4), mm.
     """
     impossible = ""
-    if stands_in_patient(case, skin, T_base_ct):
+    if base_in_patient(case, skin, T_base_ct):
         impossible = "the robot's base would stand in the patient"
     elif box := in_box(case, skin, T_base_ct):
         impossible = f"the patient would lie more than {ALLOWANCE_MM:g} mm deep in obstacle '{box}' or through it"
@@ -296,8 +297,8 @@ def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> BasePlace:
     return BasePlace(impossible, " and ".join(filter(None, (far, shoulder, bed.off))), bed.on)
 
 
-def place_warnings(case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str) -> Iterator[str]:
-    """One sentence where something speaks against the place of a mount or of markers.
+def place_warnings(case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str) -> Iterator[Finding]:
+    """One warning where something speaks against the place of a mount or of markers.
 
     They say in words where the base is, and have no other reading that could be meant, so they are not refused: without
     an arm the verdicts are about the organs alone, and with one nothing is reached from there.
@@ -310,4 +311,4 @@ def place_warnings(case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str)
     """
     place = base_place(case, skin, T_base_ct)
     if what := place.impossible or place.unlikely:
-        yield text.format(what=what)
+        yield Finding("base_place", Severity.WARNING, text.format(what=what))

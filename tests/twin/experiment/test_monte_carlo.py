@@ -103,6 +103,6 @@ def test_the_command_prints_the_finding_and_knows_one_experiment():
     done = CliRunner().invoke(app, ["reproduce", "chen2019", "--experiment", "--seeds", "200"])
     assert done.exit_code == 0
     assert "REJECTED" in done.stdout
-    assert "2.99 ->  1.28 mm" in done.stdout
+    assert "2.99 -> 1.28 mm" in done.stdout
     refused = CliRunner().invoke(app, ["reproduce", "liu2007", "--experiment"])
     assert "no such experiment" in str(refused.exception)

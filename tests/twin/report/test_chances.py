@@ -16,9 +16,10 @@ from puncture_twin.twin.report.map.map_disc import chance_raster, touch_nothing
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import map_raster
 from puncture_twin.twin.report.map_view import map_view
-from puncture_twin.twin.report.page.page import Uncertainty, write_page
-from puncture_twin.twin.report.page.page_chances import rooms_section
+from puncture_twin.twin.report.page.page import Shown, Uncertainty, write_page
 from puncture_twin.twin.report.page.page_map import map_data
+from puncture_twin.twin.report.patient import rooms
+from puncture_twin.twin.report.present import Section, text
 
 BUDGET = ErrorBudget(1.0, 0.8, 0.6, np.array([1.9, 1.5, 1.2]), {"touch": 0.75, "ct_slice": 0.25})
 BREAKDOWN = UncertaintyBreakdown(
@@ -87,8 +88,8 @@ def test_the_page_says_how_sure_it_is(shown, tmp_path):
     told, plain = tmp_path / "told.html", tmp_path / "plain.html"
     anatomy, plan = world.make_anatomy(), world.make_plan(case, found)
     parts = (case, anatomy, found, plan, None, world.make_registration())
-    write_page(*parts, told, uncertainty=Uncertainty(BREAKDOWN, ROOMS, picture))
-    write_page(case, anatomy, replace(found, chances=None), *parts[3:], plain)
+    write_page(Shown(*parts, uncertainty=Uncertainty(BREAKDOWN, ROOMS, picture)), told)
+    write_page(Shown(case, anatomy, replace(found, chances=None), *parts[3:]), plain)
     text = told.read_text()
     for words in TOLD:
         assert words in text
@@ -115,15 +116,15 @@ def test_the_page_says_where_the_next_millimetre_is_won(shown, tmp_path):
     case, found = shown
     told, plain = tmp_path / "told.html", tmp_path / "plain.html"
     parts = (case, world.make_anatomy(), found, world.make_plan(case, found), None, world.make_registration())
-    write_page(*parts, told, uncertainty=Uncertainty(BREAKDOWN, None, None, BUDGET))
-    write_page(*parts, plain, uncertainty=Uncertainty(BREAKDOWN, None, None))
+    write_page(Shown(*parts, uncertainty=Uncertainty(BREAKDOWN, None, None, BUDGET)), told)
+    write_page(Shown(*parts, uncertainty=Uncertainty(BREAKDOWN, None, None)), plain)
     text = told.read_text()
     section = text[text.index('<h2 id="budget">') : text.index('<h2 id="windows">')]
     assert "The next 0.75 mm is won by slices of 1 mm." in section
     assert "data:image/png;base64,iVBOR" in section
     for number in ("1.60", "1.20", "1.25"):
         assert f"{number}</td>" in section
-    assert "0.00" not in section.replace(section[section.index("base64,") : section.index('" style')], "")
+    assert "0.00" not in section.replace(section[section.index("base64,") : section.index('"></figure>')], "")
     assert 'href="#budget"' in text and "budget" not in plain.read_text().split("<h2")[1]
     assert 'id="budget"' not in plain.read_text()
 
@@ -134,14 +135,15 @@ def test_a_truth_that_equals_the_belief_is_said_above_all(shown, tmp_path):
     plan = world.make_plan(case, found)
     done = world.make_rehearsal(plan)
     done.truth_is_belief = True
-    write_page(case, world.make_anatomy(), found, plan, done, None, tmp_path / "page.html")
+    write_page(Shown(case, world.make_anatomy(), found, plan, done), tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     assert 0 < text.index("The truth equals the belief") < text.index("safe directions")
 
 
 def test_rooms_without_any_that_was_reached_say_nothing():
     """There is no table of nothing."""
-    assert rooms_section({**ROOMS, "realised_rms_mm": None}, None) == ""
+    said = text([Section("many rooms", rooms({**ROOMS, "realised_rms_mm": None}))])
+    assert "in none did the arm reach the pose" in said and "realised" not in said and rooms(None) == []
 
 
 def test_the_cloud_is_drawn_in_the_needles_frame(tmp_path):

@@ -194,6 +194,19 @@ def test_a_picture_is_what_its_samples_blend_to(rng, ball):
     assert len(np.unique(found.reshape(-1, 3), axis=0)) > 1000
 
 
+def test_a_picture_does_not_depend_on_what_lay_in_memory(rng, ball, monkeypatch):
+    """Of a shell that some samples of a pixel lack, the colour that is not there counts for nothing, also as NaN."""
+    camera = replace(camera_at((0.0, -90.0, 20.0)), width=300, height=200)
+    layers = Layer([Surface(ball(30.0), (200, 60, 50))]), Layer([Surface(soup(rng, 40), (50, 90, 200), 0.3)])
+    expected = picture(*layers, camera)
+
+    def nothing(shape, dtype=np.float64):
+        return np.full(shape, np.nan if np.dtype(dtype).kind == "f" else 77, dtype)
+
+    monkeypatch.setattr(np, "empty", nothing)
+    assert np.array_equal(picture(*layers, camera), expected)
+
+
 def test_an_empty_layer_is_background():
     """Nothing to draw is no error."""
     assert (picture(Layer([]), Layer([]), camera_at((0, -400, 0))) == [246, 247, 249]).all()

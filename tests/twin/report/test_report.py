@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.cache.array_cache import Cache
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.base.reasons import REASON_COLOURS
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.tables import EntryAxes
@@ -30,7 +31,7 @@ from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
 from puncture_twin.twin.report.numbers import reason_counts
 from puncture_twin.twin.report.page import page as page_slices, page_scene as lighter_mesh
-from puncture_twin.twin.report.page.page import slices_data, write_page
+from puncture_twin.twin.report.page.page import Shown, slices_data, write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
 from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
@@ -483,20 +484,6 @@ def test_a_frame_is_its_ground_with_the_parts_put_on(rng):
     parts = [film_file.Part(4, 6, ground[:10, :20] ^ 255), film_file.Part(40, 0, ground[:32, :8] // 2)]
     whole = film_file.put_on(ground, parts)
     assert np.array_equal(whole[6:16, 4:24], parts[0].pixels) and np.array_equal(whole[:, 40:], parts[1].pixels)
-    (sent,) = film_file.encoded(ground, [parts])
-    assert sent == b"".join(plane.tobytes() for plane in film_file.planes_of(whole))
-
-
-def test_planes_are_those_of_bt_601(rng):
-    """Brightness and colour differences by the standard's real numbers, within rounding; black, white and grey too."""
-    pixels = np.repeat(np.repeat(rng.integers(0, 256, (8, 8, 3), dtype=np.uint8), 2, axis=0), 2, axis=1)
-    pixels[:2, :2], pixels[:2, 2:4], pixels[:2, 4:6] = 0, 255, 119
-    r, g, b = np.moveaxis(pixels / 255.0, 2, 0)
-    light = 0.299 * r + 0.587 * g + 0.114 * b
-    wanted = 16 + 219 * light, (128 + 112 * (b - light) / 0.886)[::2, ::2], (128 + 112 * (r - light) / 0.701)[::2, ::2]
-    for plane, exact in zip(film_file.planes_of(pixels), wanted, strict=True):
-        assert np.abs(plane - exact).max() <= 1.5
-    assert film_file.planes_of(pixels).blue[0, :3].tolist() == [128, 128, 128]
 
 
 def test_frames_of_a_film_cut_off_are_not_counted(tmp_path, rng):
@@ -583,12 +570,13 @@ def report(anatomy, case, candidates, plan, tmp_path_factory):
     """The whole page as text."""
     path = tmp_path_factory.mktemp("page") / "report.html"
     rehearsal = world.make_rehearsal(plan)
-    write_page(case, anatomy, candidates, plan, rehearsal, world.make_registration(), path)
+    write_page(Shown(case, anatomy, candidates, plan, rehearsal, world.make_registration()), path)
     return path.read_text(encoding="utf-8")
 
 
 def visible(text):
-    """The page without its scripts and styles."""
+    """The page without its scripts, styles and the bytes of its pictures."""
+    text = re.sub(r"data:image/png;base64,[^\"]+", "data:,", text)
     return re.sub(r"<(script|style)\b.*?</\1>", "", text, flags=re.DOTALL)
 
 
@@ -620,7 +608,7 @@ def test_without_markers_the_page_says_what_is_not_known(tmp_path):
     plan.expected_target_error_mm = float("nan")
     rehearsal = world.make_rehearsal(plan)
     rehearsal.predicted_error_mm, rehearsal.truth_is_belief = float("nan"), True
-    write_page(case, world.make_anatomy(), candidates, plan, rehearsal, None, tmp_path / "page.html")
+    write_page(Shown(case, world.make_anatomy(), candidates, plan, rehearsal), tmp_path / "page.html")
     text = visible((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert text.count("unknown (no markers)") == 3 and "NaN" not in text
     assert "The truth equals the belief" in text
@@ -630,7 +618,7 @@ def test_the_page_needs_no_network(report):
     """No element loads anything from an address, the page forbids it to itself, and it is small enough to mail."""
     own = re.sub(r'<script type="text/plain".*?</script>', "", report, flags=re.DOTALL)
     loads = re.findall(r"""(?:src|href)\s*=\s*["']([^"'#]+)["']""", visible(own))
-    assert loads == ["data:,", "timings.json"]  # the second is a link to a file beside it, which loads nothing
+    assert loads == ["data:,", "data:,", "timings.json"]  # the last is a link to a file beside it, which loads nothing
     assert "default-src 'none'" in report
     assert "@import" not in own and not re.search(r"url\(\s*['\"]?http", own)
     assert len(report) < 3e6
@@ -648,7 +636,7 @@ def test_verdict_and_doubt_come_first(report):
 
 def test_the_target_stands_in_the_case_s_space(anatomy, candidates, tmp_path):
     """A case in RAS names its target as it was typed."""
-    write_page(world.make_case(space="RAS"), anatomy, candidates, None, None, None, tmp_path / "page.html")
+    write_page(Shown(world.make_case(space="RAS"), anatomy, candidates), tmp_path / "page.html")
     assert "at (-10.0, 20.0, 30.0) mm RAS" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
@@ -670,10 +658,24 @@ def test_what_is_unknown_is_hatched(case, candidates):
     assert 0.15 < lines[inside].mean() < 0.35 and not lines[~inside].any()
 
 
+def test_notes_are_folded_below_the_warnings(case, candidates, tmp_path):
+    """A note of ``--json`` is on the page, not among what is not known; without any nothing unfolds."""
+    pages = []
+    for number, findings in enumerate(([Finding("far", Severity.NOTE, "a <note>")], [])):
+        anatomy = world.make_anatomy(warnings=("a warning",))
+        anatomy.findings = tuple(findings)
+        write_page(Shown(case, anatomy, candidates), tmp_path / f"{number}.html")
+        pages.append(visible((tmp_path / f"{number}.html").read_text(encoding="utf-8")))
+    with_note, without = pages
+    assert '<li class="bad">a warning</li>' in with_note and '<li class="bad">a &lt;note' not in with_note
+    assert "<details><summary>Notes (1)</summary><ul><li>a &lt;note&gt;</li></ul></details>" in with_note
+    assert "<details" not in without
+
+
 def test_nothing_safe_is_said_first(anatomy, case, tmp_path):
     """The refusal comes before any picture, with the counts."""
     nothing = world.make_candidates(case, safe=False)
-    write_page(case, anatomy, nothing, None, None, None, tmp_path / "page.html")
+    write_page(Shown(case, anatomy, nothing), tmp_path / "page.html")
     text = visible((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert text.index("Nothing is safe") < text.index("Which directions are safe")
     assert "skin angle" in text and "No plan was requested" in text
@@ -686,7 +688,7 @@ def test_a_failed_plan_is_none_that_nobody_wanted(anatomy, case, candidates, tmp
     pages = {}
     for name, refusal in (("searched", ""), ("failed", "no approach was found to any of 12 candidates")):
         parts = (case, anatomy, candidates, None)
-        write_page(*parts, None, None, tmp_path / f"{name}.html", refusal=refusal)
+        write_page(Shown(*parts, refusal=refusal), tmp_path / f"{name}.html")
         draw_scene(*parts, tmp_path / f"{name}.png", failed=bool(refusal))
         pages[name] = (tmp_path / f"{name}.html").read_text(encoding="utf-8")
     assert 'class="card bad"' in pages["failed"] and 'class="card bad"' not in pages["searched"]
@@ -709,7 +711,8 @@ def test_names_from_files_cannot_become_markup(case, candidates, tmp_path):
         clearance=replace(candidates.clearance, structures=(evil, "aorta")),
         verdict=replace(candidates.verdict, structure=np.full(len(candidates), evil)),
     )
-    write_page(case, anatomy, named, None, None, {"method": evil, "flags": [evil]}, tmp_path / "page.html", film=evil)
+    shown = Shown(case, anatomy, named, registration={"method": evil, "flags": [evil]}, film=evil)
+    write_page(shown, tmp_path / "page.html")
     assert evil not in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 

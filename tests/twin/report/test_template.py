@@ -10,17 +10,16 @@ import jinja2
 import pytest
 from markupsafe import Markup
 
-from puncture_twin.twin.report.page.page_tables import listed, pairs, table
 from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
+from puncture_twin.twin.report.present import Field, Section, Warn, facts, grid, html, text
 
 EVIL = "</script><script>alert('1')</script>{{ title }}"
-SERVO = ("setup", "paper", "targets", "needle", "convergence", "statistics", "calibration", "inputs")
+JOB = ("under", "sections", "inputs", "origin")
 
 
-def servo_parts(text):
-    """What the servo's page is given, every text the same."""
-    parts = dict.fromkeys(SERVO, text)
-    return parts | {"title": text, "seed": 1, "cards": [Card(text, text, text)], "cameras": [(text, "data:,")]}
+def job_parts(text):
+    """What a job's page is given, every text the same."""
+    return dict.fromkeys(JOB, text) | {"title": text, "cards": [Card(text, text, text)]}
 
 
 @pytest.mark.parametrize(
@@ -49,28 +48,33 @@ def plotly_head():
 
 def test_texts_are_escaped_wherever_they_stand(tmp_path):
     """Title, cards, figures, and every part that is not marked as HTML."""
-    write_html("servo.html", tmp_path / "page.html", **servo_parts(EVIL))
+    write_html("job.html", tmp_path / "page.html", **job_parts(EVIL))
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<script" not in text
-    assert text.count("&lt;script&gt;") == len(SERVO) + 2 + 3 + 1  # the title stands twice
+    assert text.count("&lt;script&gt;") == len(JOB) + 2 + 3  # the title stands twice
     assert "{{ title }}" in text  # what is put in is not searched again
 
 
 def test_a_part_that_is_missing_is_an_error_and_no_page(tmp_path):
     """Half a page must not look like a whole one."""
-    parts = servo_parts("words")
-    del parts["targets"]
-    with pytest.raises(jinja2.UndefinedError, match="targets"):
-        write_html("servo.html", tmp_path / "page.html", **parts)
+    parts = job_parts("words")
+    del parts["sections"]
+    with pytest.raises(jinja2.UndefinedError, match="sections"):
+        write_html("job.html", tmp_path / "page.html", **parts)
     assert not list(tmp_path.iterdir())
 
 
-def test_tables_escape_text_and_keep_markup():
-    """In heads, cells and lists alike."""
-    shown = table((EVIL,), [(EVIL, Markup("<b>1</b>"))]) + pairs([(EVIL, EVIL)]) + listed([EVIL])
-    assert "<script" not in shown
-    assert shown.count("&lt;script&gt;") == 5
-    assert "<td><b>1</b></td>" in shown
+def test_a_section_is_the_same_on_both_faces():
+    """Every cell and sentence of the page in the terminal, plain there and escaped here; markup is the page's alone."""
+    fields = (Field("name", "name"), Field("θ", "theta", 1, "°"), Field(EVIL, lambda row: row["name"]))
+    rows = [{"name": EVIL, "theta": -1.25}, {"name": "b", "theta": None}]
+    blocks = [grid(fields, rows), (facts(fields, rows[1]), "β first"), Warn((EVIL,)), Markup("<b>1</b>")]
+    page, plain = html([Section("both", blocks)]), text([Section("both", blocks)])
+    assert "<script" not in page and page.count("&lt;script&gt;") == 5 and "<b>1</b>" in page
+    assert "θ, °" in page and "−1.2" in page and "<h2>Both</h2>" in page
+    assert "theta, deg" in plain and "-1.2" in plain and "beta first" in plain and "<b>" not in plain
+    assert plain.count(EVIL) == 5
+    assert text([Section("nothing", [grid(fields, [])])]) == ""
 
 
 def test_data_cannot_end_its_script_element():

@@ -4,9 +4,9 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy.ndimage import map_coordinates
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
     Detection,
     DetectorSettings,
@@ -115,7 +115,7 @@ def test_a_needle_that_crosses_the_picture_has_no_tip_there():
 
 def test_another_size_is_refused():
     """A picture that is not the imager's."""
-    with pytest.raises(InputError, match="the imager's"):
+    with refused("wrong_shape"):
         detect(np.zeros((300, 200), np.uint8), IMAGER)
 
 

@@ -4,10 +4,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from refusals import refused
 from selfcal_world import as_estimate
 
 from benchmarks.selfcal_rooms import DIRECTION_RAD, IMAGE_MM, compared, recorded, room_of
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import N_PARAMETERS
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
@@ -90,7 +90,7 @@ def test_what_is_recorded_counts(world):
 def test_impossible_numbers_are_refused(world, n):
     """One to all of the candidates."""
     _, candidates, _, drawing = world
-    with pytest.raises(InputError, match="of 300 candidates"):
+    with refused("out_of_range", "300"):
         choose_poses(candidates, n, SPEC_NOISE, drawing)
 
 

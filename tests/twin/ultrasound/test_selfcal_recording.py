@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
@@ -44,56 +44,53 @@ def test_arrays_are_read_only_and_directions_unit(recording):
 def test_a_shafts_length_needs_a_direction_and_is_one(recording):
     """Without directions, or with a length that shows none, the recording is bad input that says so."""
     parts = (recording.A, recording.B, recording.P)
-    with pytest.raises(InputError, match="shaft_mm without directions"):
+    with refused("missing_column"):
         Recording(*parts, shaft_mm=np.full(6, 20.0))
-    for wrong in (0.5, -3.0, np.nan, np.inf):
-        with pytest.raises(InputError, match="shaft_mm of pose 1 is"):
+    for wrong, code in ((0.5, "out_of_range"), (-3.0, "out_of_range"), (np.nan, "not_finite"), (np.inf, "not_finite")):
+        with refused(code, "shaft_mm"):
             Recording(*parts, recording.v, shaft_mm=np.append(wrong, np.full(5, 20.0)))
 
 
 @pytest.mark.parametrize(
     ("key", "change", "says"),
     [
-        ("A", lambda a: a[:, :3], r"A has shape \(6, 3, 4\); allowed: \(6, 4, 4\)"),
-        ("A", lambda a: np.where(np.arange(6)[:, None, None] == 2, np.nan, a), "A of pose 3 is not finite"),
-        ("B", lambda a: a * [1, 1, -1, 1], "B of pose 1 is not a rigid motion"),
-        ("B", lambda a: a * [1.001, 1, 1, 1], "B of pose 1 is not a rigid motion"),
-        ("A", lambda a: a + [[0, 0, 0, 0]] * 3 + [[1, 0, 0, 0]], "A has shape|A of pose 1 is not a rigid motion"),
-        ("P", lambda a: a[:, :1], r"P has shape \(6, 1\)"),
-        ("P", lambda a: a * np.inf, "P of pose 1 is not finite"),
-        ("v", lambda a: a * 0, "v of pose 1 has no length"),
-        ("v", lambda a: np.column_stack([a * 0.1, np.ones(6)]), "v of pose 1 points out of the image"),
-        ("v", lambda a: a[:3], r"v has shape \(3, 2\)"),
+        ("A", lambda a: a[:, :3], "wrong_shape"),
+        ("A", lambda a: np.where(np.arange(6)[:, None, None] == 2, np.nan, a), "not_finite A pose 3"),
+        ("B", lambda a: a * [1, 1, -1, 1], "not_rigid B pose 1"),
+        ("B", lambda a: a * [1.001, 1, 1, 1], "not_rigid"),
+        ("A", lambda a: np.where(np.arange(96).reshape(6, 4, 4) == 12, 1.0, a), "not_rigid A pose 1"),
+        ("P", lambda a: a[:, :1], "wrong_shape"),
+        ("P", lambda a: a * np.inf, "not_finite"),
+        ("v", lambda a: a * 0, "zero_direction"),
+        ("v", lambda a: np.column_stack([a * 0.1, np.ones(6)]), "out_of_image"),
+        ("v", lambda a: a[:3], "wrong_shape"),
     ],
 )
 def test_a_broken_recording_is_refused(recording, key, change, says):
     """Every broken array is bad input that names the pose."""
     parts = {name: np.array(getattr(recording, name)) for name in "ABPv"}
-    if says.startswith("A has shape|"):
-        parts["A"][0, 3, 0] = 1.0
-    else:
-        parts[key] = change(parts[key])
-    with pytest.raises(InputError, match=says):
+    parts[key] = change(parts[key])
+    with refused(*says.split()):
         Recording(**parts)
 
 
 def test_names_must_be_unique(recording):
     """Two poses of one name could not be told apart in a report."""
-    with pytest.raises(InputError, match="one name per pose"):
+    with refused("duplicate_name"):
         Recording(recording.A, recording.B, recording.P, names=("a",) * 6)
 
 
 @pytest.mark.parametrize(
     ("edit", "says"),
     [
-        (lambda text: text.replace("A_x_mm", "A_x_m"), "header: columns name, A_r11"),
-        (lambda text: text.replace("P_v_mm,", ""), "header: columns"),
-        (lambda text: text.splitlines()[0] + "\n", "no pose"),
-        (lambda text: text.rsplit(",", 1)[0] + "\n", "row 7: 28 fields; allowed: 29 fields"),
-        (lambda text: text.rsplit(",", 1)[0] + ",nan\n", "row 7, v_y: 'nan' is not finite"),
-        (lambda text: text.rsplit(",", 1)[0] + ",left\n", "row 7, v_y: 'left' is not a number"),
-        (lambda text: text.replace("\n1,", "\n1,9", 1), "A of pose 1 is not a rigid motion"),
-        (lambda text: text.replace("\n2,", "\n1,", 1), "one name per pose"),
+        (lambda text: text.replace("A_x_mm", "A_x_m"), "wrong_columns A_r11"),
+        (lambda text: text.replace("P_v_mm,", ""), "wrong_columns"),
+        (lambda text: text.splitlines()[0] + "\n", "empty"),
+        (lambda text: text.rsplit(",", 1)[0] + "\n", "ragged_row 28 29"),
+        (lambda text: text.rsplit(",", 1)[0] + ",nan\n", "not_finite v_y nan"),
+        (lambda text: text.rsplit(",", 1)[0] + ",left\n", "not_a_number v_y left"),
+        (lambda text: text.replace("\n1,", "\n1,9", 1), "not_rigid"),
+        (lambda text: text.replace("\n2,", "\n1,", 1), "duplicate_name"),
     ],
 )
 def test_a_broken_file_is_refused(recording, tmp_path, edit, says):
@@ -101,13 +98,13 @@ def test_a_broken_file_is_refused(recording, tmp_path, edit, says):
     path = tmp_path / "recording.csv"
     write_recording(recording, path)
     path.write_text(edit(path.read_text()))
-    with pytest.raises(InputError, match=f"recording.csv.*{says}"):
+    with refused(*says.split(), "recording.csv"):
         read_recording(path)
 
 
 def test_a_missing_file_is_refused(tmp_path):
     """A folder without a recording says which file it lacks."""
-    with pytest.raises(InputError, match="recording.csv: no such file"):
+    with refused("no_such_file"):
         read_recording(tmp_path)
 
 
@@ -116,5 +113,5 @@ def test_recordings_join_and_divide(recording):
     whole = recording.subset(np.arange(2)).joined(recording.subset(slice(2, 6)))
     for key in "ABPv":
         np.testing.assert_array_equal(getattr(whole, key), getattr(recording, key))
-    with pytest.raises(InputError, match="different things"):
+    with refused("tables_differ"):
         recording.joined(Recording(recording.A, recording.B, recording.P))

@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
@@ -66,10 +66,6 @@ def wide_metal(volume: Volume, diameter_mm: float) -> Bools:
     """Voxels of metal that is wider than a rod, and those into which it blurs; shape of the image.
 
     Wide is what a ball fits into that is wider than the rod's own image.
-
-    Args:
-        volume: The CT.
-        diameter_mm: Of the rod.
     """
     metal, spacing = volume.values > METAL_HU, spacing_mm(volume)
     radius = diameter_mm / 2 + BLUR_MM
@@ -193,7 +189,7 @@ def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[M
             voxels = " x ".join(f"{size:g}" for size in spacing_mm(volume))
             allowed = f"metal within {FARTHEST_MM:g} mm of where it is expected, and voxels that are small beside it"
             what = f"marker {name} is not seen in the image, of {voxels} mm voxels"
-            raise InputError(what, where=volume.path, allowed=allowed)
+            refuse(what, volume.path, allowed, "marker_not_seen")
     return [pieces[found[row]] for row in range(len(expected.names))]
 
 
@@ -227,7 +223,7 @@ def read_lesion(volume: Volume, mask: NDArray[np.bool_]) -> Floats:
     """
     found = ndimage.find_objects(mask.astype(np.uint8))
     if not found:
-        raise InputError("the lesion has no voxel", where=volume.path, allowed="a lesion larger than a voxel")
+        refuse("the lesion has no voxel", volume.path, "a lesion larger than a voxel", "lesion_not_seen")
     spacing = spacing_mm(volume)
     around = np.ceil(RIM_MM / spacing).astype(int) + 1
     low = np.maximum(np.array([one.start for one in found[0]]) - around, 0)

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.special import ndtr
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.guidance.ct.markers import (
@@ -63,7 +63,7 @@ class _Line(NamedTuple):
 
 
 class FoundNeedle(NamedTuple):
-    """A needle that was found, LPS mm.
+    """A needle in a CT, LPS mm.
 
     Attributes:
         tip_ct: Shape (3,).
@@ -104,7 +104,7 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
                 _check_tip(volume, found, target_ct, hidden)
                 return found
     allowed = f"a straight piece of metal of {SHORTEST_MM:g} mm or more"
-    raise InputError("no needle in the image", where=volume.path, allowed=allowed)
+    raise InputError("no needle in the image", where=volume.path, allowed=allowed, code="needle_not_seen")
 
 
 def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bools) -> None:
@@ -121,7 +121,7 @@ def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bo
     away = target_ct - found.tip_ct
     lateral = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
     what = f"the needle ends at other metal, which hides its tip; its axis passes the target by {lateral:.1f} mm"
-    raise InputError(what, where=volume.path, allowed=f"a tip {SEEN_MM:g} mm clear of wider metal and its blur")
+    refuse(what, volume.path, f"a tip {SEEN_MM:g} mm clear of wider metal and its blur", "tip_hidden")
 
 
 def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats, hidden: Bools) -> tuple[Metal, _Line]:
@@ -219,7 +219,7 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
 
 
 class _Rod(NamedTuple):
-    """A rod that ends in the origin, blurred by a Gaussian.
+    """Model of a rod that ends in the origin, blurred by a Gaussian.
 
     Attributes:
         forward: Shape (3,), unit, to its end.

@@ -20,7 +20,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import PARAMETERS
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 
@@ -69,7 +69,7 @@ def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, 
             f"touches of different places: {names[i]} and {names[j]} are {apart:.0f} mm apart, more than a tip "
             f"{MOST_OFF_MM:g} mm off explains"
         )
-        raise InputError(what, where=where, allowed="touches of one place, the needle tilted to several sides")
+        refuse(what, where, "touches of one place, the needle tilted to several sides", "touches_apart")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ class Pivot:
         cov_tip: Shape (3, 3), mm^2, of the tip, from all that is declared.
         misses_mm: Shape (n,): the distance of each tip from their place.
         expected_mm: Their root mean square as the declared touch noise leaves it.
-        expected_whole_mm: The same with what the arm errs by, where that was declared.
+        expected_whole_mm: The expectation with the arm's errors too, where they are declared.
     """
 
     tip_flange: Floats
@@ -119,12 +119,12 @@ def pivot_calibration(
     """
     count = len(T_base_flange)
     if count < LEAST_POSES:
-        raise InputError(f"{count} poses", where=where, allowed=f"{LEAST_POSES} or more that turn about one another")
+        refuse(f"{count} poses", where, f"{LEAST_POSES} or more that turn about one another", "too_few_poses")
     A = np.concatenate([T_base_flange[:, :3, :3], np.broadcast_to(-np.eye(3), (count, 3, 3))], axis=2).reshape(-1, 6)
     factors = np.linalg.svd(A, compute_uv=False)
     if not factors[-1] * WORST_FACTOR > 1.0:
-        what = "the poses turn too little about one another to find the tip"
-        raise InputError(what, where=where, allowed="tilts of 20 degrees or more to several sides")
+        allowed = "tilts of 20 degrees or more to several sides"
+        refuse("the poses turn too little about one another to find the tip", where, allowed, "poses_too_alike")
     found, *_ = np.linalg.lstsq(A, -T_base_flange[:, :3, 3].reshape(-1), rcond=None)
     left = (A @ found + T_base_flange[:, :3, 3].reshape(-1)).reshape(-1, 3)
     whole = noise_mm**2 * np.eye(3 * count) + (0.0 if arm_cov is None else arm_cov)

@@ -37,7 +37,7 @@ class LocatedPair(NamedTuple):
     rod_c: Floats | None
     """Shape (3,): along the rod; None for a marker, which has none."""
     head_there: bool = True
-    """Whether the head stands in the workcell and may hide it; it does not during the calibration."""
+    """Whether the head is in the workcell and may hide the ball; it is not during the calibration."""
 
 
 class Detection(NamedTuple):

@@ -199,7 +199,8 @@ def statistics(trials: Sequence[ServoTrial]) -> Statistics:
     """
     rows = [row for one in trials for row in one.rows]
     if not rows:
-        raise NoAnswerError("no session could be held: " + "; ".join(sorted({one.refused for one in trials})))
+        what = "no session could be held: " + "; ".join(sorted({one.refused for one in trials}))
+        raise NoAnswerError(what, code="no_session")
     stereo = np.concatenate([one.stereo_mm for one in trials])
     mapping, expected, before, after, only = (
         np.array([getattr(row, name) for row in rows])

@@ -101,7 +101,8 @@ def calibrate_by_robot(
     for number, (start, end) in enumerate(pairwise(q_command), start=2):
         contact = path_contact(checker, np.stack([start, end]))
         if contact is not None:
-            raise NoAnswerError(f"calibration: {contact.body} would touch {contact.other} on the way to point {number}")
+            what = f"calibration: {contact.body} would touch {contact.other} on the way to point {number}"
+            raise NoAnswerError(what, code="motion_touches")
     sigma, q_true = case.truth_errors.measuring_mm, q_command[0]
     measured, detections, stood = [], [], []
     for number, q in enumerate(q_command, start=1):
@@ -114,7 +115,7 @@ def calibrate_by_robot(
         searches = tuple(Search(camera, measured[-1], FIRST_SEARCH_PX) for camera in planned_cameras(case))
         seen = look_at(detector, ball, searches, case.file.servo.frames)
         if isinstance(seen, Lost):
-            raise NoAnswerError(f"calibration, point {number}: {seen.reason}")
+            raise NoAnswerError(f"calibration, point {number}: {seen.reason}", code="ball_not_found")
         detections.append(seen)
     measured_c = np.array(measured)
     pixels = np.stack([s.pixels for s in detections], axis=1)

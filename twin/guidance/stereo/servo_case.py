@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, Strict, model_validator
 
 from puncture_twin.planning.arm.ur import UrModel, ur_model
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import SchemaError, refuse
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.toml_types import Coordinate, Length, Name, Number, Section, Vector
@@ -81,9 +81,11 @@ class ToolSection(Section):
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:
         if self.holder_mm >= self.rod_mm:
-            raise ValueError(f"holder_mm {self.holder_mm:g} is not shorter than rod_mm {self.rod_mm:g}")
+            what = f"holder_mm {self.holder_mm:g} is not shorter than rod_mm {self.rod_mm:g}"
+            raise SchemaError(what, "out_of_range")
         if self.rod_diameter_mm >= self.ball_diameter_mm:
-            raise ValueError(f"rod_diameter_mm {self.rod_diameter_mm:g} hides a ball of {self.ball_diameter_mm:g} mm")
+            what = f"rod_diameter_mm {self.rod_diameter_mm:g} hides a ball of {self.ball_diameter_mm:g} mm"
+            raise SchemaError(what, "out_of_range")
         return self
 
 
@@ -172,10 +174,12 @@ class ServoFile(Section):
     @model_validator(mode="after")
     def _errors_are_declared_once(self) -> Self:
         if self.errors is None and self.rehearsal.errors is not None:
-            raise ValueError("[rehearsal.errors] is a truth that differs from [errors], which is not there")
+            what = "[rehearsal.errors] is a truth that differs from [errors], which is not there"
+            raise SchemaError(what, "missing_errors")
         for section, key in OLDER_NAMES:
             if getattr(getattr(self, section), key) is not None and getattr(self.errors, key, None) is not None:
-                raise ValueError(f"{section}.{key} and errors.{key} state the same error; keep errors.{key}")
+                what = f"{section}.{key} and errors.{key} state the same error; keep errors.{key}"
+                raise SchemaError(what, "stated_twice")
         return self
 
     @property
@@ -194,7 +198,7 @@ class ServoCase:
         model: The arm.
         skin: The head's surface, image frame, mm.
         markers: The markers' centres, image frame, in truth.
-        targets: The targets, likewise.
+        targets: The targets, image frame, in truth.
         inputs: Every file, with role and hash.
     """
 
@@ -245,7 +249,7 @@ def load_servo_case(path: Path | str) -> ServoCase:
     markers = parse_points(named["markers"], path.parent / file.head.markers, default_space=Space.LOCAL)
     targets = parse_points(named["targets"], path.parent / file.head.targets, default_space=Space.LOCAL)
     if len(markers.names) < MIN_MARKERS:
-        raise InputError(f"head.markers: {len(markers.names)} markers", where=path, allowed="3 or more")
+        refuse(f"head.markers: {len(markers.names)} markers", path, "3 or more", "too_few_markers")
     return ServoCase(path, file, model, skin, markers, targets, files.inputs)
 
 

@@ -42,14 +42,14 @@ from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply, frame_yz, log_rotation, pose, rotated_about
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import Conditioning
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import Conditioning
 
 CHARACTERISTIC_MM = 300.0
 """Length by which millimetres are made comparable with radians: about half of a UR3's reach."""
 
 MIN_SIGMA = 0.1
-"""Smallest singular value of the scaled Jacobian from which on position and orientation are steered together."""
+"""Smallest singular value of the scaled Jacobian from which on position and orientation are controlled together."""
 
 DAMPING = 0.05
 """Damping of a position-only step where the position itself is singular; none where it is not."""
@@ -75,18 +75,18 @@ class StepLimits(NamedTuple):
 
     step_mm: float = 10.0
     joint_step_rad: float = math.radians(10.0)
-    """The largest turn of any joint."""
+    """The largest rotation of any joint."""
     drift_rad: float = math.radians(1.0)
-    """How far the needle may turn away while only the position is steered."""
+    """How far the needle may rotate away while only the position is controlled."""
 
 
 class Step(NamedTuple):
     """The joint path of one step."""
 
     q_path: Floats
-    """Shape (m, 6), rad: from where the arm stands; one row where it may not go anywhere."""
+    """Shape (m, 6), rad: from the arm's configuration; one row where it may not move."""
     stop: ServoStop | None
-    """Why there is no path (on)."""
+    """Why the arm may not move; None where it may."""
     position_only: bool
     """Whether some piece gave the orientation up."""
 
@@ -130,28 +130,29 @@ def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits
 
     Args:
         rod: The arm and its rod.
-        q: Shape (6,), rad: where the arm stands, as commanded.
+        q: Shape (6,), rad: the arm's commanded configuration.
         move_base: Shape (3,), mm.
         limits: A longer move is cut short; the next look sees what is left.
     """
     length = float(np.linalg.norm(move_base))
     move = move_base * min(1.0, limits.step_mm / max(length, 1e-12))
     count = max(1, math.ceil(min(length, limits.step_mm) / PIECE_MM))
-    start, path, only_position = ball_base(rod, q), [np.asarray(q, dtype=np.float64)], False
+    start, path, position_only = ball_base(rod, q), [np.asarray(q, dtype=np.float64)], False
     for piece in range(1, count + 1):
-        here = path[-1]
-        turn, blind = _piece(rod, here, start + move * (piece / count) - ball_base(rod, here))  # with what is missing
-        slack = limits.joint_step_rad - np.abs(here - q).max()
-        fraction = min(1.0, max(slack, 0.0) / max(float(np.abs(turn).max()), 1e-12))
-        there = here + fraction * turn
-        stop = _refusal(rod, there, blind, limits)
+        q_now = path[-1]
+        goal = start + move * (piece / count)  # on the straight line: what the last pieces missed is made up for
+        dq, without_orientation = _piece(rod, q_now, goal - ball_base(rod, q_now))
+        slack = limits.joint_step_rad - np.abs(q_now - q).max()
+        fraction = min(1.0, max(slack, 0.0) / max(float(np.abs(dq).max()), 1e-12))
+        q_next = q_now + fraction * dq
+        position_only = position_only or without_orientation
+        stop = _refusal(rod, q_next, without_orientation, limits)
         if stop is not None:
-            return Step(np.array(path[:1]), stop, only_position or blind)
-        only_position = only_position or blind
-        path.append(there)
+            return Step(np.array(path[:1]), stop, position_only)
+        path.append(q_next)
         if fraction < 1.0:
             break
-    return Step(np.array(path), None, only_position)
+    return Step(np.array(path), None, position_only)
 
 
 def _piece(rod: CarriedRod, q: Floats, move: Floats) -> tuple[Floats, bool]:
@@ -175,10 +176,10 @@ def damped(J: Floats, goal: Floats) -> Floats:
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + squared * np.eye(len(J)), goal))
 
 
-def _refusal(rod: CarriedRod, q: Floats, blind: bool, limits: StepLimits) -> ServoStop | None:
+def _refusal(rod: CarriedRod, q: Floats, position_only: bool, limits: StepLimits) -> ServoStop | None:
     if not rod.model.within_limits(q):
         return ServoStop.JOINT_LIMIT
-    if blind and np.linalg.norm(orientation_error(rod, q)) > limits.drift_rad:
+    if position_only and np.linalg.norm(orientation_error(rod, q)) > limits.drift_rad:
         return ServoStop.SINGULAR
     return None
 
@@ -355,7 +356,7 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
         if found is None:
             return Posture(q, branch)
         why = f"{found.contact.body} would touch {found.contact.other} at point {found.at + 1} of {len(points_base)}"
-    raise NoAnswerError(why)
+    raise NoAnswerError(why, code="motion_touches")
 
 
 def path_upward(rod: CarriedRod, points_base: Floats, up_mm: float) -> Floats:

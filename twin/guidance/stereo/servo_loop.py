@@ -19,17 +19,17 @@ from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dens
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ServoStop, StepLimits, servo_step
 
 DIVERGING_RATIO = 1.5
-"""A step that leaves this times the error it found makes things worse."""
+"""A step diverges if it leaves more than this times the error before it."""
 
 DIVERGING_STEPS = 2
-"""So many such steps in a row end the servo: one may be the play of the gears."""
+"""Diverging steps in a row that end the servo: a single one may be the play of the gears."""
 
 NOISE_TOLERANCES = 3.0
-"""Errors below this many tolerances are noise, and do not diverge."""
+"""Errors below this many tolerances are noise, and end no servo as diverging."""
 
 
 class Seen(NamedTuple):
-    """Ball and target of one image, in C."""
+    """Ball and target as one look measures them, calibration frame c."""
 
     ball_c: Floats
     """Shape (3,), mm."""
@@ -46,10 +46,10 @@ class Lost(NamedTuple):
 
 
 Look = Callable[[Floats, Floats], Seen | Lost]
-"""Takes commanded and true joints, each (6,), rad; the truth is for the images alone."""
+"""Function of commanded and true joints, each (6,), rad: a measurement; only the images depend on the true ones."""
 
 Move = Callable[[Floats], Floats]
-"""Takes the commanded configuration (6,) and returns the true one, rad."""
+"""Function of the commanded configuration (6,): moves the arm, and returns the true configuration, rad."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +58,12 @@ class Task:
 
     Attributes:
         rod: The arm, its rod and the orientation to keep.
-        T_base_c: Shape (4, 4), mm: r_T_c, as calibrated.
+        T_base_c: Shape (4, 4), mm: from the calibration frame c to the base, as calibrated (Liu's r_T_c).
         tolerance_mm: The servo has converged when a look sees no larger error.
         max_steps: Moves at most.
         looks: Looks at most before a ball counts as lost.
         limits: What one step may do.
-        checker: Checks contacts, with the head where it is believed to stand.
+        checker: Checks contacts, with the head where it is believed to be.
     """
 
     rod: CarriedRod
@@ -76,7 +76,7 @@ class Task:
 
 
 class Visit(NamedTuple):
-    """One stay of the arm: commanded joints, true joints, and what was seen."""
+    """One stop of the arm: commanded joints, true joints, and what was seen."""
 
     q_command: Floats
     q_true: Floats
@@ -91,7 +91,7 @@ class Servoed:
 
     Attributes:
         stop: Why it ended.
-        visits: Every stay at which the ball was seen, in order.
+        visits: Every stop at which the ball was seen, in order.
         q_command: Shape (6,), rad: the last command.
         q_true: Shape (6,), rad: true joints.
         detail: What was touched or missing, for people.
@@ -107,42 +107,42 @@ class Servoed:
 
     @property
     def steps(self) -> int:
-        """Corrections that were moved."""
+        """Number of corrections that were executed."""
         return max(0, len(self.visits) - 1)
 
     @property
     def errors_mm(self) -> Floats:
-        """Seen error at each stay, shape (n,)."""
+        """Measured error at each stop, shape (n,), mm."""
         return np.array([visit.error_mm for visit in self.visits])
 
 
 def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, move: Move) -> Servoed:
-    """Move the ball onto the target.
+    """Move the ball onto the target: look, measure the error, move a step; until it converges or must stop.
 
     Args:
-        task: What to do.
+        task: Target, limits and devices.
         q_command: Shape (6,), rad: where the arm was sent.
         q_true: Shape (6,), rad: true joints; only handed on to ``look``.
         look: Takes images and measures.
         move: Moves the arm.
     """
     visits: list[Visit] = []
-    blind = False
+    position_only = False
 
     def ended(stop: ServoStop, detail: str = "") -> Servoed:
-        return Servoed(stop, tuple(visits), q_command, q_true, detail, blind)
+        return Servoed(stop, tuple(visits), q_command, q_true, detail, position_only)
 
     while True:
         seen = _look(task, q_command, q_true, look)
         if isinstance(seen, Lost):
             return ended(ServoStop.LOST_BALL, seen.reason)
-        miss = seen.target_c - seen.ball_c
-        visits.append(Visit(q_command, q_true, seen, float(np.linalg.norm(miss))))
+        error_c = seen.target_c - seen.ball_c
+        visits.append(Visit(q_command, q_true, seen, float(np.linalg.norm(error_c))))
         stop = _stop_reason(task, visits)
         if stop is not None:
             return ended(stop)
-        step = servo_step(task.rod, q_command, task.T_base_c[:3, :3] @ miss, task.limits)
-        blind = blind or step.position_only
+        step = servo_step(task.rod, q_command, task.T_base_c[:3, :3] @ error_c, task.limits)
+        position_only = position_only or step.position_only
         if step.stop is not None:
             return ended(step.stop)
         contact = path_contact(task.checker, step.q_path)
@@ -168,7 +168,7 @@ def _look(task: Task, q_command: Floats, q_true: Floats, look: Look) -> Seen | L
 
 
 def _stop_reason(task: Task, visits: list[Visit]) -> ServoStop | None:
-    """Whether to stop after the last look."""
+    """Why to stop after the last look; None to go on."""
     errors = [visit.error_mm for visit in visits]
     if errors[-1] <= task.tolerance_mm:
         return ServoStop.CONVERGED

@@ -164,7 +164,7 @@ def see_markers(
             detector, LocatedPair(point, head.marker_diameter_mm / 2, None), searches, servo_plan.frames
         )
         if isinstance(detections, Lost):
-            raise NoAnswerError(f"marker {name}: {detections.reason}")
+            raise NoAnswerError(f"marker {name}: {detections.reason}", code="marker_not_seen")
         found.append(detections)
     return found
 
@@ -192,7 +192,7 @@ def _try_stereo(
         searches = _searches(workcell.case, calibration, apply(T_c_base, point))
         detections = look_at(detector, ball, searches, workcell.case.file.servo.frames)
         if isinstance(detections, Lost):
-            raise NoAnswerError(f"stereo test: {detections.reason}")
+            raise NoAnswerError(f"stereo test: {detections.reason}", code="marker_not_seen")
         errors.append(np.linalg.norm(in_space(calibration.cameras, detections).points_c[0] - ball.center_c))
     return np.array(errors)
 

@@ -74,7 +74,7 @@ class Acquisition:
 
 
 class _Motion:
-    """Both true arms, with the play of their last arrivals; and whether they touch."""
+    """The true motion of both arms, with the play of their last arrivals, and whether they touch."""
 
     def __init__(self, case: SelfcalCase, truth: WorkcellTruth, rng: np.random.Generator) -> None:
         self._truth, self._rng = truth, rng
@@ -121,7 +121,8 @@ def acquire(
     left = np.arange(len(candidates.q_probe))
     while len(shots) < wanted:
         if wanted - len(shots) > len(left):
-            raise NoAnswerError(_too_few(case, candidates, shots, missed, given_up), counts=candidates.counts)
+            what = _too_few(case, candidates, shots, missed, given_up)
+            raise NoAnswerError(what, counts=candidates.counts, code="too_few_poses")
         chosen = choose(case, candidates, left, wanted - len(shots), rng, shots)
         left = np.setdiff1d(left, chosen)
         for row in chosen:

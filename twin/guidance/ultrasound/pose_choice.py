@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate, active_columns, parameter_units
@@ -143,7 +143,7 @@ def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generat
     pairs = [answer for answer in answers if not isinstance(answer, str)]
     q = np.array(pairs, dtype=np.float64).reshape(-1, 2, 6)
     if len(taken) == 0:
-        raise NoAnswerError(f"no pose of {n} can be taken: {counts}", counts=counts)
+        raise NoAnswerError(f"no pose of {n} can be taken: {counts}", counts=counts, code="no_pose")
     poses = Recording(
         goals[0][taken],
         goals[1][taken],
@@ -271,7 +271,7 @@ def choose_poses(
         InputError: More poses wanted than there are candidates, or none.
     """
     if not 0 < n <= len(candidates):
-        raise InputError(f"{n} poses of {len(candidates)} candidates", where="pose choice", allowed="1 to all of them")
+        refuse(f"{n} poses of {len(candidates)} candidates", "pose choice", "1 to all of them", "out_of_range")
     prior = prior.estimate if isinstance(prior, Calibration) else prior
     design = _design(candidates, _Belief(noise, prior, None), recorded)
     chosen: list[int] = []

@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic, decode_text, is_folder, read_input
 from puncture_twin.planning.formats.points import joint_readings, row_numbers
 from puncture_twin.planning.geometry.rigid import pose
@@ -49,7 +49,7 @@ def read_recording(path: Path) -> Recording:
 
 
 def parse_recording(content: bytes, file: Path) -> Recording:
-    """As `read_recording`, of a file that has been read; it is not opened again.
+    """Parse a recording that has been read, like `read_recording`; it is not opened again.
 
     Raises:
         InputError: As `read_recording`, but for reading.
@@ -58,19 +58,17 @@ def parse_recording(content: bytes, file: Path) -> Recording:
     try:
         rows = [row for row in csv.reader(io.StringIO(text), strict=True) if row and not row[0].startswith("#")]
     except csv.Error as error:
-        raise InputError(f"is no CSV ({error})", where=file, allowed="one line per pose, fields of numbers") from error
+        what = f"is no CSV ({error})"
+        raise InputError(what, where=file, allowed="one line per pose, fields of numbers", code="not_csv") from error
     header = tuple(cell.strip() for cell in rows[0]) if rows else ()
     if header not in KINDS:
-        raise InputError(
-            f"columns {', '.join(header)[:200]}",
-            where=f"{file}, header",
-            allowed=", ".join(columns(False, (3, 1), 24)),
-        )
+        allowed = ", ".join(columns(False, (3, 1), 24))
+        refuse(f"columns {', '.join(header)[:200]}", f"{file}, header", allowed, "wrong_columns")
     pixels, (width, shaft), behind = KINDS[header]
     places = (f"{file}, row {i}" for i in range(2, len(rows) + 1))
     values = np.array([row_numbers(row, header, header[1:], at) for row, at in zip(rows[1:], places, strict=True)])
     if values.size == 0:
-        raise InputError("no pose", where=file, allowed="one row per pose")
+        refuse("no pose", file, "one row per pose", "empty")
     names = tuple(row[0].strip() for row in rows[1:])
     try:
         first = 26 + width + shaft
@@ -84,8 +82,7 @@ def parse_recording(content: bytes, file: Path) -> Recording:
         joints = (q_probe, q_needle, turn_probe, turn_needle)
         return Recording(A, B, values[:, 24:26], v, names, pixels, *joints, shaft_mm)
     except InputError as error:
-        where = f"{file}: {error.where}"
-        raise InputError(error.what, where=where, allowed=error.allowed, code=error.code) from error
+        raise error.at(f"{file}: {error.where}") from error
 
 
 def write_recording(recording: Recording, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a self-calibration case may hold: the TOML schema, version 1, key by key. See docs/reference/selfcal-case.md."""
+"""TOML schema of a self-calibration case, version 1, key by key. See docs/reference/selfcal-case.md."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.toml_types import Length, Name, Number, Section, Sextuple, Vector
@@ -67,12 +68,13 @@ class ArmSection(Section):
     @classmethod
     def _has_meshes(cls, value: str) -> str:
         if value not in ARMS_WITH_MESHES:
-            raise ValueError(f"model '{value}'; collision needs link meshes, which ship for {ARMS_WITH_MESHES}")
+            what = f"model '{value}'; collision needs link meshes, which ship for {ARMS_WITH_MESHES}"
+            raise SchemaError(what, "unknown_robot")
         return value
 
 
 class NeedleArmSection(ArmSection):
-    """The needle's arm, and where its base stands: in the frame of the probe's arm, both upright."""
+    """The needle's arm, and the pose of its base in the frame of the probe's arm, both upright."""
 
     position_mm: Vector = (800.0, 0.0, 0.0)
     yaw_deg: Degrees = 180.0
@@ -89,7 +91,8 @@ class ProbeSection(Section):
     @model_validator(mode="after")
     def _head_fits(self) -> Self:
         if self.head_mm[1] >= self.length_mm:
-            raise ValueError(f"head_mm {self.head_mm[1]:g} along the probe is not shorter than length_mm")
+            what = f"head_mm {self.head_mm[1]:g} along the probe is not shorter than length_mm"
+            raise SchemaError(what, "out_of_range")
         return self
 
 
@@ -104,7 +107,7 @@ class SelfcalNeedleSection(Section):
     @model_validator(mode="after")
     def _shaft_fits(self) -> Self:
         if self.shaft_mm > self.length_mm:
-            raise ValueError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}")
+            raise SchemaError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}", "out_of_range")
         return self
 
 
@@ -119,7 +122,7 @@ class PhantomSection(Section):
     @model_validator(mode="after")
     def _corners_fit(self) -> Self:
         if 2 * self.round_mm >= min(self.size_mm):
-            raise ValueError(f"round_mm {self.round_mm:g} leaves nothing of size_mm {self.size_mm}")
+            raise SchemaError(f"round_mm {self.round_mm:g} leaves nothing of size_mm {self.size_mm}", "out_of_range")
         return self
 
 
@@ -141,7 +144,7 @@ class ImageSection(Section):
 
 
 class PosesSection(Section):
-    """From which poses are chosen, and how."""
+    """Bounds of the poses that are chosen, and how they are chosen."""
 
     samples: Annotated[int, Strict(), Field(ge=20, le=100_000)] = 600
     count: Annotated[int, Strict(), Field(ge=16, le=2000)] = 30
@@ -154,7 +157,8 @@ class PosesSection(Section):
     @model_validator(mode="after")
     def _insertion_ascends(self) -> Self:
         if self.insertion_deg[0] >= self.insertion_deg[1]:
-            raise ValueError(f"insertion_deg {list(self.insertion_deg)} does not ascend; it is [lowest, highest]")
+            what = f"insertion_deg {list(self.insertion_deg)} does not ascend; it is [lowest, highest]"
+            raise SchemaError(what, "range_descends")
         return self
 
 
@@ -183,9 +187,8 @@ class NoiseSection(Section):
     @model_validator(mode="after")
     def _across_the_image(self) -> Self:
         if self.robot_mm == 0.0 and self.off_plane_mm == 0.0:
-            raise ValueError(
-                "noise: robot_mm and off_plane_mm are both 0; nothing is measured exactly across the image"
-            )
+            what = "noise: robot_mm and off_plane_mm are both 0; nothing is measured exactly across the image"
+            raise SchemaError(what, "not_positive")
         return self
 
     def noise(self) -> Noise:
@@ -215,7 +218,8 @@ class SelfcalFile(Section):
     @model_validator(mode="after")
     def _phantom_on_table(self) -> Self:
         if self.phantom.top_mm[2] - self.phantom.size_mm[2] < 0.0:
-            raise ValueError("phantom: its lower side (top_mm minus size_mm) is below the table at z = 0")
+            what = "phantom: its lower side (top_mm minus size_mm) is below the table at z = 0"
+            raise SchemaError(what, "out_of_range")
         return self
 
 

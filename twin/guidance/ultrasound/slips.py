@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.geometry.rigid import inverse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
@@ -65,14 +65,12 @@ def checked_calibration(recording: Recording, case: SelfcalCase | None, where: P
         rms_mm = _residual_mm(lambda r: _read(r, r.A, r.B, r.P), recording)
         if rms_mm > SUSPECT_MM:
             _refuse_slip(recording, rms_mm, where)
-        if error.code:
-            raise InputError(error.what, where=where, allowed=error.allowed, code=error.code) from error
-        raise
+        raise error.at(where) from error
     if found.rms_mm > SUSPECT_MM:
         _refuse_slip(recording, found.rms_mm, where)
     if found.rms_mm > SOUND_MM:
         what = f"residuals of {found.rms_mm:.3g} mm (rms): the poses and the image do not belong together"
-        raise InputError(what, where=where, allowed=f"residuals up to {SOUND_MM:g} mm; {ALLOWED}")
+        refuse(what, where, f"residuals up to {SOUND_MM:g} mm; {ALLOWED}", "residuals_too_large")
     return found
 
 
@@ -81,7 +79,7 @@ def _check_reach(recording: Recording, where: Path) -> None:
         farthest = float(np.linalg.norm(T[:, :3, 3], axis=1).max())
         if farthest < LEAST_REACH_MM:
             what = f"the flange of {name} is never farther than {farthest:.3g} mm from its base: metres?"
-            raise InputError(what, where=where, allowed=ALLOWED)
+            refuse(what, where, ALLOWED, "wrong_unit")
 
 
 def _refuse_slip(recording: Recording, rms_mm: float, where: Path) -> None:
@@ -90,7 +88,7 @@ def _refuse_slip(recording: Recording, rms_mm: float, where: Path) -> None:
         if other < SUSPECT_MM and other < BETTER * rms_mm:
             as_given = f"residuals {rms_mm:.3g} mm" if np.isfinite(rms_mm) else "no fit"
             what = f"it fits ({other:.2g} mm rms) if {slip}, and not as it is given ({as_given})"
-            raise InputError(what, where=where, allowed=ALLOWED)
+            refuse(what, where, ALLOWED, "recording_slip")
 
 
 def _residual_mm(undo: Reading, recording: Recording) -> float:

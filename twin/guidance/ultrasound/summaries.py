@@ -104,7 +104,7 @@ def arms_summary(found: Calibration) -> dict[str, Any] | None:
 def predicted_tre(found: Calibration, recording: Recording) -> float:
     """Expected (rms) error at the recorded tips, mm: from the calibration, the declared arms, an image that errs."""
     known = _rms(found.predicted_tre_mm(recording.P, recording.A)) if found.arms is None else None
-    image_mm = found.image.rms_mm if found.image is not None and found.image.doubted else 0.0
+    image_mm = found.image.rms_mm if found.image is not None and found.image.significant else 0.0
     return float(np.hypot(expected_error_mm(found, recording) if known is None else known, image_mm))
 
 

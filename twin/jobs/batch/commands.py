@@ -28,7 +28,7 @@ def _plan(
 ) -> None:
     """Write down every case of a cohort, with the hash of its inputs, options and version."""
     from puncture_twin.twin.jobs.batch.jobs import plan_cohort
-    from puncture_twin.twin.jobs.batch.text import plan_text
+    from puncture_twin.twin.jobs.batch.report import plan_text
 
     with progress_display() as progress:
         run = plan_cohort(cohort, out_dir, arm=False if no_arm else None, dry=dry_run, watcher=progress)
@@ -53,7 +53,7 @@ def _run(
     """Run the cases that have no result yet; what is done is kept, whatever stops the run."""
     from puncture_twin.planning.batch.workers import Limits
     from puncture_twin.twin.jobs.batch.jobs import Where, run_part, run_summary
-    from puncture_twin.twin.jobs.batch.text import run_text
+    from puncture_twin.twin.jobs.batch.report import run_text
 
     where = Where(part, scheduler, jobs, pages, Limits(memory_mb, timeout_s))
     with progress_display() as progress:
@@ -65,7 +65,7 @@ def _run(
 def _status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
     """Count the cases that are done, failed, missing and stale; every input is hashed again."""
     from puncture_twin.planning.batch.run import cohort_state
-    from puncture_twin.twin.jobs.batch.text import state_text
+    from puncture_twin.twin.jobs.batch.report import state_text
 
     with progress_display() as progress:
         state = cohort_state(out_dir, partial(progress.count, "cases"))
@@ -85,7 +85,7 @@ def _merge(
 ) -> None:
     """Write one table of all cases, one dataset of all candidates, and one page."""
     from puncture_twin.twin.jobs.batch.jobs import merge_cohort
-    from puncture_twin.twin.jobs.batch.text import merge_text
+    from puncture_twin.twin.jobs.batch.report import merge_text
 
     with progress_display() as progress:
         merged = merge_cohort(out_dir, expect, tolerance, progress)
@@ -101,7 +101,7 @@ def _compare(
     """Say what became safe, what was lost, and how far best entries moved, from A to B."""
     from puncture_twin.planning.batch.merge import compare, read_cases
     from puncture_twin.twin.jobs.batch.jobs import change_summary
-    from puncture_twin.twin.jobs.batch.text import compare_text
+    from puncture_twin.twin.jobs.batch.report import compare_text
 
     found = compare(read_cases(before), read_cases(after))
     summary = {"counts": dict(found.counts), "cases": [change_summary(one) for one in found.changes]}

@@ -5,15 +5,16 @@ Two paths side by side: numbers with their units, and why one is not safe.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
@@ -24,11 +25,11 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
-from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
 from puncture_twin.planning.search.windows import Window, find_windows, nearest_row
 from puncture_twin.twin.jobs.patient.answers import explain_choice
 from puncture_twin.twin.jobs.patient.main_job import is_plan
 from puncture_twin.twin.jobs.patient.summaries import plan_summary
+from puncture_twin.twin.report.present import NOTHING, Block, Field, Section, Table, facts, number, text
 
 SAME_DIRECTION = 1e-9
 """Radians within which a direction is one of the grid: rounding of typed degrees."""
@@ -55,7 +56,7 @@ def parse_two(
         InputError: None or more than two, or one angle alone.
     """
     if len(theta_deg) != len(beta_deg):
-        raise InputError("one angle alone gives no direction", where="--theta, --beta", allowed="both, as often")
+        refuse("one angle alone gives no direction", "--theta, --beta", "both, as often", "one_angle")
     choices = [parse_choice(*pair, None, None, None) for pair in zip(theta_deg, beta_deg, strict=True)]
     choices += [parse_choice(None, None, one, None, None) for one in rank]
     choices += [parse_choice(None, None, None, one, None) for one in window]
@@ -63,10 +64,10 @@ def parse_two(
     if len(choices) == 1:
         choices = [BEST_OF_ALL, *choices]
     if len(choices) == 2 and choices[0] == choices[1]:
-        raise InputError("the same direction twice", where="compare", allowed="two, or one that is not the best")
+        refuse("the same direction twice", "compare", "two, or one that is not the best", "same_direction")
     if len(choices) != 2:
         allowed = "two, such as --rank 1 --window 2, or one, which is compared with the best"
-        raise InputError(f"{len(choices)} choices", where="compare", allowed=allowed)
+        refuse(f"{len(choices)} choices", "compare", allowed, "wrong_count")
     return choices[0], choices[1]
 
 
@@ -79,10 +80,10 @@ def two_plans(source: Path, other: Path | None, case: Path | None, chosen: bool)
     allowed = "PLAN_A PLAN_B [--case CASE], or CASE with one choice or two"
     if not is_plan(source):
         if other is not None or case is not None:
-            raise InputError("a case and another file", where="compare", allowed=allowed)
+            refuse("a case and another file", "compare", allowed, "conflicting_options")
         return None
     if other is None or not is_plan(other) or chosen:
-        raise InputError("a plan is compared with a plan", where=source, allowed=allowed)
+        refuse("a plan is compared with a plan", source, allowed, "conflicting_options")
     return source, other
 
 
@@ -190,9 +191,6 @@ NEAREST = 5
 
 LEAST_CHANCE = 1e-4
 """What is shown of a chance: a smaller one is no number that anybody can rely on."""
-
-NOTHING = "-"
-"""Where there is no number."""
 
 NOT_CHECKED = "as the plans state it; name their case with --case to have them checked again, with chances and windows"
 
@@ -305,18 +303,17 @@ class Comparison:
     def text(self) -> str:
         """A table, then what takes a sentence."""
         entries = f", their entries {self.entries_apart_mm:.0f} mm" if np.isfinite(self.entries_apart_mm) else ""
-        rows = [("", "A", "B"), *self._rows()]
-        rows = [row for row in rows if row[1:] != (NOTHING, NOTHING)]
-        first, second = (max(len(row[column]) for row in rows) for column in (0, 1))
-        table = [f"  {what:{first}s}  {one:{second}s}  {two}".rstrip() for what, one, two in rows]
+        sides = [{**side.summary(), "side": side} for side in (self.a, self.b)]
+        rows = [(one.name, *(one.of(side, unit=True) for side in sides)) for one in (*FIELDS, *self._clearances())]
+        table = Table(("", "A", "B"), tuple(row for row in rows if row[1:] != (NOTHING, NOTHING)))
         head = f"case {self.case_name}: two paths {self.apart_deg:.1f} deg apart{entries}"
-        return "\n".join([head, *table, *self._sentences(), *(f"warning: {one}" for one in self.warnings)])
+        return text([
+            Section(head, [table, *self._sentences()]), *(Section(f"warning: {one}", []) for one in self.warnings),
+        ])  # fmt: skip
 
-    def _rows(self) -> Iterator[tuple[str, str, str]]:
-        for what, values in _ROWS:
-            yield what, values(self.a), values(self.b)
+    def _clearances(self) -> Iterator[Field]:
         for name in self._structures():
-            yield f"clearance to {name}, mm", _clearance(self.a, name), _clearance(self.b, name)
+            yield Field(f"clearance to {name}", partial(_clearance, name=name))
 
     def _structures(self) -> list[str]:
         """The nearest of either side that demand a margin, the nearest first."""
@@ -326,16 +323,15 @@ class Comparison:
                 least[name] = min(mm, least.get(name, np.inf))
         return sorted(least, key=lambda name: least[name])
 
-    def _sentences(self) -> Iterator[str]:
+    def _sentences(self) -> Iterator[Block]:
         for letter, side in (("A", self.a), ("B", self.b)):
             if side.explained is None:
                 continue
             if not side.safe:
-                yield f"  {letter} is rejected: {reason_text(side.explained.candidates, 0)}"
-            for what, values in side.explained.facts.rows():
-                yield f"  {letter} {what}: {values}"
+                yield f"{letter} is rejected: {reason_text(side.explained.candidates, 0)}"
+            yield facts((f"{letter} {what}", value) for what, value in side.explained.facts.rows())
         if self.a.explained is None:
-            yield f"  {NOT_CHECKED}"
+            yield NOT_CHECKED
 
 
 def _demanding(side: Side) -> list[tuple[str, float]]:
@@ -347,103 +343,83 @@ def _demanding(side: Side) -> list[tuple[str, float]]:
     )
 
 
-def _clearance(side: Side, name: str) -> str:
+def _clearance(row: Mapping[str, Any], name: str) -> str | None:
+    explained = row["side"].explained
+    if explained is None:
+        return None
+    digits = next(decimals(one) for one in explained.anatomy.checked if one.name == name)
+    clearance = explained.clearances()[name]
+    return "crossed" if clearance < 0 else number(clearance, digits, "mm")
+
+
+def _angles(row: Mapping[str, Any]) -> str:
+    at = row["plan"] or row["check"]
+    return f"{at['theta_deg']:.6g}, {at['beta_deg']:.6g}"
+
+
+def _verdict(row: Mapping[str, Any]) -> str:
+    side = row["side"]
     if side.explained is None:
-        return NOTHING
-    digits = next(decimals(one) for one in side.explained.anatomy.checked if one.name == name)
-    clearance = side.explained.clearances()[name]
-    return "crossed" if clearance < 0 else f"{clearance:.{digits}f}"
+        return "not checked"
+    return str(side.explained.candidates.safe_text) if side.safe else str(side.explained.verdict)
 
 
-def _shown(value: float, form: str) -> str:
-    return form.format(value) if np.isfinite(value) else NOTHING
+def _chance(key: str) -> Callable[[Mapping[str, Any]], str | None]:
+    """In percent, of a side that has chances."""
 
+    def shown(row: Mapping[str, Any]) -> str | None:
+        known = (row["check"] or {}).get("chances")
+        return None if known is None else _percent(known[key])
 
-def _checked(number: Callable[[Explanation], float], form: str) -> Callable[[Side], str]:
-    return lambda side: NOTHING if side.explained is None else _shown(number(side.explained), form)
+    return shown
 
 
 def _percent(chance: float) -> str:
     return f"{100 * chance:.2f}" if chance >= LEAST_CHANCE else "below 0.01"
 
 
-def _of_breakdown(values: Callable[[UncertaintyBreakdown], str]) -> Callable[[Side], str]:
-    def shown(side: Side) -> str:
-        breakdown = None if side.explained is None else side.explained.breakdown
-        return NOTHING if breakdown is None else values(breakdown)
-
-    return shown
+def _likeliest(row: Mapping[str, Any]) -> str | None:
+    breakdown = None if row["side"].explained is None else row["side"].explained.breakdown
+    name, chance = ("", 0.0) if breakdown is None else breakdown.likeliest
+    return f"{_percent(chance)}, {name}" if name else None
 
 
-def _of_window(number: Callable[[Window], float], form: str) -> Callable[[Side], str]:
-    def values(side: Side) -> str:
-        window = None if side.grid is None else side.grid.window
-        return NOTHING if window is None else _shown(number(window), form)
-
-    return values
-
-
-def _of_plan(number: Callable[[Plan], float], form: str) -> Callable[[Side], str]:
-    return lambda side: NOTHING if side.plan is None else _shown(number(side.plan), form)
+def _reach(row: Mapping[str, Any]) -> str | None:
+    if row["check"] is None:
+        return None
+    margin = f"yes, margin {number(row['check']['reach_margin'], 2)}"
+    return {None: "not computed", False: "no", True: margin}[row["check"]["reachable"]]
 
 
-def _angles(side: Side) -> str:
-    if side.plan is not None:
-        theta, beta = side.plan.theta, side.plan.beta
-    elif side.explained is not None:
-        theta, beta = side.explained.candidates.theta[0], side.explained.candidates.beta[0]
-    return f"{np.degrees(theta):.6g}, {np.degrees(beta):.6g}"
+def _least(row: Mapping[str, Any]) -> float | None:
+    explained = row["side"].explained
+    return None if explained is None else float(explained.candidates.least_clearance[0])
 
 
-def _verdict(side: Side) -> str:
-    if side.explained is None:
-        return "not checked"
-    return side.explained.candidates.safe_text if side.safe else side.explained.verdict
-
-
-def _rank(side: Side) -> str:
-    return NOTHING if side.grid is None or side.grid.rank is None else str(side.grid.rank)
-
-
-def _reach(side: Side) -> str:
-    if side.explained is None:
-        return NOTHING
-    arm = side.explained.candidates.arm
-    return {-1: "not computed", 0: "no", 1: f"yes, margin {arm.margin[0]:.2f}"}[int(arm.reachable[0])]
-
-
-def _likeliest(breakdown: UncertaintyBreakdown) -> str:
-    name, chance = breakdown.likeliest
-    return f"{_percent(chance)}, {name}" if name else NOTHING
-
-
-_ROWS: tuple[tuple[str, Callable[[Side], str]], ...] = (
-    ("chosen by", lambda side: side.title),
-    ("theta, beta, deg", _angles),
-    ("verdict", _verdict),
-    ("rank", _rank),
-    ("window", _of_window(lambda one: one.number, "{:g}")),
-    ("window's area, deg2", _of_window(lambda one: one.square_deg, "{:.0f}")),
-    ("its entry on the skin, cm2", _of_window(lambda one: one.entry_cm2, "{:.1f}")),
-    (
-        "safe cone, deg",
-        lambda side: NOTHING if side.grid is None else _shown(np.degrees(side.grid.safe_cone), "{:.1f}"),
-    ),
-    ("chance to hit, %", _of_breakdown(lambda breakdown: _percent(breakdown.p_hit))),
-    ("chance to touch anything, %", _of_breakdown(lambda breakdown: _percent(breakdown.p_touch_any))),
-    ("likeliest to be touched, %", _of_breakdown(_likeliest)),
-    ("expected tip error (rms), mm", _of_breakdown(lambda breakdown: f"{breakdown.budget.rms_mm:.2f}")),
-    ("path length, mm", _checked(lambda one: one.candidates.path.length[0], "{:.1f}")),
-    ("skin angle, deg", _checked(lambda one: np.degrees(one.candidates.path.skin_angle[0]), "{:.1f}")),
-    ("tissue crossed, mm", _checked(lambda one: one.candidates.path.tissue[0], "{:.1f}")),
-    ("arm reaches it", _reach),
-    ("standoff, mm", _of_plan(lambda plan: plan.standoff_mm, "{:.1f}")),
-    ("approach, s", _of_plan(lambda plan: float(plan.approach.times_s[-1]), "{:.1f}")),
-    ("insertion, s", _of_plan(lambda plan: float(plan.insertion.times_s[-1]), "{:.1f}")),
-    ("expected tip error in the plan, mm", _of_plan(lambda plan: plan.expected_target_error_mm, "{:.2f}")),
-    ("needle to the nearest, mm", _of_plan(lambda plan: plan.clearance_mm.get("needle", np.nan), "{:.2f}")),
-    ("arm on the approach, mm", _of_plan(lambda plan: plan.clearance_mm.get("approach", np.nan), "{:.2f}")),
-    ("arm on the insertion, mm", _of_plan(lambda plan: plan.clearance_mm.get("insertion", np.nan), "{:.2f}")),
-    ("least clearance, mm", _checked(lambda one: one.candidates.least_clearance[0], "{:.2f}")),
+FIELDS = (
+    Field("chosen by", "title"),
+    Field("theta, beta, deg", _angles),
+    Field("verdict", _verdict),
+    Field("rank", "search.rank"),
+    Field("window", "search.window"),
+    Field("window's area, deg2", "search.window_square_deg", 0),
+    Field("its entry on the skin, cm2", "search.window_entry_cm2", 1),
+    Field("safe cone", "search.safe_cone_deg", 1, "deg"),
+    Field("chance to hit, %", _chance("p_hit")),
+    Field("chance to touch anything, %", _chance("p_touch_any")),
+    Field("likeliest to be touched, %", _likeliest),
+    Field("expected tip error (rms)", "check.chances.expected_rms_mm", 2, "mm"),
+    Field("path length", "check.path_length_mm", 1, "mm"),
+    Field("skin angle", "check.skin_angle_deg", 1, "deg"),
+    Field("tissue crossed", "check.tissue_mm", 1, "mm"),
+    Field("arm reaches it", _reach),
+    Field("standoff", "plan.standoff_mm", 1, "mm"),
+    Field("approach", "plan.approach_s", 1, "s"),
+    Field("insertion", "plan.insertion_s", 1, "s"),
+    Field("expected tip error in the plan", "plan.expected_target_error_mm", 2, "mm"),
+    Field("needle to the nearest", "plan.clearance_mm.needle", 2, "mm"),
+    Field("arm on the approach", "plan.clearance_mm.approach", 2, "mm"),
+    Field("arm on the insertion", "plan.clearance_mm.insertion", 2, "mm"),
+    Field("least clearance", _least, 2, "mm"),
 )
 """What stands in each row; rows that neither side has are left out."""

@@ -5,18 +5,15 @@ A list of entries, or of targets, checked row by row: one row out for each row i
 
 from __future__ import annotations
 
-import csv
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
@@ -27,6 +24,8 @@ from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, finite
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.twin.jobs.patient.answers import explain_choice
+from puncture_twin.twin.jobs.patient.candidates_export import csv_text
+from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
 
 def lists_of(
@@ -38,13 +37,13 @@ def lists_of(
         InputError: Two lists, a list of directions beside a choice, a picture of a list, or a folder without a list.
     """
     if entries is not None and targets is not None:
-        raise InputError("two lists", where="--entries, --targets", allowed="one of them")
+        refuse("two lists", "--entries, --targets", "one of them", "conflicting_options")
     if entries is not None and choice != BEST:
-        raise InputError("a list of entries beside a choice", where="--entries", allowed="the list alone")
+        refuse("a list of entries beside a choice", "--entries", "the list alone", "conflicting_options")
     if (entries or targets) is not None and picture is not None:
-        raise InputError("a picture is of one candidate", where="--picture", allowed="check without a list")
+        refuse("a picture is of one candidate", "--picture", "check without a list", "conflicting_options")
     if (entries or targets) is None and out_dir is not None:
-        raise InputError("one candidate is printed, not written", where="--out", allowed="--entries or --targets")
+        refuse("one candidate is printed, not written", "--out", "--entries or --targets", "conflicting_options")
     return (entries or targets) is not None
 
 
@@ -150,16 +149,11 @@ class CheckedList:
 
     def text(self) -> str:
         """A line a row, then what kept those that are not safe."""
-        wide = max(4, *(len(row["name"]) for row in self.rows))
-        lines = [
-            f"case {self.case_name}: {len(self.rows)} rows, arm {self.arm}",
-            f"   row  {'name':{wide}s}  verdict    theta   beta  clearance   path  angle  nearest",
-            f"        {'':{wide}s}               deg    deg         mm     mm    deg",
-            *(_line(row, wide) for row in self.rows),
-        ]
-        kept = [f"  row {row['row']}: {_why(row)}" for row in self.rows if row["verdict"] != "safe"]
-        rest = [f"warning: {one}" for one in self.warnings] + [f"  {path}" for path in self.files]
-        return "\n".join([*lines, *kept, *rest])
+        kept = [f"row {row['row']}: {_why(row)}" for row in self.rows if row["verdict"] != "safe"]
+        head = Section(
+            f"case {self.case_name}: {len(self.rows)} rows, arm {self.arm}", [grid(FIELDS, self.rows), *kept]
+        )
+        return text([head, *footer(self.files, self.warnings)])
 
 
 def check_entries(context: CaseContext, listed: ReadList) -> CheckedList:
@@ -196,12 +190,16 @@ def check_targets(context: CaseContext, listed: ReadList, aimed: Callable[[Liste
 
 
 def write_checked(checked: CheckedList, context: CaseContext, out: Path) -> CheckedList:
-    """The same, with its rows as CSV and Parquet in a folder."""
+    """Write a checked list's rows as CSV and Parquet into a folder."""
     names, stages, note = (CSV, PARQUET), context.stages.seconds, context.watcher.note
     with writing(out, "check list", inputs=checked.inputs, seconds=stages, names=names, note=note) as draft:
         paths = (draft.folder / CSV, draft.folder / PARQUET)
-        _write_csv(checked.rows, paths[0])
+        rows = [[row[name] for name in COLUMNS] for row in checked.rows]
+        paths[0].write_text(csv_text(COLUMNS, rows), encoding="utf-8", newline="")
         run = {**context.provenance(), "inputs": inputs_document(checked.inputs)}
+        import pyarrow as pa  # here: it takes 0.05 s, and a single candidate needs none
+        import pyarrow.parquet as pq
+
         table = pa.table({name: pa.array([row[name] for row in checked.rows], _kind(name)) for name in COLUMNS})
         pq.write_table(table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)}), paths[1])
     return CheckedList(**{**vars(checked), "files": draft.final(paths)})
@@ -252,38 +250,25 @@ def _explained(explained: Explanation) -> dict[str, Any]:
     }
 
 
-def _kind(name: str) -> pa.DataType:
+def _kind(name: str) -> str:
     if name in TEXTS:
-        return pa.string()
+        return "string"
     if name == "reachable":
-        return pa.bool_()
-    return pa.int64() if name in WHOLE else pa.float64()
+        return "bool"
+    return "int64" if name in WHOLE else "float64"
 
 
-def _write_csv(rows: Iterable[dict[str, Any]], path: Path) -> None:
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows([_field(row[name]) for name in COLUMNS] for row in rows)
-
-
-def _field(value: Any) -> str:
-    if value is None:
-        return ""
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _line(row: dict[str, Any], wide: int) -> str:
-    angles, lengths = ("theta_deg", "beta_deg"), ("path_length_mm", "skin_angle_deg")
-    cells = [*(_number(row[name], 7, 1) for name in angles), _number(row["min_clearance_mm"], 11, 2)]
-    cells += [_number(row[name], 7, 1) for name in lengths]
-    crosses = "crosses " if (row["min_clearance_mm"] or 0) < 0 else ""
-    line = f"{row['row']:6d}  {row['name']:{wide}s}  {row['verdict']:8s} {''.join(cells)}  {crosses}{row['nearest']}"
-    return line.rstrip()
-
-
-def _number(value: float | None, width: int, digits: int) -> str:
-    return f"{'-':>{width}s}" if value is None else f"{value:{width}.{digits}f}"
+FIELDS = (
+    Field("row", "row"),
+    Field("name", "name"),
+    Field("verdict", "verdict"),
+    Field("theta", "theta_deg", 1, "deg"),
+    Field("beta", "beta_deg", 1, "deg"),
+    Field("clearance", "min_clearance_mm", 2, "mm"),
+    Field("path", "path_length_mm", 1, "mm"),
+    Field("angle", "skin_angle_deg", 1, "deg"),
+    Field("nearest", lambda row: "crosses " * ((row["min_clearance_mm"] or 0) < 0) + row["nearest"]),
+)
 
 
 def _why(row: dict[str, Any]) -> str:

@@ -221,7 +221,8 @@ def _inserted(context: CaseContext, tour: Tour, seed: int, registration: Registr
         truth, at_target = true_touches(context, tour, seed), true_at_target(context, seed)
         inserted = rehearse_touched(context, plan, truth, at_target)
     for contact in inserted.contacts:
-        raise NoAnswerError(f"the arm stopped on its way to the target: {contact.link} touches {contact.body}")
+        what = f"the arm stopped on its way to the target: {contact.link} touches {contact.body}"
+        raise NoAnswerError(what, code="motion_touches")
     return inserted
 
 

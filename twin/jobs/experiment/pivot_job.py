@@ -8,13 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import PARAMETERS, check_recording, flange_pose
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, content_input, inputs_document
@@ -22,8 +22,8 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points import (
     MAX_FILE_BYTES,
     NamedPoints,
-    parse_coordinate,
     parse_joint_recording,
+    parse_triple,
     write_points,
 )
 from puncture_twin.planning.search.context import CaseContext
@@ -32,8 +32,11 @@ from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, appr
 from puncture_twin.planning.touch.tour_motions import TouchTour
 from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, check_one_place, pivot_calibration
 from puncture_twin.twin.jobs.terminal import write_result
-from puncture_twin.twin.plant.true_needle import TouchTruth, draw_pivot_truth
-from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
+from puncture_twin.twin.report.present import Section, footer, text, vector
+
+if TYPE_CHECKING:  # a list is read where the simulator is not installed
+    from puncture_twin.twin.plant.true_needle import TouchTruth
+    from puncture_twin.twin.rehearsal.touching import Touched
 
 STANDS_OUT = 2.0
 """A touch that misses by so many times the others' root mean square is named."""
@@ -80,7 +83,7 @@ def refuse_of_twin(*options: object) -> None:
         InputError: One of them is stated.
     """
     if any(option is not None for option in options):
-        raise InputError("touches that were read", where="pivot", allowed="JOINTS.csv alone, or the twin's options")
+        refuse("touches that were read", "pivot", "JOINTS.csv alone, or the twin's options", "conflicting_options")
 
 
 def pivot_case(case: Case, joints: Path) -> PivotRun:
@@ -109,7 +112,7 @@ def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> 
         InputError: As `pivot_case`.
     """
     if case.errors is None:
-        raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm")
+        refuse("no noise is declared", case.path, "[errors] touch_mm", "no_noise")
     model, tip_mm = case.robot.model, case.needle.length_mm
     poses = flange_pose(model, q)
     check_one_place(names, poses[:, :3, 3] + tip_mm * poses[:, :3, 2], poses[:, :3, :3], where=where)
@@ -119,19 +122,21 @@ def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> 
 
 def pivot_text(run: PivotRun) -> str:
     """For the terminal."""
-    pivot = run.pivot
+    return text(_pivot_said(run))
+
+
+def _pivot_said(run: PivotRun) -> list[Section]:
+    pivot, stated = run.pivot, run.case.needle.length_mm
     x, y, z = pivot.tip_flange
-    sd = np.sqrt(np.diag(pivot.cov_tip))
-    lines = [
-        f"tip in the flange frame: ({x:.3f}, {y:.3f}, {z:.3f}) mm, sd ({sd[0]:.3f}, {sd[1]:.3f}, {sd[2]:.3f}), "
-        f"from {len(run.names)} poses",
-        f"the case states {run.case.needle.length_mm:g} mm along z: {z - run.case.needle.length_mm:+.3f} mm, "
-        f"and {np.hypot(x, y):.3f} mm beside it",
+    tip, sd = vector(pivot.tip_flange, 3, "mm"), vector(np.sqrt(np.diag(pivot.cov_tip)), 3)
+    said = [
+        f"tip in the flange frame: {tip}, sd {sd}, from {len(run.names)} poses",
+        f"the case states {stated:g} mm along z: {z - stated:+.3f} mm, and {np.hypot(x, y):.3f} mm beside it",
         f"residual {pivot.residual_mm:.3f} mm rms; the declared touch noise leaves {pivot.expected_mm:.3f}, "
         f"with the declared arm {pivot.expected_whole_mm:.3f}",
         *_doubt(run),
     ]
-    return "\n".join(lines)
+    return [Section(one, []) for one in said]
 
 
 def _doubt(run: PivotRun) -> list[str]:
@@ -179,7 +184,7 @@ class PivotTourRun:
 
     @property
     def expected_error_mm(self) -> float:
-        """The same (rms) as declared."""
+        """Expected error of the tip on the flange (rms), by the declared errors, mm."""
         return float(np.sqrt(np.trace(self.found.pivot.cov_tip)))
 
     def summary(self) -> dict[str, Any]:
@@ -203,12 +208,7 @@ def parse_place(text: str | None) -> Floats | None:
     Raises:
         InputError: Not three numbers.
     """
-    if text is None:
-        return None
-    numbers = [parse_coordinate(part.strip(), "--at") for part in text.split(",")]
-    if len(numbers) != 3:
-        raise InputError(f"{len(numbers)} numbers", where="--at", allowed="X,Y,Z in mm, in the robot's base frame")
-    return np.array(numbers)
+    return None if text is None else np.array(parse_triple(text, "--at", "X,Y,Z in mm, in the robot's base frame"))
 
 
 def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats | None, seed: int) -> PivotTourRun:
@@ -227,9 +227,9 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
     """
     case = context.case
     if not LEAST_POSES <= poses <= MOST_POSES:
-        raise InputError(f"{poses} poses", where="--poses", allowed=f"{LEAST_POSES} to {MOST_POSES}")
+        refuse(f"{poses} poses", "--poses", f"{LEAST_POSES} to {MOST_POSES}", "out_of_range")
     if case.errors is None:
-        raise InputError("no noise is declared", where=case.path, allowed="[errors] touch_mm")
+        refuse("no noise is declared", case.path, "[errors] touch_mm", "no_noise")
     with writing(out, "pivot", inputs=case.inputs, names=(PIVOT, SUMMARY), note=context.watcher.note) as draft:
         with context.stages.time("pivot plan"):
             count = partial(context.watcher.count, "motions")
@@ -248,6 +248,8 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
 
 
 def _truth(context: CaseContext, tour: TouchTour, seed: int) -> TouchTruth:
+    from puncture_twin.twin.plant.true_needle import draw_pivot_truth
+
     errors = context.case.truth_errors or context.case.errors
     assert errors is not None and context.reach is not None
     names = tuple(f"P{number + 1}" for number in range(len(tour.touches)))
@@ -255,28 +257,23 @@ def _truth(context: CaseContext, tour: TouchTour, seed: int) -> TouchTruth:
 
 
 def _executed(context: CaseContext, tour: TouchTour, truth: TouchTruth) -> Touched:
+    from puncture_twin.twin.rehearsal.touching import execute_touches
+
     checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
     with context.stages.time("touches"):
         touched = execute_touches(tour, context.case, context.anatomy, checkers, truth, count)
     if len(touched.readings) < LEAST_POSES:
         why = "; ".join(f"{name}: {reason}" for name, reason in touched.failed.items())
         poses = f"{len(touched.readings)} of {len(tour.touches)} poses were touched"
-        raise NoAnswerError(f"{poses}, {LEAST_POSES} are needed: {why}")
+        raise NoAnswerError(f"{poses}, {LEAST_POSES} are needed: {why}", code="too_few_poses")
     return touched
 
 
 def pivot_tour_text(run: PivotTourRun) -> str:
     """For the terminal."""
-    at = ", ".join(f"{mm:.0f}" for mm in run.place_base)
-    count, seconds = len(run.touched.readings), run.touched.seconds
-    x, y, z = run.true_tip_flange
-    return "\n".join(
-        [
-            f"{count} poses touched about ({at}) mm (base) in {seconds:.0f} s",
-            *(f"  {name:<12} not touched: {why}" for name, why in run.touched.failed.items()),
-            pivot_text(run.found),
-            f"the true tip (seed {run.seed}) is ({x:.3f}, {y:.3f}, {z:.3f}) mm: {run.error_mm:.3f} mm off, "
-            f"{run.expected_error_mm:.3f} expected (rms)",
-            *(f"wrote {path}" for path in run.files),
-        ]
-    )
+    at, count, seconds = vector(run.place_base, 0, "mm"), len(run.touched.readings), run.touched.seconds
+    failed = [f"{name} not touched: {why}" for name, why in run.touched.failed.items()]
+    off = f"{run.error_mm:.3f} mm off, {run.expected_error_mm:.3f} expected (rms)"
+    true = f"the true tip (seed {run.seed}) is {vector(run.true_tip_flange, 3, 'mm')}: {off}"
+    head = Section(f"{count} poses touched about {at} (base) in {seconds:.0f} s", failed)
+    return text([head, *_pivot_said(run.found), Section(true, []), *footer(run.files)])

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import FORMAT, read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
@@ -44,6 +44,7 @@ from puncture_twin.twin.plant.scanner.case_scene import (
 )
 from puncture_twin.twin.plant.scanner.image import CtImage, ScanSettings, scan_solids
 from puncture_twin.twin.plant.scanner.writers import write_nifti, write_series
+from puncture_twin.twin.report.present import Block, Field, Section, facts, grid, text
 
 SERIES = "dicom"
 CT, LABELS, CROSSED, FOUND, REPORT, PICTURE = (
@@ -80,7 +81,8 @@ def parse_marker(text: str) -> MarkerKind:
     for kind in get_args(MarkerKind):
         if text == kind:
             return kind
-    raise InputError(f"marker '{text[:40]}' is not known", where="--marker", allowed=", ".join(get_args(MarkerKind)))
+    what = f"marker '{text[:40]}' is not known"
+    raise InputError(what, where="--marker", allowed=", ".join(get_args(MarkerKind)), code="unknown_choice")
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,8 +218,8 @@ def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
 def _refuse_two_beds(context: CaseContext, request: ScanRequest) -> None:
     own = [one.name for one in context.case.obstacles if one.frame == "ct"]
     if own and request.beside is not None and request.beside.bed != "none":
-        what = f"the case has what stands in the scanner: {', '.join(own)}"
-        raise InputError(what, where="--bed", allowed="none, or a case without obstacles in the frame ct")
+        allowed = "none, or a case without obstacles in the frame ct"
+        refuse(f"the case has what stands in the scanner: {', '.join(own)}", "--bed", allowed, "two_beds")
 
 
 def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volume) -> tuple[Floats, Floats]:
@@ -228,7 +230,7 @@ def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volu
         return scene.target, find_needle(volume, scene.target).tip_ct
     mask = image.labels[solid.layer] == solid.label
     if not mask.any():
-        raise InputError(f"'{name}' is not in the image", where="scan", allowed="a field of view that shows the target")
+        refuse(f"'{name}' is not in the image", "scan", "a field of view that shows the target", "outside_image")
     return middle_of(solid.mesh.triangles), read_lesion(volume, mask)
 
 
@@ -300,73 +302,65 @@ def _identity(run: ScanRun) -> str:
 
 def scan_text(run: ScanRun) -> str:
     """Errors in mm along x, y, z of the scan (left, back, head)."""
-    facts = run.summary()
-    settings, shape = facts["settings"], " x ".join(map(str, facts["voxels"]))
+    found, folder = run.summary(), run.files[-1].parent
+    settings, shape = found["settings"], " x ".join(map(str, found["voxels"]))
+    target = ",".join(f"{one:.2f}" for one in found["target_mm"])
     pixel, spacing = settings["pixel_mm"], settings["spacing_mm"]
-    folder = run.files[-1].parent
-    target = ",".join(f"{one:.2f}" for one in facts["target_mm"])
-    return "\n".join(
-        [
-            f"{folder}",
-            f"  scan           {shape} voxels of {pixel:g} x {pixel:g} x {spacing:g} mm, noise "
-            f"{settings['noise_hu']:g} HU, seed {settings['seed']}",
-            *_marker_lines(facts),
-            f"  {'lesion':<15}{_vector(facts['lesion']['error_mm'])}   read against true",
-            *_needle_lines(facts["needle"]),
-            *_beside_lines(facts["beside"]),
-            *_thin_lines(facts["thin_voxels"]),
-            f"next: run-twin init {folder} --ct {SERIES} --target={target}",
-        ]
+    beside = ", ".join(
+        one["name"] for one in found["beside"] if one["place"] != "within" and not one["name"].endswith(INSIDE)
     )
+    thin = ", ".join(f"{name} ({count})" for name, count in found["thin_voxels"].items())
+    rows = [
+        ("scan", f"{shape} voxels of {pixel:g} x {pixel:g} x {spacing:g} mm, noise {settings['noise_hu']:g} HU, seed "
+                 f"{settings['seed']}"),
+        *([] if found["markers"] else [("markers", "none")]),
+        ("lesion", f"{_vector(found['lesion']['error_mm'])}   read against true"),
+        *_needle_rows(found["needle"]),
+        *([("beside", f"{beside}: surfaces in beside/")] if beside else []),
+        *([("thin", f"parts thinner than a voxel have whole voxels of the labels: {thin}")] if thin else []),
+    ]  # fmt: skip
+    return text([
+        Section(str(folder), [facts(rows), *_marker_blocks(found)]),
+        Section(f"next: run-twin init {folder} --ct {SERIES} --target={target}", []),
+    ])  # fmt: skip
 
 
-def _marker_lines(facts: dict[str, Any]) -> list[str]:
-    if not facts["markers"]:
-        return ["  markers        none"]
-    lines = ["  errors, mm     slice and millimetre     middle of the metal"]
-    lines += [
-        f"  {one['name']:<15}{_vector(one['rule_error_mm'])}    {_vector(one['error_mm'])}" for one in facts["markers"]
-    ]
-    theory = facts["theory_mm"]
-    rms = [np.sqrt(np.mean(np.square([one[key] for one in facts["markers"]]), axis=0)) for key in _KEYS]
-    expected = f"{theory['rule_in_plane']:.2f} in the plane, {theory['rule_along_bed']:.2f} along the bed"
-    return [
-        *lines,
-        f"  {'rms':<15}{_vector(rms[0])}    {_vector(rms[1])}",
-        f"  standard dev.  {expected}; the middle of the metal is held to {theory['middle_along_bed']:.2f} there",
-    ]
+def _marker_blocks(found: dict[str, Any]) -> list[Block]:
+    markers, theory = found["markers"], found["theory_mm"]
+    if not markers:
+        return []
+    rms = {key: np.sqrt(np.mean(np.square([one[key] for one in markers]), axis=0)).tolist() for key in _KEYS}
+    fields = (
+        Field("errors, mm", "name"),
+        Field("slice and millimetre", lambda one: _vector(one["rule_error_mm"])),
+        Field("middle of the metal", lambda one: _vector(one["error_mm"])),
+    )
+    expected = (
+        "standard dev.  {rule_in_plane:.2f} in the plane, {rule_along_bed:.2f} along the bed; the middle of the metal"
+    )
+    held = " is held to {middle_along_bed:.2f} there"
+    return [grid(fields, [*markers, {"name": "rms", **rms}]), (expected + held).format(**theory)]
 
 
 _KEYS = ("rule_error_mm", "error_mm")
 
 
-def _needle_lines(needle: dict[str, Any] | None) -> list[str]:
+def _needle_rows(needle: dict[str, Any] | None) -> list[tuple[str, str]]:
     if needle is None:
         return []
-    found, true = needle["found"], needle["true"]
-    if found is None:
-        return [f"  needle         not read: {needle['why_not']}"]
+    if needle["found"] is None:
+        return [("needle", f"not read: {needle['why_not']}")]
+    said = "tip {tip_to_target_mm:.2f} mm from the target ({lateral_mm:.2f} across, {depth_mm:+.2f} along)"
+    off = "{tip_reading_error_mm:.2f} mm and {angle_reading_error_deg:.2f}°".format(**needle)
     return [
-        f"  needle         tip {found['tip_to_target_mm']:.2f} mm from the target in the control CT "
-        f"({found['lateral_mm']:.2f} across, {found['depth_mm']:+.2f} along)",
-        f"                 truly {true['tip_to_target_mm']:.2f} ({true['lateral_mm']:.2f}, {true['depth_mm']:+.2f}), "
-        "so that the "
-        f"tip was read {needle['tip_reading_error_mm']:.2f} mm and {needle['angle_reading_error_deg']:.2f}° off",
+        ("needle, in the control CT", said.format(**needle["found"])),
+        ("truly", said.format(**needle["true"])),
+        ("so that it was read off by", off),
     ]
-
-
-def _beside_lines(parts: list[dict[str, Any]]) -> list[str]:
-    shown = ", ".join(one["name"] for one in parts if one["place"] != "within" and not one["name"].endswith(INSIDE))
-    return [f"  beside         {shown}: surfaces in beside/"] if shown else []
 
 
 INSIDE = ("_core", "_foam")
 """Ends of the names of what fills a line or a bed."""
-
-
-def _thin_lines(thin: dict[str, int]) -> list[str]:
-    parts = ", ".join(f"{name} ({count})" for name, count in thin.items())
-    return [f"  thin           parts thinner than a voxel have whole voxels of the labels: {parts}"] if thin else []
 
 
 def _vector(numbers: list[float]) -> str:
@@ -384,17 +378,12 @@ LIST = "manifest.json"
 def parse_beside(arms: str, bed: str, lines: int) -> OutsideObjects | None:
     """What shall lie beside the patient; None for nothing.
 
-    Args:
-        arms: One of `Arms`.
-        bed: One of `Bed`.
-        lines: How many.
-
     Raises:
         InputError: A word that is not known.
     """
     for option, word, known in (("--arms", arms, get_args(Arms)), ("--bed", bed, get_args(Bed))):
         if word not in known:
-            raise InputError(f"'{word[:40]}' is not known", where=option, allowed=", ".join(known))
+            refuse(f"'{word[:40]}' is not known", option, ", ".join(known), "unknown_choice")
     wanted = OutsideObjects(
         next(k for k in get_args(Arms) if k == arms), next(k for k in get_args(Bed) if k == bed), lines
     )

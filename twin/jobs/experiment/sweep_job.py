@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.formats.points import parse_coordinate
@@ -20,6 +20,7 @@ from puncture_twin.planning.sweep.sweep_planner import SweepPlan, plan_sweep
 from puncture_twin.twin.jobs.patient.main_job import is_plan
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.rehearsal.rehearsal import Swept, execute_sweep
+from puncture_twin.twin.report.present import Section, footer, text
 
 SWEEP = "sweep.json"
 
@@ -111,9 +112,9 @@ def sweep_end(source: Path, to: str | None, *, sweep: bool, alone: bool) -> Angl
         InputError: No sweep, or none of one case.
     """
     if not sweep:
-        raise InputError("a sweep ends there", where="--to", allowed="--sweep --to THETA,BETA")
+        refuse("a sweep ends there", "--to", "--sweep --to THETA,BETA", "conflicting_options")
     if is_plan(source) or not alone:
-        raise InputError("a sweep is of one case", where="--sweep", allowed="a case, no plan, no --seeds")
+        refuse("a sweep is of one case", "--sweep", "a case, no plan, no --seeds", "conflicting_options")
     return parse_angles(to)
 
 
@@ -127,7 +128,7 @@ def parse_angles(text: str | None) -> Angles | None:
         return None
     numbers = [parse_coordinate(part.strip(), "--to") for part in text.split(",")]
     if len(numbers) != 2 or not (0 <= numbers[0] <= 180 and 0 <= numbers[1] <= 360):
-        raise InputError(f"'{text[:40]}'", where="--to", allowed="THETA,BETA in degrees, 0 to 180 and 0 to 360")
+        refuse(f"'{text[:40]}'", "--to", "THETA,BETA in degrees, 0 to 180 and 0 to 360", "not_a_number")
     return float(np.radians(numbers[0])), float(np.radians(numbers[1]))
 
 
@@ -145,7 +146,7 @@ def _ends(context: CaseContext, choice: Choice, to: Angles | None) -> tuple[Angl
     windows = find_windows(found)
     near = int(np.argmax(found.outward_ct @ chosen.candidates.outward_ct[row]))
     if not windows.of_row[near]:
-        raise InputError("the direction lies in no window of the grid", where="--sweep", allowed="--to THETA,BETA")
+        refuse("the direction lies in no window of the grid", "--sweep", "--to THETA,BETA", "no_window")
     rows = windows.rows(int(windows.of_row[near]))
     far = int(rows[np.argmin(found.outward_ct[rows] @ found.outward_ct[near])])
     return start, (float(found.theta[far]), float(found.beta[far]))
@@ -154,14 +155,11 @@ def _ends(context: CaseContext, choice: Choice, to: Angles | None) -> tuple[Angl
 def sweep_text(run: SweepRun) -> str:
     """For the terminal."""
     plan, off = run.plan, run.swept.off_mm
-    angles = ["theta {:.1f}, beta {:.1f}".format(*np.degrees(one)) for one in (plan.angles[0], plan.angles[-1])]
-    lines = [
-        f"swept from {angles[0]} to {angles[1]} deg in {plan.sweep.duration_s:.1f} s, "
-        f"the tip {plan.standoff_mm:.0f} mm from the target",
-        f"virtual TCP off its point: {off.mean():.4f} mm on average, {off.max():.4f} mm at most ({run.control})",
-    ]
-    if plan.stopped:
-        headed = "theta {:.1f}, beta {:.1f}".format(*np.degrees(plan.wanted))
-        lines.append(f"stopped there, on the way to {headed} deg: {plan.stopped}")
-    lines += [f"{link} touches {body}" for link, body in run.swept.contacts]
-    return "\n".join([*lines, *(f"wrote {path}" for path in run.files)])
+    start, end, wanted = (
+        "theta {:.1f}, beta {:.1f}".format(*np.degrees(one)) for one in (plan.angles[0], plan.angles[-1], plan.wanted)
+    )
+    seconds = f"in {plan.sweep.duration_s:.1f} s, the tip {plan.standoff_mm:.0f} mm from the target"
+    tcp = f"virtual TCP off its point: {off.mean():.4f} mm on average, {off.max():.4f} mm at most ({run.control})"
+    stopped = [f"stopped there, on the way to {wanted} deg: {plan.stopped}"] if plan.stopped else []
+    touched = (f"{link} touches {body}" for link, body in run.swept.contacts)
+    return text([Section(f"swept from {start} to {end} deg {seconds}", [tcp, *stopped, *touched]), *footer(run.files)])

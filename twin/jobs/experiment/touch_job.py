@@ -39,6 +39,7 @@ from puncture_twin.twin.plant.true_needle import (
 )
 from puncture_twin.twin.rehearsal.distribution import misregistered
 from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
+from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
 TOUCH, SUMMARY = "touch.csv", "touch.json"
 
@@ -59,12 +60,12 @@ class Use(NamedTuple):
             "expected_tip_error_mm": self.expected_mm,
             "tip_error_mm": self.tip_error_mm,
             "fre_mm": self.registration.fre_mm,
-            "flags": list(self.registration.flags),
+            "flags": [flag.sentence for flag in self.registration.flags],
         }
 
 
 def _no_use(why: str) -> dict[str, Any]:
-    """The same of readings that register nothing."""
+    """The use of readings that register nothing, with the reason."""
     return {"why_not": why, "expected_tip_error_mm": None, "tip_error_mm": None, "fre_mm": None, "flags": []}
 
 
@@ -217,7 +218,8 @@ def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
         chosen = choose(context, found, choice)
     rows = [row for row in chosen.rows if np.isfinite(chosen.candidates.arm.q_insertion[row]).all()]
     if not rows:
-        raise NoAnswerError("the arm reaches no such candidate: nothing to touch the markers for")
+        what = "the arm reaches no such candidate: nothing to touch the markers for"
+        raise NoAnswerError(what, code="no_safe_direction")
     return chosen.candidates.arm.q_insertion[rows[0]], chosen.candidates.outward_ct[rows[0]]
 
 
@@ -267,34 +269,35 @@ def _true_errors(context: CaseContext) -> ErrorModel:
     return errors
 
 
+TOUCHED = (
+    Field("marker", lambda one: one.name),
+    Field("took", lambda one: one.seconds, 1, "s"),
+    Field("felt, deep", lambda one: one.bias_mm, 3, "mm"),
+    Field("at", lambda one: one.speed_mm_s, 1, "mm/s"),
+    Field("at most", lambda one: one.force_n, 2, "N"),
+    Field("line moved at the standoff", lambda one: one.aside_mm, 1, "mm"),
+)
+
+
 def touch_text(run: TouchRun) -> str:
     """For the terminal."""
     plan, touched = run.plan, run.touched
     each = f", {_per_touch(touched):.1f} s each" if touched.readings else ""
-    every = len(touched.readings) + len(touched.failed)
-    of = f" of {every}" if touched.failed else ""
-    lines = [f"{len(touched.readings)}{of} markers touched in {touched.seconds:.0f} s{each}"]
-    lines += [
-        f"  {one.name:<12} {one.seconds:5.1f} s  felt {one.bias_mm:.3f} mm deep at {one.speed_mm_s:.1f} mm/s, "
-        f"{one.force_n:.2f} N at most; line moved {one.aside_mm:.1f} mm at the standoff"
-        for one in touched.readings
-    ]
-    lines += [f"  {name:<12} not touched: {why}" for name, why in (*plan.left_out.items(), *touched.failed.items())]
-    return "\n".join([*lines, *_use_lines(run), *(f"wrote {path}" for path in run.files)])
+    of = f" of {len(touched.readings) + len(touched.failed)}" if touched.failed else ""
+    left = (f"{name} not touched: {why}" for name, why in (*plan.left_out.items(), *touched.failed.items()))
+    head = f"{len(touched.readings)}{of} markers touched in {touched.seconds:.0f} s{each}"
+    return text([Section(head, [grid(TOUCHED, touched.readings), *left]), *_use_said(run), *footer(run.files)])
 
 
-def _use_lines(run: TouchRun) -> list[str]:
+def _use_said(run: TouchRun) -> list[Section]:
     plan, use = run.plan, run.use
     if isinstance(use, str):
-        return [f"no registration: {use}"]
+        return [Section(f"no registration: {use}", [])]
     failed = ", ".join(run.touched.failed)
     without = f" without {failed}, {plan.expected_mm:.2f} with" if failed else ""
-    worst = f"of the worst poses {plan.worst_mm:.2f} mm"
-    return [
-        f"expected tip error: {use.expected_mm:.2f} mm rms{without}; {worst}",
-        f"error of this truth (seed {run.seed}): {use.tip_error_mm:.2f} mm; FRE {use.registration.fre_mm:.2f} mm",
-        *(f"  {flag}" for flag in use.registration.flags),
-    ]
+    expected = f"expected tip error: {use.expected_mm:.2f} mm rms{without}; of the worst poses {plan.worst_mm:.2f} mm"
+    truth = f"error of this truth (seed {run.seed}): {use.tip_error_mm:.2f} mm; FRE {use.registration.fre_mm:.2f} mm"
+    return [Section(expected, []), Section(truth, [flag.sentence for flag in use.registration.flags])]
 
 
 def _per_touch(touched: Touched) -> float | None:

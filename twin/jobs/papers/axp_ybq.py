@@ -9,7 +9,7 @@ Every error is the root mean square over 200 held-out exact poses and all runs.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -26,6 +26,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, P
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
 from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, SimulatedTruth, simulate_recording
+from puncture_twin.twin.report.present import Field, Section, grid, text
 
 SEED = 20230816
 RUNS = 200
@@ -247,31 +248,30 @@ class _Rms(NamedTuple):
 
 
 def _rms(one: Callable[[np.random.Generator], list[float]], runs: int, key: int) -> _Rms:
-    """Over the runs."""
     squared = np.array([one(np.random.default_rng([SEED, key, k])) for k in range(runs)])
     return _Rms(np.sqrt(np.mean(squared, axis=0)).tolist(), [widened(column) for column in squared.T])
 
 
-def reproduction_text(result: AxpYbqTables) -> str:
+FIELDS = (
+    Field("what", "what"),
+    Field("spec", lambda row: row["known"] and f"{row['known']:.3g}"),
+    Field("ours", lambda row: f"{row['ours']:.3g}"),
+    Field("limit", lambda row: row["limit"] and f"{row['limit']:.3g}"),
+    Field("unit", "unit"),
+    Field("", lambda row: "" if row["holds"] else "DOES NOT HOLD"),
+)
+
+
+def reproduction_text(found: Mapping[str, Any]) -> str:
     """For a person: the specified numbers beside ours."""
-    lines = [f"compared with {COMPARED_WITH}", ""]
-    lines.append(f"{'what':64s} {'spec':>8s} {'ours':>10s} {'limit':>8s}  unit")
-    for row in result.rows:
-        known, limit = ("-" if value is None else f"{value:.3g}" for value in (row.known, row.limit))
-        mark = "" if row.passed else "  DOES NOT HOLD"
-        lines.append(f"{row.what:64.64s} {known:>8s} {row.ours:10.3g} {limit:>8s}  {row.unit}{mark}")
-    verdict = "every limit holds" if result.passed else "NOT every limit holds"
-    wider = (
-        "" if result.runs >= RUNS else f"; the limits are those of {RUNS} runs, widened by what chance adds in so few"
-    )
-    return "\n".join([*lines, "", f"{result.runs} runs per row, seed {result.seed}: {verdict}{wider}"])
+    verdict = "every limit holds" if found["holds"] else "NOT every limit holds"
+    wider = f"; the limits are those of {RUNS} runs, widened by what chance adds in so few"
+    ending = f"{found['runs']} runs per row, seed {found['seed']}: {verdict}{'' if found['runs'] >= RUNS else wider}"
+    return text([Section(f"compared with {COMPARED_WITH}", [grid(FIELDS, found["rows"])]), Section(ending, [])])
 
 
 def reproduction_summary(result: AxpYbqTables) -> dict[str, Any]:
-    """The same as plain values."""
-    rows = [
-        {"what": r.what, "known": r.known, "ours": r.ours, "limit": r.limit, "unit": r.unit, "holds": r.passed}
-        for r in result.rows
-    ]
+    """The specified numbers beside ours as plain values, for ``--json``."""
+    rows = [{**asdict(row), "holds": row.passed} for row in result.rows]
     answer = {"rows": rows, "runs": result.runs, "seed": result.seed, "holds": result.passed}
     return {"compared_with": COMPARED_WITH, **answer}

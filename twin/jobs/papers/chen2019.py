@@ -19,6 +19,7 @@ from puncture_twin.planning.case.entry import needle_pose, outward
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_affine, fit_triad
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2, TABLE_4, Point
+from puncture_twin.twin.report.present import Field, Section, grid, text
 
 TOLERANCE_MM = 0.01
 """The paper prints two decimals; so much may rounding its inputs and outputs differ."""
@@ -182,24 +183,26 @@ def _triple(point: Floats) -> Point:
     return x, y, z
 
 
-def reproduction_text(result: Chen2019Tables) -> str:
+FIELDS = (
+    Field("table", "table"),
+    Field("what", "what"),
+    Field("paper, mm", lambda row: "  ".join(f"{mm:.2f}" for mm in row["paper_mm"])),
+    Field("ours, mm", lambda row: "  ".join(f"{mm:.2f}" for mm in row["ours_mm"])),
+    Field(
+        "differs", lambda row: max(abs(a - b) for a, b in zip(row["paper_mm"], row["ours_mm"], strict=True)), 4, "mm"
+    ),
+    Field("", lambda row: "" if row["holds"] else "DOES NOT HOLD"),
+)
+
+
+def reproduction_text(found: Mapping[str, Any]) -> str:
     """The paper's numbers beside ours."""
-    lines = [
-        "table  what                                    paper                       ours                   differs"
-    ]
-    for row in result.rows:
-        paper, ours = (" ".join(f"{x:8.2f}" for x in values) for values in (row.paper, row.ours))
-        mark = "" if row.passed else "  DOES NOT HOLD"
-        lines.append(f"{row.table:5s}  {row.what:36.36s} {paper:>27s} {ours:>27s} {row.difference_mm:8.4f}{mark}")
-    reach = result.reach
-    lines += [
-        "",
-        f"The worked pose puts the flange {reach.flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, "
-        f"whose links span {reach.longest_span_mm:.1f} mm at most: "
-        + ("it is out of reach." if reach.out_of_reach else "it is within reach."),
-        "every number holds" if result.passed else "NOT every number holds",
-    ]
-    return "\n".join(lines)
+    reach = (
+        "the worked pose puts the flange {flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, whose links span "
+        "{longest_span_mm:.1f} mm at most: it is "
+    ).format(**found) + ("out of reach" if found["out_of_reach"] else "within reach")
+    verdict = "every number holds" if found["holds"] else "NOT every number holds"
+    return text([Section("Chen et al. 2019, and ours", [grid(FIELDS, found["rows"]), reach]), Section(verdict, [])])
 
 
 def reproduction_summary(result: Chen2019Tables) -> dict[str, Any]:

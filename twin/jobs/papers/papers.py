@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.twin.experiment.chen2019 import (
     AS_FOUND,
@@ -27,6 +27,7 @@ from puncture_twin.twin.experiment.chen2019 import (
 from puncture_twin.twin.jobs.papers import axp_ybq, chen2019
 from puncture_twin.twin.jobs.papers.chen2019 import reproduction_summary, reproduction_text
 from puncture_twin.twin.jobs.servo.job import reproduce_paper
+from puncture_twin.twin.report.present import Field, Section, Table, grid, text
 
 DRAWS, SEED = 1000, 2019
 
@@ -90,37 +91,43 @@ def _declaration(one: Experiment) -> dict[str, Any]:
 
 def experiment_text(report: ExperimentReport) -> str:
     """The finding first, then the numbers behind it."""
-    stated, found = report.stated, report.found
-    lines = [
-        f"the experiment of Chen 2019, drawn {stated.draws} times under two declarations (seed {report.seed})",
-        f"  {_declared(stated)}",
-        f"  {_declared(found)}",
-        "",
-        f"{'number of the paper':40s} {'paper':>7s}   percentile of it: {'stated':>8s} {'found':>8s}",
-    ]
-    lines += [_row(one, other) for one, other in zip(stated.printed, found.printed, strict=True)]
-    lines += ["", "all points of both setups together, squares in mm^2 (x lies along the bed):"]
-    lines += [_joint_row(one, other) for one, other in zip(stated.joint, found.joint, strict=True)]
-    share = report.strains["y against z"]
-    others = max(value for name, value in report.strains.items() if name != "y against z")
-    lines += [
-        "",
+    stated, found, strains = report.stated, report.found, report.strains
+    others = max(value for name, value in strains.items() if name != "y against z")
+    verdicts = [
         f"stated: p {stated.probability:.1g}, {'REJECTED' if stated.rejected else 'not rejected'} "
         f"(below {REJECTED:g}): slices of 5 mm cannot leave their least residuals along the bed.",
         f"found: p {found.probability:.2g}; every number within its range: {'yes' if found.agrees else 'NO'} "
         "(found from these very points: no proof, but nothing speaks against it)",
-        f"a skew of the CT's y against z alone takes {100 * share:.0f} % of the squares, no other strain more than "
-        f"{100 * others:.0f} %",
-        f"under the stated errors some strain takes as much in {100 * stated.best_strain:.1f} % of draws",
-        f"from the markers of setup 2 alone, no lesion among them, it is {np.degrees(report.skew.angle):.2f} degrees; "
-        "taken off the readings, the lesions are missed by",
+        f"a skew of the CT's y against z alone takes {100 * strains['y against z']:.0f} % of the squares, no other "
+        f"strain more than {100 * others:.0f} %; under the stated errors some strain takes as much in "
+        f"{100 * stated.best_strain:.1f} % of draws",
     ]
-    lines += [f"  {one.name:24s} {one.as_read:5.2f} -> {one.square:5.2f} mm" for one in report.skew.lesions]
-    lines.append(
-        "its cause is open: a carton out of square, measuring lines that are not, a bias of touches at its sides"
+    skew = (
+        f"from the markers of setup 2 alone, no lesion among them, it is {np.degrees(report.skew.angle):.2f} degrees; "
+        "taken off the readings, the lesions are missed by"
     )
-    lines.append("'about 40 % more efficient' counts touches (3 instead of 5); no time is printed to measure it by")
-    return "\n".join(lines)
+    open_ = "its cause is open: a carton out of square, measuring lines that are not, a bias of touches at its sides"
+    touches = "'about 40 % more efficient' counts touches (3 instead of 5); no time is printed to measure it by"
+    title = f"the experiment of Chen 2019, drawn {stated.draws} times under two declarations (seed {report.seed})"
+    return text([
+        Section(title, [_declared(stated), _declared(found)]),
+        Section("percentile of the paper's number among the drawn ones", [_ranks(stated.printed, found.printed)]),
+        Section("all points of both setups together, squares in mm^2 (x lies along the bed)",
+                [_ranks(stated.joint, found.joint), *verdicts]),
+        Section(skew, [f"{one.name}: {one.as_read:.2f} -> {one.square:.2f} mm" for one in report.skew.lesions]),
+        Section(open_, []), Section(touches, []),
+    ])  # fmt: skip
+
+
+def _ranks(stated: Sequence[DrawnRank], found: Sequence[DrawnRank]) -> Table:
+    """The statistic's size depends on the declaration for chi-squared alone."""
+    fields = (
+        Field("number of the paper", lambda two: two[0].name),
+        Field("paper", lambda two: " and ".join(dict.fromkeys(f"{one.paper:.2f}" for one in two))),
+        Field("stated", lambda two: two[0].percentile, 1),
+        Field("found", lambda two: two[1].percentile, 1),
+    )
+    return grid(fields, zip(stated, found, strict=True))
 
 
 def _declared(one: Experiment) -> str:
@@ -132,16 +139,6 @@ def _declared(one: Experiment) -> str:
         f"touches {d.touch_mm:g} mm",
     ]
     return f"{d.name}: {', '.join(part for part in parts if part)}"
-
-
-def _row(stated: DrawnRank, found: DrawnRank) -> str:
-    return f"{stated.name:40s} {stated.paper:7.2f} {'':19s} {stated.percentile:8.1f} {found.percentile:8.1f}"
-
-
-def _joint_row(stated: DrawnRank, found: DrawnRank) -> str:
-    """The statistic's size depends on the declaration for chi-squared alone."""
-    paper = f"{stated.paper:.1f}" if stated.paper == found.paper else f"{stated.paper:.0f} and {found.paper:.1f}"
-    return f"{stated.name:40s} {paper:>12s} {'':14s} {stated.percentile:8.1f} {found.percentile:8.1f}"
 
 
 class PaperResult(NamedTuple):
@@ -162,7 +159,8 @@ Reproduce = Callable[[Path, int | None], PaperResult]
 def _chen2019(out_dir: Path, seeds: int | None) -> PaperResult:
     del out_dir, seeds  # arithmetic on printed tables: nothing is drawn, in either sense
     result = chen2019.reproduce()
-    return PaperResult(result.passed, reproduction_summary(result), reproduction_text(result))
+    summary = reproduction_summary(result)
+    return PaperResult(result.passed, summary, reproduction_text(summary))
 
 
 def chen2019_experiment(out_dir: Path, draws: int | None, runs: int, watcher: Watcher) -> PaperResult:
@@ -192,11 +190,11 @@ def reproduced(
         InputError: A paper that is not known, or has no such experiment; a folder that cannot be written to.
     """
     if paper not in PAPERS:
-        raise InputError(f"paper '{paper}' is not known", where="reproduce", allowed=", ".join(PAPERS))
+        refuse(f"paper '{paper}' is not known", "reproduce", ", ".join(PAPERS), "unknown_choice")
     if experiment and paper != "chen2019":
-        raise InputError(f"{paper} has no such experiment", where="--experiment", allowed="reproduce chen2019")
+        refuse(f"{paper} has no such experiment", "--experiment", "reproduce chen2019", "unknown_choice")
     if runs and not experiment:
-        raise InputError("--runs are of the experiment", where="--runs", allowed="reproduce chen2019 --experiment")
+        refuse("--runs are of the experiment", "--runs", "reproduce chen2019 --experiment", "conflicting_options")
     return chen2019_experiment(out_dir, seeds, runs, watcher) if experiment else PAPERS[paper](out_dir, seeds)
 
 
@@ -206,7 +204,8 @@ SETUP_2 = "carton/case_m_setup2.toml"
 
 def _axp_ybq(out_dir: Path, seeds: int | None) -> PaperResult:
     result = axp_ybq.reproduce(out_dir, seeds)
-    return PaperResult(result.passed, axp_ybq.reproduction_summary(result), axp_ybq.reproduction_text(result))
+    summary = axp_ybq.reproduction_summary(result)
+    return PaperResult(result.passed, summary, axp_ybq.reproduction_text(summary))
 
 
 def _liu2007(out_dir: Path, seeds: int | None) -> PaperResult:

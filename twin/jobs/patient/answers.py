@@ -14,7 +14,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import load_anatomy, load_skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError, InputListError
+from puncture_twin.planning.base.errors import InputListError, Severity, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import Input, inputs_document
@@ -22,7 +22,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
-from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_coordinate, parse_points
+from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_points, parse_triple
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
@@ -30,9 +30,9 @@ from puncture_twin.planning.registration.checks.places import touchable_points
 from puncture_twin.planning.registration.fits import ReadingNoise, rigid_fre_mm
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.method import LEAST_FOUND_MM
-from puncture_twin.planning.registration.noise_test import INTERVAL
 from puncture_twin.planning.registration.placement import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.registration import Registration, register
+from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, choose, chosen_angles, refuse_other_entry, with_file_read
 from puncture_twin.planning.search.context import CaseContext
@@ -40,6 +40,8 @@ from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.twin.jobs.patient.budget import budget_facts, correction_facts
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
+from puncture_twin.twin.report import patient
+from puncture_twin.twin.report.present import Section, text, vector
 
 
 def check_candidate(context: CaseContext, choice: Choice) -> Explanation:
@@ -80,7 +82,7 @@ def register_report(
     if markers_base is None:
         return registration_report(source)
     if target is None:
-        raise InputError("two lists of markers need a target", where="register", allowed="--target X,Y,Z in mm")
+        refuse("two lists of markers need a target", "register", "--target X,Y,Z in mm", "missing_option")
     return lists_report(source, markers_base, target, space, fle_mm)
 
 
@@ -95,8 +97,9 @@ def registration_report(path: Path) -> dict[str, Any]:
     if checked is None or checked.placement.registration is None:
         file = case.robot.transform
         what = "no [registration] with markers" if file is None else f"the base is placed by the transform {file}"
-        compared = () if checked is None else (*checked.findings.warnings, *checked.findings.notes)
-        raise InputListError("; ".join((what, *compared)), where=case.path, allowed="markers_ct and markers_base alone")
+        compared = () if checked is None else (one.sentence for one in checked.findings)
+        allowed = "markers_ct and markers_base alone"
+        raise InputListError("; ".join((what, *compared)), where=case.path, allowed=allowed, code="no_markers")
     placement, registration = checked.placement, checked.placement.registration
     report = registration_summary(registration)
     pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]
@@ -108,9 +111,11 @@ def registration_report(path: Path) -> dict[str, Any]:
     read = None if case.errors is None else case.errors.target_cov_ct
     report |= one_insertion(registration, case.target_ct, read)
     report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
-    report["warnings"] = [*case.warnings, *checked.findings.warnings, *_branch_warning(case, registration)]
+    found = {kind: [one.sentence for one in checked.findings if one.severity is kind] for kind in Severity}
+    report["warnings"] = [*case.warnings, *found[Severity.WARNING], *_branch_warning(case, registration)]
     report |= _advice(case, registration)
-    report["notes"] = list(checked.findings.notes)
+    report["notes"] = found[Severity.NOTE]
+    report["findings"] += [one.document() for one in checked.findings]
     return report
 
 
@@ -122,10 +127,7 @@ def lists_report(
     Raises:
         InputError: Lists that cannot be read, matched or trusted, or a target that is no point.
     """
-    where = "--target"
-    numbers = [parse_coordinate(part.strip(), where) for part in target.split(",")]
-    if len(numbers) != 3:
-        raise InputError(f"{len(numbers)} numbers", where=where, allowed="X,Y,Z in mm")
+    numbers = parse_triple(target, "--target")
     content = [read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)) for path in (markers_ct, markers_base)]
     read = [parse_points(content[0], markers_ct, default_space=space), parse_points(content[1], markers_base)]
     target_ct = to_lps(np.array([numbers]), space)[0]
@@ -136,7 +138,7 @@ def lists_report(
     registration = register(pairs, **stated, **given)
     report = registration_summary(registration)
     report["case"] = f"{markers_ct} and {markers_base}"
-    report["target_mm"], report["space"] = numbers, str(space)
+    report["target_mm"], report["space"] = list(numbers), str(space)
     named = zip(("markers_ct", "markers_base"), (markers_ct, markers_base), content, strict=True)
     report["inputs"] = inputs_document(
         tuple(Input(role, str(path), hashlib.sha256(data).hexdigest()) for role, path, data in named)
@@ -266,3 +268,20 @@ def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:
     done = verify(certificate, context.case, context.anatomy, cells, error=error)
     inputs = inputs_document((stated, *context.case.inputs))
     return {"certificate": str(path), "inputs": inputs, **certificate.summary(), "verified": asdict(done)}
+
+
+def certificate_text(report: dict[str, Any]) -> str:
+    """What the plain checker proved."""
+    done = report["verified"]
+    proven = f"{done['safe']} safe and {done['rejected']} rejected cells proven again, {done['undecided']} undecided"
+    return text([Section(f"{report['certificate']}: every cell holds", [proven, *patient.certificate(report)])])
+
+
+def registration_text(report: dict[str, Any]) -> str:
+    """Residuals, expected error, weak points and error budget of a registration."""
+    target = f", target {vector(report['target_mm'], 1, 'mm')} {report['space']}" if "target_mm" in report else ""
+    return text([
+        Section(f"case {report['case']}: registration{target}", patient.registration(report)),
+        Section("error budget", patient.budget(report.get("budget"))),
+        *(Section(f"{kind}: {one}", []) for kind in ("warning", "note") for one in report[f"{kind}s"]),
+    ])  # fmt: skip

@@ -1,7 +1,4 @@
-"""The error budget of a case as facts and text: what each source costs, and what would win the next millimetre.
-
-What a corrected aim wins, as facts and text.
-"""
+"""The error budget of a case: what each source costs, what would win the next millimetre, what a corrected aim wins."""
 
 from __future__ import annotations
 
@@ -19,18 +16,15 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-from puncture_twin.planning.registration.noise_test import INTERVAL
 from puncture_twin.planning.registration.placement import default_method
 from puncture_twin.planning.registration.registration import Registration, reached_insertion, register
+from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm, pose_error
 from puncture_twin.planning.uncertainty.sources import SOURCES, not_modelled
 
 POLE = 1e-6
 """Puncture angle below which an azimuth says nothing, rad."""
-
-SHOWN_MM = 0.005
-"""A source that costs less is not printed: it would be 0.00."""
 
 
 def budget_facts(
@@ -120,33 +114,6 @@ def _bed_ct(case: Case, marker_cov_ct: Floats) -> Floats | None:
     return None if case.space is Space.LOCAL else np.array([0.0, 0.0, 1.0])
 
 
-def budget_lines(facts: dict[str, Any] | None) -> list[str]:
-    """A table of the sources, and the changes that win something."""
-    if facts is None:
-        return []
-    now = facts["expected_mm"]
-    parts = f"{facts['expected_lateral_mm']:.2f} across it and {facts['expected_depth_mm']:.2f} along it"
-    at = f"theta {facts['theta_deg']:.0f}, beta {facts['beta_deg']:.0f}"
-    lines = [
-        f"  expected tip error, markers and arm together, inserted at {at}: {now:.2f} mm (rms), {parts}; "
-        f"one of 20 insertions ends beyond {facts['limit_95_mm']:.2f} mm; not modelled: {facts['not_modelled']}",
-        f"    {'source':34s} {'alone':>7s} {'all but it':>11s}",
-    ]
-    lines += [
-        f"    {one['text']:34s} {one['alone_mm']:7.2f} {one['without_mm']:11.2f}"
-        for one in facts["sources"]
-        if one["alone_mm"] >= SHOWN_MM
-    ]
-    lines.append("    what if (all else as it is)")
-    lines += [f"    {one['text']:50s} {one['expected_mm']:7.2f}" for one in facts["changes"]]
-    best = facts["best"]
-    if now - best["expected_mm"] >= SHOWN_MM:
-        lines.append(
-            f"  the next {now - best['expected_mm']:.2f} mm is won by {best['text']}: {best['expected_mm']:.2f} mm"
-        )
-    return lines
-
-
 def correction_facts(case: Case, registration: Registration) -> dict[str, Any] | None:
     """What a corrected aim wins at its own insertion, mm; None where the case corrects none."""
     aim, plain = registration.aim, registration.uncertainty
@@ -168,19 +135,6 @@ def correction_facts(case: Case, registration: Registration) -> dict[str, Any] |
         "uncorrected_method": method,
         "uncorrected_mm": _expected_mm(case, other, aim.q),
     }
-
-
-def correction_lines(facts: dict[str, Any] | None) -> list[str]:
-    """Both expectations, and where the correction is the best one."""
-    if facts is None:
-        return []
-    joints = ", ".join(f"{angle:.2f}" for angle in facts["joints_deg"])
-    return [
-        f"  aim corrected for the insertion at theta {facts['theta_deg']:.0f}, beta {facts['beta_deg']:.0f} "
-        f"(joints {joints} deg): moved by {facts['moved_mm']:.2f} mm and {facts['turned_deg']:.2f} deg;",
-        f"    expected there {facts['expected_mm']:.2f} mm (rms), not corrected ({facts['uncorrected_method']}) "
-        f"{facts['uncorrected_mm']:.2f} mm; it trusts what [errors] says of the arm",
-    ]
 
 
 def _expected_mm(case: Case, registration: Registration, q: Floats) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +14,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
@@ -58,7 +58,7 @@ def table_of(source: Path, choice: Choice) -> Path | None:
         InputError: One candidate is chosen, or a plan is the source.
     """
     if choice != BEST or is_plan(source):
-        raise InputError("a table holds all candidates", where=source, allowed=f"{ALLOWED}; no choice")
+        refuse("a table holds all candidates", source, f"{ALLOWED}; no choice", "conflicting_options")
     if source.suffix.lower() == ".parquet":
         return source
     table = source / TABLE
@@ -100,9 +100,10 @@ def _table(data: bytes, path: Path) -> pa.Table:
     try:
         table = pq.read_table(pa.BufferReader(data))
     except (pa.ArrowException, OSError) as error:
-        raise InputError(f"no Parquet file ({str(error)[:100]})", where=path, allowed=ALLOWED) from error
+        what = f"no Parquet file ({str(error)[:100]})"
+        raise InputError(what, where=path, allowed=ALLOWED, code="not_parquet") from error
     if b"run" not in (table.schema.metadata or {}) or not {*ROUNDED, "verdict"} <= set(table.column_names):
-        raise InputError("no table of candidates", where=path, allowed=ALLOWED)
+        refuse("no table of candidates", path, ALLOWED, "no_such_file")
     return table
 
 
@@ -116,6 +117,11 @@ def _rows(table: pa.Table) -> list[list[Any]]:
 
 def _csv(run: Mapping[str, Any], columns: list[str], rows: list[list[Any]]) -> str:
     del run  # a CSV has no place for it; the manifest lists the inputs
+    return csv_text(columns, rows)
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table as CSV; what has no value is empty."""
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)

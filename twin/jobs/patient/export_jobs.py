@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+import numpy as np
+
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.export.exporter import FORMATS, Exported
+from puncture_twin.planning.export.exporter import Exported, format_names
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
 from puncture_twin.planning.export.slicer import NAMES, SLICER, SceneContent, entry_area, slicer_files
 from puncture_twin.planning.plan.plan_check import with_case_arm
@@ -26,7 +28,7 @@ from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.twin.jobs.patient.candidates_export import CANDIDATE_FORMATS, TABLE, export_candidates, table_of
 from puncture_twin.twin.jobs.patient.main_job import case_of, export, export_case, is_plan, plan_case, search_case
 from puncture_twin.twin.jobs.patient.summaries import export_summary
-from puncture_twin.twin.jobs.patient.text import export_text
+from puncture_twin.twin.report.present import Section, Warn, text
 
 NOTES = (
     "scene, goals, arm with needle and a sender: read the sender before it is run; it asks before each phase",
@@ -84,9 +86,9 @@ def refuse_format(name: str) -> None:
     Raises:
         InputError: Names those that are.
     """
-    known = (*FORMATS, MOVEIT, SLICER, *CANDIDATE_FORMATS)
+    known = (*format_names(), MOVEIT, SLICER, *CANDIDATE_FORMATS)
     if name not in known:
-        raise InputError(f"format '{name}' is not known", where="--format", allowed=", ".join(known))
+        refuse(f"format '{name}' is not known", "--format", ", ".join(known), "unknown_format")
 
 
 def export_source(
@@ -116,12 +118,11 @@ def export_source(
     planned_case = case_of(source, case, choice)
     if format_name == SLICER:
         if is_plan(source):
-            allowed = "a case, with --rank, --window, --theta or --entry"
-            raise InputError("slicer shows a case", where=source, allowed=allowed)
+            refuse("slicer shows a case", source, "a case, with --rank, --window, --theta or --entry", "missing_option")
         shown = export_to_slicer(prepare(source, watcher=watcher), out, choice)
         return Export(shown, shown.summary(), shown.text())
     if format_name == MOVEIT and planned_case is None:
-        raise InputError("moveit's scene is the case's", where=source, allowed="export plan.json --case CASE")
+        refuse("moveit's scene is the case's", source, "export plan.json --case CASE", "missing_option")
     context = None if planned_case is None else prepare(planned_case, watcher=watcher)
     if format_name == MOVEIT and context is not None:
         done = export_to_moveit(context, source if is_plan(source) else None, out, choice)
@@ -130,6 +131,15 @@ def export_source(
     else:
         done = export_case(context, format_name, out, choice)
     return Export(done, export_summary(done, context is not None), export_text(done, context is not None))
+
+
+def export_text(done: Exported, case_checked: bool) -> str:
+    """What was written, and what whoever runs it should know."""
+    unchecked = [] if case_checked else ["the plan was not held against its case again: name it with --case"]
+    direction = f"direction: theta {np.degrees(done.plan.theta):g} deg, beta {np.degrees(done.plan.beta):g} deg"
+    warned = (Section(f"warning: {one}", []) for one in done.plan.warnings)
+    said = Section(f"{done.format_name}: {done.path}", [direction, *done.notes, *unchecked])
+    return text([said, *warned])
 
 
 NO_APPROACH = "the directions were checked; no approach of the arm was planned"
@@ -166,10 +176,8 @@ class SlicerExport:
 
     def text(self) -> str:
         """As lines."""
-        lines = [*self.notes, *(f"warning: {one}" for one in self.warnings)]
-        return "\n".join(
-            [f"{SLICER}: {self.path}", *(f"  {file}" for file in self.files), *(f"  {one}" for one in lines)]
-        )
+        warned = (f"warning: {one}" for one in self.warnings)
+        return text([Section(f"{SLICER}: {self.path}", [Warn(tuple(map(str, self.files))), *self.notes, *warned])])
 
 
 def export_to_slicer(context: CaseContext, out: Path, choice: Choice) -> SlicerExport:

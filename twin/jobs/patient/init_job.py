@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from puncture_twin.planning.base.cache.array_cache import Memory, user_cache
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
@@ -76,11 +76,11 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     _refuse_options(request)
     folder, path = request.folder, request.folder / CASE
     if not is_folder(folder):
-        raise InputError("is no folder", where=str(folder)[:200], allowed=ALLOWED)
+        refuse("is no folder", str(folder)[:200], ALLOWED, "not_a_folder")
     if is_plain_file(path) and not force:
-        raise InputError("there is a case already", where=path, allowed="--force to replace it")
+        refuse("there is a case already", path, "--force to replace it", "case_exists")
     if (request.target is None) == (request.target_label is None):
-        raise InputError("one target", where="init", allowed="either --target X,Y,Z or --target-label NAME")
+        refuse("one target", "init", "either --target X,Y,Z or --target-label NAME", "conflicting_options")
     memory = Memory(READING_BYTES)
     start = start_case(request, replace(user_cache(), memory=memory), partial(watcher.step, "reading"))
     with atomic(path) as draft:
@@ -108,11 +108,11 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
 def _refuse_options(request: Request) -> None:
     region, radius = request.region, request.hit_radius_mm
     if region is not None and region not in get_args(Region):
-        raise InputError(f"region '{region[:40]}' is not known", where="--region", allowed=", ".join(get_args(Region)))
+        refuse(f"region '{region[:40]}' is not known", "--region", ", ".join(get_args(Region)), "unknown_region")
     if request.wanted.space is Space.LOCAL:
-        raise InputError("a patient's space", where="--space", allowed="LPS or RAS")
+        refuse("a patient's space", "--space", "LPS or RAS", "unknown_space")
     if radius is not None and (request.target is None or not 0 < radius <= 100):
-        raise InputError(f"{radius:g}", where="--hit-radius", allowed="mm, above 0, at most 100, beside --target")
+        refuse(f"{radius:g}", "--hit-radius", "mm, above 0, at most 100, beside --target", "out_of_range")
 
 
 def _with_seen(start: Start, request: Request, context: CaseContext) -> str:

@@ -1,8 +1,8 @@
-"""The main job, stage by stage: search, plan, rehearse, and the files that show each.
+"""The main job, stage by stage over one growing `Run`: search, certify, plan, table, pictures, rehearsal, page.
 
-A stage loads what it needs itself: a search without pictures waits for no planner, simulator or plotter.
-
-What a command works on that takes a case, or a plan beside its case.
+`search_case`, `plan_case`, `rehearse_case` and `rehearse_plan` are the lists of stages; each stage, below, takes a run
+and returns it with what it found and wrote. A stage loads what it needs itself: a search without pictures waits for no
+planner, simulator or plotter.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.output.publish import Draft
@@ -25,13 +25,12 @@ from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
 from puncture_twin.planning.search.choice import BEST, Choice, Pick, choose, choose_stated, with_file_read
-from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
 
 if TYPE_CHECKING:
     from puncture_twin.planning.export.exporter import Exported
-    from puncture_twin.twin.jobs.patient.rehearsed import PendingRehearsal
 
 
 CERTIFICATE = "certificate.json"
@@ -61,7 +60,7 @@ def certify_options(wanted: bool, size_deg: float | None, touch: float | None) -
     """
     for option, value in (("--certify-touch", touch), ("--certify-size", size_deg)):
         if value is not None and not wanted:
-            raise InputError("of a certificate that nobody asked for", where=option, allowed="beside --certify")
+            refuse("of a certificate that nobody asked for", option, "beside --certify", "conflicting_options")
     return CertifyOptions(CERTIFY_DEG if size_deg is None else size_deg, touch) if wanted else None
 
 
@@ -85,8 +84,7 @@ def search_case(
     names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify is None else (CERTIFICATE,)))
     with _writing(out, "search", context, names) as draft:
         run = Run(context, context.search(), (), checked=checked)
-        if certify is not None:
-            run = _certified(run, certify, draft.folder)
+        run = run if certify is None else _certified(run, certify, draft.folder)
         run = _with_table(run, draft.folder)
         run = _with_pictures(run, draft.folder) if pictures else run
     return _final(run, draft)
@@ -102,7 +100,10 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
     _refuse_without_arm(context)
     choice = _stated(context, out, choice)
     with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES), read=choice.read) as draft:
-        run = _with_pictures(_searched_and_planned(context, draft.folder, choice), draft.folder)
+        run = Run(context, context.search(), (), read=choice.read)
+        run = _planned(run, draft.folder, choice)
+        run = _with_table(run, draft.folder)
+        run = _with_pictures(run, draft.folder)
     return _answered(_final(run, draft), out)
 
 
@@ -119,29 +120,24 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
+    from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
 
     _refuse_without_arm(context)
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names, read=choice.read) as draft, two_stages() as begin:
-        run = _searched_and_planned(context, draft.folder, choice)
+        run = Run(context, context.search(), (), read=choice.read)
+        run = _planned(run, draft.folder, choice)
+        run = _with_table(run, draft.folder)
         planned = run.files
-        pending = None if run.plan is None else begin_rehearsal(run, rooms, begin)
-        run = _pictured_and_rehearsed(run, draft.folder, pending)
+        pending = None if run.plan is None else begin_rehearsal(run, rooms, begin)  # while the pictures are drawn
+        paged = partial(with_page, out=draft.folder, drawn=draw_pictures(run, draft.folder))
+        run = paged(run) if pending is None else pending.ended(draft.folder, paged)
         if run.rehearsal is not None:  # the page shows it: it goes with it
             shown = {draft.folder / name for name in PICTURES if name != PAGE}
             draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
     return _answered(_final(run, draft), out)
-
-
-def _pictured_and_rehearsed(run: Run, out: Path, pending: PendingRehearsal | None) -> Run:
-    """The run with the pictures of its plan, drawn while that is rehearsed, and then with the page of all."""
-    from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
-
-    drawn = draw_pictures(run, out)
-    paged = partial(with_page, out=out, drawn=drawn)
-    return paged(run) if pending is None else pending.ended(out, paged)
 
 
 def rehearsed_case(source: Path, case: Path | None, choice: Choice) -> Path:
@@ -151,7 +147,7 @@ def rehearsed_case(source: Path, case: Path | None, choice: Choice) -> Path:
         InputError: A plan without its case, or see there.
     """
     if (found := case_of(source, case, choice)) is None:
-        raise InputError("a plan needs its case", where=source, allowed="rehearse plan.json --case CASE")
+        refuse("a plan needs its case", source, "rehearse plan.json --case CASE", "missing_option")
     return found
 
 
@@ -163,11 +159,7 @@ def demo_case(context: CaseContext, out: Path) -> Run:
 
 def _refuse_without_arm(context: CaseContext) -> None:
     if context.reach is None:
-        raise InputError(
-            "the case does not say where the robot stands, so nothing can be planned",
-            where=context.case.path,
-            allowed="[registration] with markers_ct and markers_base, or [robot.mount]",
-        )
+        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
 
 
 def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
@@ -184,7 +176,7 @@ def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
         choose_stated(context, choice)
     except NoAnswerError as error:
         withdraw(out, "plan")
-        raise NoAnswerError(f"{NO_PLAN}{error}", counts=error.counts) from error
+        raise NoAnswerError(f"{NO_PLAN}{error}", counts=error.counts, code=error.code) from error
     return choice
 
 
@@ -221,12 +213,9 @@ def _answered(run: Run, out: Path) -> Run:
         NoAnswerError: It has none.
     """
     if run.plan is None:
-        raise NoAnswerError(f"{NO_PLAN}{run.refusal}; see {out / 'report.html'}", counts=run.candidates.counts())
+        what = f"{NO_PLAN}{run.refusal}; see {out / 'report.html'}"
+        raise NoAnswerError(what, counts=run.candidates.counts(), code="no_plan")
     return run
-
-
-def _searched_and_planned(context: CaseContext, out: Path, choice: Choice) -> Run:
-    return _with_table(_planned(Run(context, context.search(), (), read=choice.read), out, choice), out)
 
 
 def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomCount | None = None) -> Run:
@@ -359,8 +348,8 @@ def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
     """
     if is_plan(source):
         if choice != BEST:
-            raise InputError("a plan has its direction", where=source, allowed="a case, where one is to be chosen")
+            refuse("a plan has its direction", source, "a case, where one is to be chosen", "conflicting_options")
         return case
     if case is not None:
-        raise InputError("two cases", where="--case", allowed="CASE alone, or plan.json --case CASE")
+        refuse("two cases", "--case", "CASE alone, or plan.json --case CASE", "conflicting_options")
     return source

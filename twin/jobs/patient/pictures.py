@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.plan.plan import Plan
@@ -25,7 +25,7 @@ from puncture_twin.twin.report.error_pictures import draw_budget
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map_view import map_view
-from puncture_twin.twin.report.page.page import Uncertainty, write_page
+from puncture_twin.twin.report.page.page import Shown, Uncertainty, write_page
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
 from puncture_twin.twin.report.slices.sheet import Slices, draw_slices, write_sheet
 from puncture_twin.twin.report.slices.subject import Subject
@@ -68,23 +68,24 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
     shown = _registration(context)
     film = next((path.name for path in run.files if path.stem == Path(FILM).stem and path.suffix != ".json"), None)
     with stages.time("page"):
-        page, uncertainty = out / PAGE, _uncertainty(run)
-        write_page(
+        page = Shown(
             case,
             anatomy,
             found,
             run.plan,
             run.rehearsal,
             shown,
-            page,
             film=film,
-            uncertainty=uncertainty,
+            uncertainty=_uncertainty(run),
             pick=run.pick,
             slices=drawn.slices,
             facts=run.facts,
             refusal=run.refusal,
             raster=drawn.raster,
+            notes=run.plan_notes,
+            failures=run.failures,
         )
+        write_page(page, out / PAGE)
     return run.with_files(*drawn.files, out / PAGE)
 
 
@@ -105,7 +106,7 @@ def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:
     _check_png(path)
     budget = report.get("budget")
     if budget is None:
-        raise InputError("no error budget to draw", where="--picture", allowed="a case with [errors] and an arm")
+        refuse("no error budget to draw", "--picture", "a case with [errors] and an arm", "no_error_budget")
     inputs = read_inputs(report["inputs"])
     with writing(path.parent, f"register {path.name}", inputs=inputs, names=(path.name,), note=lambda _: None) as draft:
         draw_budget(budget, draft.folder / path.name)
@@ -173,6 +174,6 @@ def _budget(context: CaseContext, q_insertion: Floats) -> Mapping[str, Any] | No
 
 def _check_png(path: Path) -> None:
     if path.suffix.lower() != ".png":
-        raise InputError(f"'{path.name}' is no PNG's name", where="--picture", allowed="FILE.png")
+        refuse(f"'{path.name}' is no PNG's name", "--picture", "FILE.png", "bad_file_name")
     if not path.parent.is_dir():
-        raise InputError("there is no such folder", where=path.parent, allowed="a folder that is there")
+        refuse("there is no such folder", path.parent, "a folder that is there", "not_a_folder")

@@ -5,6 +5,7 @@ What ``place`` prints for a person.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,9 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.twin.report.numbers import direction_text, mounting_text
+from puncture_twin.twin.report.present import Field, Section, Warn, footer, grid, text
+
+Ranked = tuple[str, RatedPlacement]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +75,8 @@ def place_case(context: CaseContext, out: Path, *, jobs: int, pictures: bool = T
         withdraw(out, "place")
         raise
     if not any(one.verdict.reached for one in run.found.rated):
-        raise NoAnswerError(f"no placement holds any of the {run.directions} organ-safe directions")
+        what = f"no placement holds any of the {run.directions} organ-safe directions"
+        raise NoAnswerError(what, code="no_placement")
     return replace(run, files=draft.final(run.files))
 
 
@@ -120,24 +125,43 @@ def place_text(run: PlaceRun) -> str:
     case, found = run.context.case, run.found
     wanted = found.rated[0].verdict.count if found.rated else 0
     x, y, z = (direction_text(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
-    lines = [
-        f"case {case.name}: {wanted} organ-safe directions; {len(found.coarse)} + {found.refined} placements estimated,"
-        f" {len(found.rated)} checked",
-        f"  from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}",
-        *needle_line(found.possible),
-        "rank  share %   held  margin  along  across  height  mount",
+    frame = f"from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}"
+    ranked = [(str(rank), one) for rank, one in enumerate(found.rated, start=1)]
+    own = [] if found.own is None else [("-", found.own)]
+    best = Warn(tuple(str(run.document["mount_lines"] or "").splitlines()))
+    truth = "a proposal: where the arm then really stands, markers must say ([registration])"
+    return text([
+        Section(
+            f"case {case.name}: {wanted} organ-safe directions; {len(found.coarse)} + {found.refined} placements "
+            f"estimated, {len(found.rated)} checked",
+            [frame, *needle_line(found.possible), grid(_fields(run), [*ranked, *own])]),
+        *([Section("the best, for the case (in place of its [registration] or [robot.mount]):", [best]),
+           Section(truth, [])] if best.lines else []),
+        *footer(run.files, run.document["warnings"], run.context.stages.seconds),
+    ])  # fmt: skip
+
+
+def _fields(run: PlaceRun) -> list[Field]:
+    """Of a rank and its placement."""
+
+    def at(axis: int) -> Callable[[Ranked], float | None]:
+        return lambda ranked: None if ranked[1].site is None else ranked[1].site.position[axis]
+
+    def mount(ranked: Ranked) -> str:
+        one, home = ranked[1], ranked[1].verdict.home_contact
+        space = str(run.context.case.space)
+        name = one.name if one.site is None else mounting_text(one.site.region, run.found.T_ct_bed, space)
+        return name + (f"; home: {home}" if home else "")
+
+    return [
+        Field("rank", lambda ranked: ranked[0]),
+        Field("share", lambda ranked: 100 * ranked[1].verdict.fraction, 1, "%"),
+        Field("held", lambda ranked: ranked[1].verdict.reached),
+        Field("margin", lambda ranked: ranked[1].verdict.margin, 2),
+        *(Field(name, at(axis), 0) for axis, name in enumerate(("along", "across", "height"))),
+        Field("expected tip error", lambda ranked: ranked[1].expected_mm, 2, "mm"),
+        Field("mount", mount),
     ]
-    lines += [_line(f"{rank:4d}", one, run) for rank, one in enumerate(found.rated, start=1)]
-    if found.own is not None:
-        lines.append(_line("   -", found.own, run))
-    best = run.document["mount_lines"]
-    if best:
-        lines += ["the best, for the case (in place of its [registration] or [robot.mount]):", ""]
-        lines += [f"  {line}" for line in str(best).splitlines()]
-        lines += ["", "a proposal: where the arm then really stands, markers must say ([registration])"]
-    lines += [f"warning: {warning}" for warning in run.document["warnings"]]
-    seconds = ", ".join(f"{stage} {spent:.1f}" for stage, spent in run.context.stages.seconds.items())
-    return "\n".join([*lines, f"seconds: {seconds}", "look at:", *(f"  {path}" for path in run.files)])
 
 
 def needle_line(possible: float) -> list[str]:
@@ -145,14 +169,4 @@ def needle_line(possible: float) -> list[str]:
     if possible > 1.0 - HALF_A_DIGIT:
         return []
     fraction = f"at most {100 * possible:.1f} % can be held from anywhere"
-    return [f"  {fraction}: elsewhere the needle itself would start too near the skin"]
-
-
-def _line(rank: str, one: RatedPlacement, run: PlaceRun) -> str:
-    verdict, space = one.verdict, str(run.context.case.space)
-    where = "     -       -       -" if one.site is None else "{:6.0f}  {:6.0f}  {:6.0f}".format(*one.site.position)
-    name = one.name if one.site is None else mounting_text(one.site.region, run.found.T_ct_bed, space)
-    home = f"; home: {verdict.home_contact}" if verdict.home_contact else ""
-    expected = "" if one.expected_mm is None else f"; expected tip error {one.expected_mm:.2f} mm"
-    worth = f"{rank}  {100 * verdict.fraction:7.1f}  {verdict.reached:5d}  {verdict.margin:6.2f}"
-    return f"{worth}  {where}  {name}{expected}{home}"
+    return [f"{fraction}: elsewhere the needle itself would start too near the skin"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -10,11 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.processes import process_pool, worker_count
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.twin.jobs.patient.run import FILM, ROOMS, RoomCount, Run
 from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
+from puncture_twin.twin.jobs.terminal import write_json
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
 from puncture_twin.twin.rehearsal.plan_truth import error_scale, median_truth, plan_truth
 
@@ -94,7 +93,7 @@ class PendingRehearsal:
         rehearsal = replace(rehearsal, standing=None if scale is None else scale.of(rehearsal.tip_error_mm))
         film_at = self.begin(_film, rehearsal, run.plan, run.context.case, run.context.anatomy, out / FILM)
         document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
-        measured = replace(run, rehearsal=rehearsal).with_files(_write_json(document, out / "rehearsal.json"))
+        measured = replace(run, rehearsal=rehearsal).with_files(write_json(document, out / "rehearsal.json"))
         rooms = (out / ROOMS,) if shown else ()
         run = measured.with_files(out / FILM, *rooms)
         run = run if with_page is None else with_page(run)
@@ -146,9 +145,3 @@ def _distribution(run: Run, count: RoomCount) -> Distribution:
     with context.stages.time("physics"):
         again = partial(context.watcher.count, "rooms in the simulator")
         return replace(found, physics=physics_trials(context, run.plan, found, count.physics, again))
-
-
-def _write_json(summary: dict[str, Any], path: Path) -> Path:
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return path

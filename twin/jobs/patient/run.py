@@ -6,7 +6,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from puncture_twin.planning.base.errors import InputError
+import numpy as np
+
+from puncture_twin.planning.base.errors import Severity, refuse
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
@@ -14,8 +16,9 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.explain import needle_warnings
+from puncture_twin.planning.search.explain import needle_warnings, reason_text
 from puncture_twin.planning.search.sides import sides_text
 from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.summaries import (
@@ -25,6 +28,9 @@ from puncture_twin.twin.jobs.patient.summaries import (
     trial_failures,
     window_summary,
 )
+from puncture_twin.twin.report import patient
+from puncture_twin.twin.report.numbers import TRUTH_IS_BELIEF
+from puncture_twin.twin.report.present import Section, footer, text
 
 if TYPE_CHECKING:
     from puncture_twin.twin.rehearsal.distribution import Distribution
@@ -52,7 +58,7 @@ def room_count(rooms: int | None, physics: int) -> RoomCount | None:
         InputError: More in the simulator than there are.
     """
     if physics > (rooms or 0):
-        raise InputError("--physics runs some of the rooms", where="--physics", allowed="--seeds N --physics K, K <= N")
+        refuse("--physics runs some of the rooms", "--physics", "--seeds N --physics K, K <= N", "conflicting_options")
     return None if rooms is None else RoomCount(rooms, physics)
 
 
@@ -133,3 +139,93 @@ class Run:
             "seconds": {stage: round(seconds, 3) for stage, seconds in self.context.stages.seconds.items()},
             "files": [str(path) for path in self.files],
         }
+
+    @property
+    def plan_notes(self) -> tuple[str, ...]:
+        """What else must be known of the plan's expected error and of its aim."""
+        if self.plan is None:
+            return ()
+        notes = [] if self.context.case.bending is None else ["The expected error is of a needle that does not bend."]
+        if self.context.chance is None:
+            notes.append("The expected error is of markers alone: no [errors] declare the arm's.")
+        return (*notes, *_other_configuration(self.candidates, self.plan), *self._other_aim(self.plan))
+
+    def _other_aim(self, plan: Plan) -> list[str]:
+        """That the pose was corrected for another insertion, and what would correct it for this one."""
+        registration = None if self.context.placement is None else self.context.placement.registration
+        q = plan.insertion.q[-1]
+        if registration is None or registration.aim is None or np.abs(q - registration.aim.q).max() < SAME_AIM:
+            return []
+        joints = ", ".join(f"{angle:.2f}" for angle in np.degrees(q))
+        return [f"The aim is corrected for another insertion; for this one: correct_joints_deg = [{joints}]."]
+
+    def text(self) -> str:
+        """What a person reads: what must be read first, the search, then what was done with it; then the files."""
+        return text([*self._first(), *self._searched(), *self._done(), *self._footer()])
+
+    def _first(self) -> list[Section]:
+        belief = self.rehearsal is not None and self.rehearsal.truth_is_belief
+        return [Section(f"NOTE: {TRUTH_IS_BELIEF}", [])] if belief else []
+
+    def _searched(self) -> list[Section]:
+        found, sides = self.candidates, self.context.sides
+        looked = f", looked from: {sides_text(sides, searched=True)}" if sides else ""
+        warned = (*needle_warnings(self.context.case, found), *(one.sentence for one in found.findings))
+        return [
+            Section(f"case {self.context.case.name}: {find_windows(found).headline}", []),
+            Section(f"{len(found)} direction{'s' if len(found) != 1 else ''}{looked}", patient.counts(found)),
+            *(Section(one, []) for one in warned),
+            Section("the best of each window", patient.windows(found)) if found.safe.any() else self._nothing_safe(),
+        ]
+
+    def _nothing_safe(self) -> Section:
+        row = closest_miss(self.candidates)
+        if row is None:
+            return Section("no candidate is safe", [])
+        at = self.candidates.at(row)
+        angles = f"theta {at['theta_deg']:g} deg, beta {at['beta_deg']:g} deg"
+        return Section(f"no candidate is safe; closest came {angles}: {reason_text(self.candidates, row)}", [])
+
+    def _done(self) -> list[Section]:
+        """Plan, rehearsal, many rooms, certificate and cross-check, where there are any."""
+        away = frozenset(one.name for one in self.context.anatomy.structures if one.demands_margin)
+        at_patient = () if self.facts is None else self.facts.rows()
+        declared = self.context.chance is not None
+        done = []
+        if self.plan is not None:
+            done.append(Section("plan", patient.plan(self.plan, at_patient, declared=declared, notes=self.plan_notes)))
+        if self.rehearsal is not None:
+            done.append(Section("rehearsal", patient.rehearsal(self.rehearsal, away, failures=self.failures)))
+        if self.distribution is not None:
+            done.append(Section("many rooms", patient.rooms(self.distribution.summary())))
+        if self.certificate is not None:
+            done.append(Section("certificate", patient.certificate(self.certificate.summary())))
+        if (checked := self.checked) is not None:
+            done.append(Section(
+                f"cross-check: FCL measured {checked.directions} directions again; {checked.pairs} distances agree,"
+                f" largest difference {checked.largest_mm:.1e} mm", []))  # fmt: skip
+        return done
+
+    def _footer(self) -> list[Section]:
+        anatomy = self.context.anatomy
+        notes = [Section(f"note: {one.sentence}", []) for one in anatomy.findings if one.severity is Severity.NOTE]
+        ending = footer(self.files, anatomy.warnings, self.context.stages.seconds)
+        return [*notes, *ending]
+
+
+NOTABLE = 0.05
+"""Of an expected error: by as much two configurations' differ before people are told."""
+
+SAME_AIM = 0.02
+"""rad: joints that differ by less are of one insertion; an arm's errors do the same there within a fiftieth."""
+
+
+def _other_configuration(candidates: Candidates, plan: Plan) -> list[str]:
+    """That the table's row of the plan's direction is of another configuration, where that tells."""
+    row = np.flatnonzero((candidates.theta == plan.theta) & (candidates.beta == plan.beta))
+    if candidates.chances is None or not len(row):
+        return []
+    other = float(np.hypot(candidates.chances.lateral_mm[row[0]], candidates.chances.depth_mm[row[0]]))
+    if not abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
+        return []
+    return [f"In the configuration of the table and of check {other:.2f} mm: an approach may end in another one."]

@@ -46,12 +46,13 @@ def registration_summary(registration: Registration) -> dict[str, Any]:
         "altitude_mm": registration.conditioning.altitude_mm,
         "leverage": registration.conditioning.leverage,
         "distortion": _distortion(registration.distortion),
-        "flags": list(registration.flags),
+        "flags": [flag.sentence for flag in registration.flags],
+        "findings": [flag.document() for flag in registration.flags],
     }
 
 
 def _distortion(found: Distortion | None) -> dict[str, Any] | None:
-    return None if found is None else {**vars(found), "doubted": found.doubted, "text": found.text()}
+    return None if found is None else {**vars(found), "doubted": found.significant, "text": found.text()}
 
 
 def _declared(registration: Registration) -> dict[str, Any]:

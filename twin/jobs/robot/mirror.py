@@ -15,12 +15,13 @@ from puncture_twin.planning.arm.kinematics import check_recording, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError, require_extra
+from puncture_twin.planning.base.errors import InputError, refuse, require_extra
 from puncture_twin.planning.base.files import read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points import joint_readings, parse_joint_recording
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
+from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE
 
 MAX_RECORDING_BYTES = 200_000_000
 """An hour at 125 states a second is 60 MB."""
@@ -107,8 +108,7 @@ class Mirror:
         """
         checked = checked_placement(case, user_cache())
         if checked is None:
-            allowed = "[registration] with markers, or [robot.mount]"
-            raise InputError("the case does not say where the robot stands", where=case.path, allowed=allowed)
+            refuse(NO_BASE, case.path, ALLOWED_BASE, "no_base")
         return cls(case.robot.model, checked.placement.T_base_ct, case.needle.length_mm, case.target_ct)
 
     def show(self, state: RecordedState) -> Mirrored:
@@ -140,14 +140,15 @@ def connect(host: str) -> Receiver:
         receiver: Receiver = RTDEReceiveInterface(host, variables=list(VARIABLES))
     except (OSError, RuntimeError, ValueError) as error:  # ValueError: a name that no address can have
         where = f"mirror {host}, port {RTDE_PORT}"
-        raise InputError(f"no robot answers: {error}", where=where, allowed="a UR that is on") from error
+        what = f"no robot answers: {error}"
+        raise InputError(what, where=where, allowed="a UR that is on", code="no_robot_answers") from error
     return receiver
 
 
 def _check_host(host: str) -> None:
     if not 0 < len(host) <= MAX_HOST or not host.isprintable() or any(c.isspace() for c in host):
         what = f"host of {len(host)} characters, or with spaces in it"
-        raise InputError(what, where=f"mirror {host}", allowed=f"a name or address of 1 to {MAX_HOST} characters")
+        refuse(what, f"mirror {host}", f"a name or address of 1 to {MAX_HOST} characters", "bad_host")
 
 
 def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[RecordedState]:
@@ -173,7 +174,7 @@ def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -
         elif not receiver.isConnected() or time.monotonic() - heard > SILENCE_S:
             # the library goes on to give the last state it has heard
             said = "hung up" if not receiver.isConnected() else "tells nothing new"
-            raise InputError(f"the robot {said}, {last:.3f} s by its clock", where="mirror", allowed="a UR that is on")
+            refuse(f"the robot {said}, {last:.3f} s by its clock", "mirror", "a UR that is on", "robot_silent")
         time.sleep(period_s)
 
 
@@ -244,7 +245,7 @@ def readings_of(
     if recording is None and host is not None:
         return Readings(live_states(connect(host), period_s=period_s, seconds=seconds), case.inputs)
     if recording is None or host is not None:
-        raise InputError("one arm at a time", where="mirror", allowed="either HOST or --from joints.csv")
+        refuse("one arm at a time", "mirror", "either HOST or --from joints.csv", "conflicting_options")
     read = RecordedJoints.read(recording)
     return Readings(read.states(case), (read.input, *case.inputs), read.warnings())
 
@@ -252,7 +253,7 @@ def readings_of(
 def told(time_s: float, q: list[float]) -> RecordedState:
     """A controller's word, if it is a time and six angles that an arm can have; else an `InputError`."""
     if not np.isfinite(time_s):
-        raise InputError(f"a time of {time_s} s", where="the robot's answer", allowed="a finite time")
+        refuse(f"a time of {time_s} s", "the robot's answer", "a finite time", "not_finite")
     return RecordedState(float(time_s), joint_readings([q], "rad", where="the robot's answer")[0])
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from puncture_twin.planning.base.errors import PlanningError
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.output.publish import Draft
 from puncture_twin.planning.base.progress import Watcher
@@ -16,9 +14,10 @@ from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME, write_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.summaries import calibration_summary
-from puncture_twin.twin.jobs.selfcal.page import write_page
 from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, workcell_picture
+from puncture_twin.twin.jobs.selfcal.report import write_page
 from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun, selfcal_recording, selfcal_twin
+from puncture_twin.twin.jobs.terminal import write_json
 
 COMMAND = "selfcal"
 ANSWERS = ("calibration.json", "report.html")
@@ -78,7 +77,7 @@ def _simulated(case: SelfcalCase, seeds: int, draft: Draft, watcher: Watcher) ->
 
 def write_run(run: SelfcalRun, out: Path) -> SelfcalRun:
     """Write ``calibration.json`` and, in the twin, the first seed's ``recording.csv``."""
-    written = [_write_json(calibration_file(run), out / "calibration.json")]
+    written = [write_json(calibration_file(run), out / "calibration.json")]
     if run.trials:
         write_recording(run.recording, out / FILE_NAME)
         written.append(out / FILE_NAME)
@@ -99,9 +98,3 @@ def calibration_file(run: SelfcalRun) -> dict[str, Any]:
         "covariance": found.covariance_counts.tolist(),
         "region_limit_95": found.region_limit(),
     }
-
-
-def _write_json(content: dict[str, Any], path: Path) -> Path:
-    with atomic(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    return path

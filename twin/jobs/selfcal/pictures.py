@@ -7,13 +7,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
 from PIL import Image, ImageDraw
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import visual_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.base.arrays import Floats, Pixels
-from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeShot
@@ -24,7 +27,8 @@ from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.summaries import SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import head_pose, needle_tool, phantom_mesh, probe_tool, table_box
 from puncture_twin.twin.report import palette
-from puncture_twin.twin.report.annotate import width_of, write, write_image
+from puncture_twin.twin.report.annotate import write, write_image
+from puncture_twin.twin.report.figures import cross, figure_of, ring, write_png
 from puncture_twin.twin.report.raster.camera import camera_around
 from puncture_twin.twin.report.raster.compositing import compose
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, shells_of
@@ -33,8 +37,8 @@ from puncture_twin.twin.report.scene.shapes import bar
 PX_PER_MM = 8
 """Of the sheet."""
 
-MARGIN, CAPTION = 14, 58
-"""Pixels about a picture and below it."""
+MARGIN, CAPTION, LEGEND, COLUMNS = 14, 58, 40, 3
+"""Pixels about a picture, below it and below all; pictures side by side."""
 
 MARKED_MM = 14.0
 """Of the detected shaft that is marked."""
@@ -45,6 +49,9 @@ TARGET_MM = 2.0
 DETECTED: Rgb = (86, 220, 255)
 TRUE: Rgb = (255, 214, 64)
 TARGET: Rgb = (255, 96, 96)
+DARK = ("#0082af", "#be8c00", "#c82828")
+"""The same on white."""
+
 WORKCELL_SIZE = (1180, 720)
 OPACITY = 0.45
 """Opacity of the phantom, so that the needle shows in it."""
@@ -66,17 +73,22 @@ def detection_sheet(case: SelfcalCase, trial: SelfcalTrial, path: Path) -> Path:
     rng = np.random.default_rng([trial.seed, 1])
     panels = [*_recorded_panels(trial), *_puncture_panels(case, trial, rng)]
     imager = case.content.image.imager()
-    columns = 3
-    width, height = (int(PX_PER_MM * (side + imager.pixel_mm)) for side in imager.size_mm)
-    cell = (width + 2 * MARGIN, height + CAPTION + 2 * MARGIN)
-    rows = -(-len(panels) // columns)
-    sheet = Image.new("RGB", (columns * cell[0], rows * cell[1] + 40), (255, 255, 255))
-    draw = ImageDraw.Draw(sheet)
+    width, height = (PX_PER_MM * (side + imager.pixel_mm) for side in imager.size_mm)
+    wide, rows = width + 2 * MARGIN, -(-len(panels) // COLUMNS)
+    high = height + CAPTION + 2 * MARGIN
+    size = (round(COLUMNS * wide), round(rows * high + LEGEND))
+    figure = figure_of(*size)
     for i, panel in enumerate(panels):
-        corner = ((i % columns) * cell[0] + MARGIN, (i // columns) * cell[1] + MARGIN)
-        _draw_panel(sheet, draw, panel, imager, corner, (width, height))
-    _draw_legend(draw, rows * cell[1])
-    write_image(sheet, path)
+        left, top = (i % COLUMNS) * wide + MARGIN, (i // COLUMNS) * high + MARGIN
+        at = (left / size[0], 1 - (top + height) / size[1], width / size[0], height / size[1])
+        _draw_panel(figure.add_axes(at), panel, imager)
+    marks = (
+        Line2D([], [], marker="o", ms=16, mfc="none", mew=2, color=DARK[0], label="ring, lines: detected tip, shaft"),
+        Line2D([], [], marker="x", ms=10, mew=2, ls="none", color=DARK[1], label="cross: true tip"),
+        Line2D([], [], marker="o", ms=16, mfc="none", mew=2, ls="none", color=DARK[2], label="ring of 2 mm: target"),
+    )
+    figure.legend(handles=marks, loc="lower left", ncols=3, fontsize=15, frameon=False)
+    write_png(figure, path)
     return path
 
 
@@ -111,70 +123,32 @@ def _puncture_panels(case: SelfcalCase, trial: SelfcalTrial, rng: np.random.Gene
     return [panel(one) for one in [*order[:1], *order[1:][-(wanted - 1) :]]]
 
 
-def _draw_panel(
-    sheet: Image.Image,
-    draw: ImageDraw.ImageDraw,
-    panel: Panel,
-    imager: Imager,
-    corner: tuple[int, int],
-    size: tuple[int, int],
-) -> None:
-    picture = Image.fromarray(panel.picture).resize(size, Image.Resampling.BICUBIC).convert("RGB")
-    _draw_marks(ImageDraw.Draw(picture), panel, imager)
-    sheet.paste(picture, corner)
-    below = corner[1] + size[1] + 6
-    write(draw, (corner[0], below), panel.title, size=18, bold=True)
-    write(draw, (corner[0], below + 24), panel.text, size=15)
-    bar_y = corner[1] + size[1] - 12
-    draw.line([(corner[0] + 10, bar_y), (corner[0] + 10 + 10 * PX_PER_MM, bar_y)], fill=(255, 255, 255), width=3)
-    write(draw, (corner[0] + 16 + 10 * PX_PER_MM, bar_y), "10 mm", size=13, colour=(255, 255, 255), anchor="lm")
+def _draw_panel(axes: Axes, panel: Panel, imager: Imager) -> None:
+    """The picture in mm, its marks, its scale, and its title and text below."""
+    (wide, deep), half = imager.size_mm, 0.5 * imager.pixel_mm
+    axes.set_axis_off()
+    extent = (-half, wide + half, deep + half, -half)
+    axes.imshow(panel.picture, cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="bicubic", aspect="auto")
+    axes.set_autoscale_on(False)
+    _draw_marks(axes, panel)
+    axes.plot((1.0, 11.0), (deep - 1.5, deep - 1.5), color="white", linewidth=3)
+    axes.text(12.0, deep - 1.5, "10 mm", color="white", fontsize=13, va="center")
+    for text, below, look in ((panel.title, 6, {"fontsize": 18, "weight": "bold"}), (panel.text, 30, {"fontsize": 15})):
+        axes.annotate(text, (0, 0), (0, -below), "axes fraction", textcoords="offset points", va="top", **look)
 
 
-def _draw_marks(draw: ImageDraw.ImageDraw, panel: Panel, imager: Imager) -> None:
+def _draw_marks(axes: Axes, panel: Panel) -> None:
     """Detected shaft and tip, true tip, target; what lies beyond the picture is cut off."""
-
-    def at(point: Floats) -> tuple[float, float]:
-        x, y = (np.asarray(point) + 0.5 * imager.pixel_mm) * PX_PER_MM
-        return float(x), float(y)
-
     if panel.found is not None:
         tip, direction = panel.found.tip_image, panel.found.direction_image
         for side in (-1.2, 1.2):  # beside the shaft, so that it stays visible
             start = tip + side * np.array([-direction[1], direction[0]])
-            draw.line([at(start), at(start - MARKED_MM * direction)], fill=DETECTED, width=1)
-    _cross(draw, at(panel.true.tip_image[:2]), TRUE)
+            axes.plot(*np.stack([start, start - MARKED_MM * direction]).T, color=css(DETECTED), linewidth=1)
+        ring(axes, tip, 9, DETECTED)
+    cross(axes, panel.true.tip_image[:2], 5, TRUE, "x")
     if panel.target is not None:
-        _ring(draw, at(panel.target[:2]), TARGET_MM * PX_PER_MM, TARGET)
-    if panel.found is not None:
-        _ring(draw, at(panel.found.tip_image), 9, DETECTED)
-
-
-def _cross(draw: ImageDraw.ImageDraw, at: tuple[float, float], colour: Rgb) -> None:
-    x, y = at
-    for dx, dy in ((5, 5), (5, -5)):
-        draw.line([(x - dx, y - dy), (x + dx, y + dy)], fill=colour, width=2)
-
-
-def _ring(draw: ImageDraw.ImageDraw, at: tuple[float, float], radius: float, colour: Rgb) -> None:
-    x, y = at
-    draw.ellipse([x - radius, y - radius, x + radius, y + radius], outline=colour, width=2)
-
-
-def _draw_legend(draw: ImageDraw.ImageDraw, top: int) -> None:
-    x, y = MARGIN + 10.0, top + 16.0
-    dark = {DETECTED: (0, 130, 175), TRUE: (190, 140, 0), TARGET: (200, 40, 40)}
-    items = (
-        (DETECTED, "ring and lines: detected tip and shaft"),
-        (TRUE, "cross: true tip"),
-        (TARGET, "ring of 2 mm radius: target"),
-    )
-    for colour, text in items:
-        if colour == TRUE:
-            _cross(draw, (x, y), dark[colour])
-        else:
-            _ring(draw, (x, y), 8, dark[colour])
-        write(draw, (x + 16, y), text, size=15, anchor="lm")
-        x += 60 + width_of(text, 15)
+        u, v = panel.target[:2].tolist()
+        axes.add_patch(Circle((u, v), TARGET_MM, fill=False, color=css(TARGET), linewidth=2))
 
 
 def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path: Path) -> Path:

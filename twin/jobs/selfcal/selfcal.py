@@ -49,8 +49,8 @@ class SelfcalRun:
         inputs: Recording and case file, with role and hash.
         trials: In the twin, one per seed; empty for a recording.
         case: The case, in the twin.
-        candidates: The same.
-        choice: The same.
+        candidates: Poses that were to choose from, in the twin.
+        choice: The poses chosen of them, in the twin.
         stages: Seconds.
         files: What was written.
         warnings: What the recording leaves open, one sentence each.
@@ -74,7 +74,7 @@ class SelfcalRun:
         return tuple(one for trial in self.trials for one in trial.punctures)
 
     def with_files(self, *files: Path) -> SelfcalRun:
-        """The same, with files written."""
+        """This run with the files that were written."""
         return replace(self, files=(*self.files, *files))
 
 

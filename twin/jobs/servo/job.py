@@ -11,11 +11,16 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.session import Session
 from puncture_twin.twin.jobs.servo import liu2007
-from puncture_twin.twin.jobs.servo.facts import Facts, reproduction_facts, servo_facts
 from puncture_twin.twin.jobs.servo.liu2007 import finished_sessions
-from puncture_twin.twin.jobs.servo.page import write_servo_page
 from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence
-from puncture_twin.twin.jobs.servo.text import reproduction_text, servo_text
+from puncture_twin.twin.jobs.servo.report import (
+    Facts,
+    Pictures,
+    reproduction_facts,
+    servo_facts,
+    servo_text,
+    write_servo_page,
+)
 
 NAMES = ("servo.html", "convergence.png", "camera_1.png", "camera_2.png")
 
@@ -68,13 +73,16 @@ def reproduce_paper(out_dir: Path, seeds: int | None) -> ServoJob:
         facts = reproduction_facts(result)
         written = _files(result.tilted.case, result.tilted.first, facts, draft.folder)
     facts["files"] = [str(path) for path in draft.final(written)]
-    return ServoJob(result.passed, facts, reproduction_text(facts))
+    return ServoJob(result.passed, facts, servo_text(facts))
 
 
 def _files(case: ServoCase, first: Session, facts: Facts, out_dir: Path) -> list[Path]:
     """Write everything; returns the paths."""
     pictures = draw_cameras(first, out_dir)
-    convergence, page = out_dir / "convergence.png", out_dir / "servo.html"
+    convergence = out_dir / "convergence.png"
     draw_convergence(first, convergence)
-    write_servo_page(case, facts, pictures, convergence, page)
-    return [page, convergence, *pictures]
+    return [
+        write_servo_page(case, facts, Pictures(convergence, pictures), out_dir / "servo.html"),
+        convergence,
+        *pictures,
+    ]

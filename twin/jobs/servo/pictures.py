@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
 
 from puncture_twin.planning.arm.tool import Box, Tool
-from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.twin.guidance.stereo.ball.ball_image import render
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
 from puncture_twin.twin.guidance.stereo.session import Reached, Session
-from puncture_twin.twin.report.annotate import INK, write, write_image
-from puncture_twin.twin.report.figures import halo, write_png
+from puncture_twin.twin.report.annotate import INK
+from puncture_twin.twin.report.figures import cross, figure_of, halo, picture_axes, ring, write_png
 from puncture_twin.twin.world.workcell import load_ball, open_workcell, pinhole_picture
 
 BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)
@@ -41,13 +41,11 @@ def draw_cameras(session: Session, path_of: Path) -> list[Path]:
     reached = next((one for one in session.reached if one.servoed.visits), session.reached[0])
     paths = []
     for number, camera in enumerate(session.workcell.cameras):
-        picture = Image.fromarray(_workcell_picture(session, reached, camera))
-        scale = WIDTH_PX / camera.width
-        picture = picture.resize((WIDTH_PX, round(camera.height * scale)), Image.Resampling.LANCZOS)
-        _annotate(picture, session, reached, number, scale)
-        path = path_of / f"camera_{number + 1}.png"
-        write_image(picture, path)
-        paths.append(path)
+        figure = figure_of(WIDTH_PX, round(WIDTH_PX * camera.height / camera.width))
+        axes = picture_axes(figure, _workcell_picture(session, reached, camera))
+        _annotate(axes, session, reached, number)
+        paths.append(path_of / f"camera_{number + 1}.png")
+        write_png(figure, paths[-1])
     return paths
 
 
@@ -72,17 +70,18 @@ def _workcell_picture(session: Session, reached: Reached, camera: Camera) -> NDA
         )
 
 
-def _annotate(picture: Image.Image, session: Session, reached: Reached, number: int, scale: float) -> None:
-    draw, workcell = ImageDraw.Draw(picture), session.workcell
+def _annotate(axes: Axes, session: Session, reached: Reached, number: int) -> None:
+    workcell = session.workcell
     camera, believed = workcell.cameras[number].pinhole(), session.calibration.cameras[number].pinhole()
     for name, marker in zip(
         workcell.case.markers.names, session.mapping.to_c(workcell.case.markers.points), strict=True
     ):
-        _ring(draw, believed.project(marker) * scale, 16, MARKER, name)
+        ring(axes, believed.project(marker), 16, MARKER, name, 3)
     for target, point in zip(workcell.case.targets.names, workcell.targets_c, strict=True):
-        _cross(draw, camera.project(point) * scale, TARGET, 9 if target == reached.target else 3)
+        cross(axes, camera.project(point), 9 if target == reached.target else 3, TARGET)
     if reached.servoed.visits:
-        _ring(draw, believed.project(reached.servoed.visits[-1].seen.ball_c) * scale, 18, BALL, "")
+        ring(axes, believed.project(reached.servoed.visits[-1].seen.ball_c), 18, BALL, width=3)
+        _inset(axes, session, reached, number)
     lines = (
         (f"camera {number + 1}: {workcell.case.name}, seed {session.seed}, at the end of target {reached.target}", INK),
         ("orange ring: ball as measured", BALL),
@@ -91,25 +90,12 @@ def _annotate(picture: Image.Image, session: Session, reached: Reached, number: 
         ("the room is drawn for looking at, without the lens's distortion", INK),
     )
     for row, (text, colour) in enumerate(lines):
-        write(draw, (16, 14 + 24 * row), text, size=17, bold=row == 0, colour=colour, halo=3)
-    if reached.servoed.visits:
-        _inset(picture, session, reached, number)
+        place, weight = (16, -14 - 24 * row), "normal" if row else "bold"
+        look: dict[str, Any] = {"textcoords": "offset points", "va": "top", "weight": weight, "path_effects": halo(3)}
+        axes.annotate(text, (0, 1), place, "axes fraction", fontsize=17, color=css(colour), **look)
 
 
-def _ring(draw: ImageDraw.ImageDraw, at: Floats, radius: float, colour: Rgb, text: str) -> None:
-    x, y = (float(v) for v in at)
-    draw.ellipse([x - radius, y - radius, x + radius, y + radius], outline=colour, width=3)
-    if text:
-        write(draw, (x + radius + 4, y), text, size=15, colour=colour, anchor="lm", halo=3)
-
-
-def _cross(draw: ImageDraw.ImageDraw, at: Floats, colour: Rgb, size: float) -> None:
-    x, y = (float(v) for v in at)
-    draw.line([(x - size, y), (x + size, y)], fill=colour, width=2)
-    draw.line([(x, y - size), (x, y + size)], fill=colour, width=2)
-
-
-def _inset(picture: Image.Image, session: Session, reached: Reached, number: int) -> None:
+def _inset(axes: Axes, session: Session, reached: Reached, number: int) -> None:
     """What is really measured: the analytic picture of the ball, enlarged, with the outline that was found."""
     workcell, tool = session.workcell, session.workcell.case.file.tool
     camera, believed = workcell.cameras[number], session.calibration.cameras[number]
@@ -120,18 +106,15 @@ def _inset(picture: Image.Image, session: Session, reached: Reached, number: int
     grey = render(
         camera, ball_scene(plan, ball, 0.0, rng), rng=rng, noise=plan.noise_grey, blur_px=plan.blur_px, half_px=half
     )
-    side = INSET_SCALE * 2 * INSET_HALF_PX
-    zoom = side / grey.grey.shape[1]
-    inset = Image.fromarray(grey.grey).convert("RGB").resize((side, side), Image.Resampling.NEAREST)
-    x, y = (believed.project(seen) - np.array(grey.offset) + 0.5) * zoom
-    radius = believed.ball_radius_px(seen, ball.radius_mm) * zoom
-    draw = ImageDraw.Draw(inset)
-    draw.ellipse([x - radius, y - radius, x + radius, y + radius], outline=BALL, width=2)
-    _cross(draw, np.array([x, y]), BALL, 6)
-    corner = (picture.width - side - 16, picture.height - side - 16)
-    picture.paste(inset, corner)
-    text = f"what is measured, x{zoom:.1f}"
-    write(ImageDraw.Draw(picture), (corner[0], corner[1] - 8), text, size=15, colour=BALL, anchor="lb", halo=3)
+    side, high = INSET_SCALE * 2 * INSET_HALF_PX, axes.figure.bbox.height
+    inset = axes.inset_axes((1 - (side + 16) / WIDTH_PX, 16 / high, side / WIDTH_PX, side / high))
+    inset.set_axis_off()
+    inset.imshow(grey.grey, cmap="gray", vmin=0, vmax=255)
+    at = believed.project(seen) - np.array(grey.offset)
+    inset.add_patch(Circle(at, believed.ball_radius_px(seen, ball.radius_mm), fill=False, color=css(BALL), linewidth=2))
+    cross(inset, at, 6, BALL)
+    text = f"what is measured, x{side / grey.grey.shape[1]:.1f}"
+    inset.set_title(text, fontsize=15, color=css(BALL), loc="left", path_effects=halo(3))
 
 
 def draw_convergence(session: Session, path: Path) -> None:

@@ -17,7 +17,7 @@ from puncture_twin.planning.anatomy.default_roles import default_role
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.anatomy.unseen import BEYOND_LABELS
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case, bed_frame
 from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
@@ -338,7 +338,7 @@ def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator
     if counts.min() < 2 or np.prod(counts, dtype=float) > MOST_VOXELS:
         shown = " x ".join(map(str, counts))
         allowed = f"2 voxels or more along each axis, {MOST_VOXELS:,} at most: larger pixels, or --fov and --length"
-        raise InputError(f"a scan of {shown} voxels", where="scan", allowed=allowed)
+        refuse(f"a scan of {shown} voxels", "scan", allowed, "out_of_range")
     T = np.diag([*spacing, 1.0])
     T[:3, 3] = first
     return VolumeGrid((int(counts[0]), int(counts[1]), int(counts[2])), T, {})

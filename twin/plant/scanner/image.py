@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, pose
@@ -217,7 +217,7 @@ def check_closed(solid: Solid, where: str) -> Solid:
         InputError: Its surface is open.
     """
     if not solid.mesh.closed:
-        raise InputError(f"'{solid.name}' has an open surface", where=where, allowed="closed surfaces")
+        refuse(f"'{solid.name}' has an open surface", where, "closed surfaces", "open_mesh")
     return solid
 
 

@@ -52,7 +52,7 @@ FRONT: Mapping[str, Any] = MappingProxyType({"marker": "o", "ms": 3.0, "mew": 0.
 
 
 class Label(NamedTuple):
-    """What is written on the map, and where, in the disc's radii (x right, y up)."""
+    """Text on the map, and its position, in the disc's radii (x right, y up)."""
 
     x: float
     y: float
@@ -110,20 +110,11 @@ def _lined(raster: MapRaster, candidates: Candidates, codes: NDArray[np.int64]) 
 
 
 def _edges(values: NDArray[np.int64], *, named: bool = False) -> Bools:
-    """Pixels within one of where two values lie beside each other; where ``named``, of two that are not 0."""
-    marked = np.zeros(values.shape, dtype=bool)
-    for here, there, at in (
-        (values[:-1], values[1:], marked[:-1]),
-        (values[:, :-1], values[:, 1:], marked[:, :-1]),
-    ):
-        at |= (here != there) & ((here * there != 0) | (not named))
-    wide = marked.copy()
-    wide[1:] |= marked[:-1]
-    wide[:-1] |= marked[1:]
-    wider = wide.copy()
-    wider[:, 1:] |= wide[:, :-1]
-    wider[:, :-1] |= wide[:, 1:]
-    return wider
+    """Pixels beside which another value lies; where ``named``, of two that are not 0."""
+    shown = np.where(values == 0, np.iinfo(np.int64).max, values) if named else values
+    least = ndimage.minimum_filter(shown, 3)
+    most = ndimage.maximum_filter(values, 3)
+    return np.asarray((least < most) & (values != 0) if named else least < most)
 
 
 def _frame(axes: Axes, view: MapView) -> None:
@@ -232,7 +223,7 @@ NAMES_COARSE = 4
 
 
 def region_codes(verdict: Verdict, rows: Ints) -> tuple[NDArray[np.int64], list[str]]:
-    """What is written over each pixel, as its place in a list of names, of which the first is empty.
+    """Index, for each pixel, of the name that is written over it, in a list whose first name is empty.
 
     Args:
         verdict: Of every direction.
@@ -264,7 +255,7 @@ def region_labels(codes: NDArray[np.int64], names: Sequence[str], written: Seque
 
 
 def _region_names(verdict: Verdict) -> Texts:
-    """What is written over each direction, shape (n,): the structure that forbids it, or "unknown" and why."""
+    """Name written over each direction, shape (n,): the structure that forbids it, or "unknown" and why."""
     unknown = verdict.reason == Reason.UNKNOWN_REGION.value
     named = np.where(verdict.reason == Reason.TOO_CLOSE.value, verdict.structure, "").astype(object)
     whys = np.where(verdict.not_seen, NOT_SEEN_HERE, verdict.structure)

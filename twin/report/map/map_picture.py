@@ -51,12 +51,11 @@ from puncture_twin.twin.report.numbers import (
     arm_text,
     nearest_text,
     needle_text,
-    number,
-    percent,
     reason_counts,
     target_text,
 )
 from puncture_twin.twin.report.palette import safe_shades
+from puncture_twin.twin.report.present import number, percent
 
 WIDTH, HEIGHT = 1690, 1222
 
@@ -173,7 +172,6 @@ def _words(axes: Axes, one: ReasonCount) -> Text:
 
 
 def _width(text: Text) -> float:
-    """Of the column's width."""
     return float(text.get_window_extent().width) / SIDE_WIDE
 
 
@@ -222,7 +220,7 @@ def _even_shade(scale: ClearanceScale) -> Rgb:
 
 
 def _even_text(scale: ClearanceScale) -> str:
-    """What one shade stands for."""
+    """Text for what one shade means."""
     if not np.isfinite(scale.low):
         return "no structure has a margin"
     return f"least clearance {number(scale.low, SCALE_DIGITS, 'mm')} everywhere"

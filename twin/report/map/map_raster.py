@@ -1,6 +1,6 @@
 """The map as pixels: every pixel asks which grid cell it lies in, so no gap and no moire can arise.
 
-A pixel with other colours around it is the mean of a few samples; all others have the colour of their cell.
+It is finer than anything that shows it, which smooths the cells' borders.
 
 The Pareto front on the map: hundreds of dots hide the shades below, so a large front is thinned, and says so.
 """
@@ -21,9 +21,6 @@ from puncture_twin.twin.report.palette import reason_of, safe_shades
 
 PIXELS = 1120
 """Side of the raster that picture and page share: twice as fine as the page shows it, finer than the picture does."""
-
-OVERSAMPLING = 2
-"""Samples per pixel side at the cells' borders, which they smooth."""
 
 SCALE_DIGITS = 1
 """Of the scale's ends, mm; where both print as one number, shades between them would show nothing."""
@@ -104,20 +101,11 @@ def map_raster(candidates: Candidates, view: MapView, size: int = PIXELS) -> Map
         view: The map's geometry.
         size: Pixels per side.
     """
-    cells = MapCells.of(candidates)
-    rows = cells.picture(view, size)
+    rows = MapCells.of(candidates).picture(view, size)
     table = np.zeros((len(candidates) + 1, 4), dtype=np.uint8)
     table[:-1, :3] = row_colours(candidates)
     table[:-1, 3] = 255
-    whole = table.view(np.uint32)[rows, 0]
-    rgba = whole.view(np.uint8).reshape(size, size, 4)
-    line, column = np.nonzero(_beside_another(whole))
-    parts = (np.arange(OVERSAMPLING) + 0.5) / OVERSAMPLING
-    within = np.stack(np.meshgrid(parts, parts), axis=-1).reshape(-1, 1, 2)
-    fine = table[cells.rows(*view.angles_at(_to_disc(np.stack([column, line], axis=-1) + within, size)))].astype(float)
-    opaque = fine[..., 3:] / 255.0
-    mean = (fine[..., :3] * opaque).mean(axis=0) / np.maximum(opaque.mean(axis=0), 1.0 / 255.0)
-    rgba[line, column] = np.round(np.concatenate([mean, 255.0 * opaque.mean(axis=0)], axis=-1))
+    rgba = table[rows]
     _hatch(rgba, rows, candidates)
     return MapRaster(rgba, rows)
 
@@ -140,28 +128,6 @@ def _hatch(rgba: NDArray[np.uint8], rows: NDArray[np.int64], candidates: Candida
         (not_searched, line + 0 * column, HATCH_NOT_SEARCHED),
     ):
         rgba[where & (phase % period < max(1, period // 5)), :3] = colour
-
-
-def _to_disc(pixels: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Points of the unit disc (x right, y up) at columns and rows of the picture, shape (..., 2)."""
-    return (pixels / size * 2 - 1) * [1.0, -1.0]
-
-
-def _beside_another(colours: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """Whether one of the eight around each entry, or nothing at the border, differs from it; shape (n, n)."""
-    beside = np.zeros(colours.shape, dtype=bool)
-    beside[[0, -1]] = beside[:, [0, -1]] = True
-    here, there = slice(None, -1), slice(1, None)
-    for a, b in (
-        ((here, slice(None)), (there, slice(None))),
-        ((slice(None), here), (slice(None), there)),
-        ((here, here), (there, there)),
-        ((here, there), (there, here)),
-    ):
-        differs = colours[a] != colours[b]
-        beside[a] |= differs
-        beside[b] |= differs
-    return beside
 
 
 MOST_DOTS = 40
@@ -188,7 +154,7 @@ class ShownFront(NamedTuple):
 
     @property
     def text(self) -> str:
-        """For a legend."""
+        """Text for a legend."""
         return "Pareto front" if len(self.rows) == self.of else f"Pareto front ({len(self.rows)} of {self.of:,})"
 
 

@@ -9,6 +9,7 @@ import base64
 import io
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -19,15 +20,17 @@ from markupsafe import Markup
 from PIL import Image
 
 from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.errors import Severity
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.formats.dicom.storage import is_dicom_file
 from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
-from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, chance_text
 from puncture_twin.planning.search.windows import find_windows
-from puncture_twin.twin.report.error_pictures import budget_png
+from puncture_twin.twin.report import patient
+from puncture_twin.twin.report.error_pictures import budget_png, rehearsal_png
 from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.numbers import (
@@ -36,24 +39,28 @@ from puncture_twin.twin.report.numbers import (
     expected_text,
     nearest_text,
     needle_text,
-    number,
-    percent,
     reason_counts,
     target_text,
 )
-from puncture_twin.twin.report.page import page_tables as tables
-from puncture_twin.twin.report.page.page_chances import chance_card, chances_section, rooms_section
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import scene_figure
-from puncture_twin.twin.report.page.page_tables import PROJECT, faint, table, two
 from puncture_twin.twin.report.page.template import (
     Card,
     image_address,
     plotly_script,
-    png_address,
-    rehearsal_charts,
     script_json,
     write_html,
+)
+from puncture_twin.twin.report.present import (
+    PROJECT,
+    Block,
+    Warn,
+    blocks_html,
+    inputs_table,
+    number,
+    origin_section,
+    percent,
+    picture,
 )
 from puncture_twin.twin.report.slices.panel import TONES, Panel, grey_table, stored
 from puncture_twin.twin.report.slices.sheet import Slices
@@ -75,33 +82,17 @@ class Uncertainty(NamedTuple):
     budget: Mapping[str, Any] | None = None
 
 
-def write_page(
-    case: Any,
-    anatomy: Any,
-    candidates: Candidates,
-    plan: Any | None,
-    rehearsal: Any | None,
-    registration: Mapping[str, Any] | None,
-    path: Path,
-    *,
-    film: str | None = None,
-    uncertainty: Uncertainty | None = None,
-    pick: Pick | None = None,
-    slices: Sequence[Slices] = (),
-    facts: EntryFacts | None = None,
-    refusal: str = "",
-    raster: MapRaster | None = None,
-) -> None:
-    """Write the page.
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What a page shows.
 
-    Args:
+    Attributes:
         case: The case.
         anatomy: Structures, skin, warnings.
         candidates: The search's rows.
         plan: The plan, or None.
         rehearsal: What was measured, or None.
         registration: The registration as plain values, or None.
-        path: The HTML to write; it appears whole or not at all.
         film: Name of the rehearsal's film, which lies beside the page and is linked; None without one.
         uncertainty: What there is to say of chances and rooms; None where the case declares no errors.
         pick: The planned candidate, or the one to be shown; None shows the best.
@@ -109,10 +100,37 @@ def write_page(
         facts: How the planned or shown path is found at the patient.
         refusal: Why there is no plan although one was requested; "" where none was.
         raster: The map's pixels where somebody has them already.
+        notes: What else must be known of the plan, one sentence each.
+        failures: Why the rehearsal's answer is no, one sentence each.
     """
-    pick = pick or best_pick(candidates)
-    breakdown = None if uncertainty is None else uncertainty.breakdown
-    seed = case.rehearsal.seed if plan is None else plan.seed
+
+    case: Any
+    anatomy: Any
+    candidates: Candidates
+    plan: Any | None = None
+    rehearsal: Any | None = None
+    registration: Mapping[str, Any] | None = None
+    film: str | None = None
+    uncertainty: Uncertainty | None = None
+    pick: Pick | None = None
+    slices: Sequence[Slices] = ()
+    facts: EntryFacts | None = None
+    refusal: str = ""
+    raster: MapRaster | None = None
+    notes: Sequence[str] = ()
+    failures: Sequence[str] = ()
+
+    @property
+    def chosen(self) -> Pick | None:
+        """The pick, or the best direction."""
+        return self.pick or best_pick(self.candidates)
+
+
+def write_page(shown: Shown, path: Path) -> None:
+    """Write the page; it appears whole or not at all."""
+    case, found, plan, done = shown.case, shown.candidates, shown.plan, shown.rehearsal
+    at_patient = () if shown.facts is None else shown.facts.rows()
+    declared = shown.uncertainty is not None
     write_html(
         "report.html",
         path,
@@ -120,58 +138,77 @@ def write_page(
         stands=_location(case),
         dates=dates_text(case),
         needle=needle_text(case),
-        sliced=bool(slices),
-        tones=SHOWN_TONES if slices and slices[0].panels[0].hu is not None else (),
-        methods=methods_text(case, anatomy, candidates),
-        notice=TRUTH_IS_BELIEF if rehearsal is not None and rehearsal.truth_is_belief else "",
-        refused=_refused(candidates),
-        cards=_cards(candidates, pick, plan, rehearsal, breakdown, refusal),
-        counts=tables.counts_table(candidates),
-        best=tables.best_table(candidates),
-        plan=tables.plan_section(
-            plan, () if facts is None else facts.rows(), refusal, declared=uncertainty is not None
-        ),
-        registration=tables.registration_section(registration),
-        rehearsal=tables.rehearsal_section(rehearsal, demanding(anatomy), film),
-        warnings=tables.warnings_section((*(one.sentence for one in candidates.findings), *anatomy.warnings)),
-        inputs=tables.inputs_table(case.inputs),
-        origin=tables.origin_section(seed),
-        data=script_json(_drawn(case, anatomy, candidates, plan, rehearsal, pick, slices, raster)),
+        sliced=bool(shown.slices),
+        tones=SHOWN_TONES if shown.slices and shown.slices[0].panels[0].hu is not None else (),
+        methods=methods_text(case, shown.anatomy, found),
+        notice=TRUTH_IS_BELIEF if done is not None and done.truth_is_belief else "",
+        refused=_refused(found),
+        cards=_cards(shown),
+        counts=blocks_html(patient.counts(found)),
+        best=blocks_html(patient.windows(found)),
+        plan=blocks_html(patient.plan(plan, at_patient, shown.refusal, declared=declared, notes=shown.notes)),
+        registration=blocks_html(patient.registration(shown.registration)),
+        rehearsal=blocks_html(_rehearsed(done, demanding(shown.anatomy), shown.film, shown.failures)),
+        warnings=_doubts(found, shown.anatomy),
+        inputs=inputs_table(case.inputs),
+        origin=origin_section(case.rehearsal.seed if plan is None else plan.seed),
+        data=script_json(_drawn(shown)),
         plotly=plotly_script(),
-        **_uncertain_sections(uncertainty, registration),
+        **_uncertain_sections(shown.uncertainty, shown.registration),
     )
 
 
-def _drawn(
-    case: Any,
-    anatomy: Any,
-    candidates: Candidates,
-    plan: Any | None,
-    rehearsal: Any | None,
-    pick: Pick | None,
-    slices: Sequence[Slices],
-    raster: MapRaster | None,
-) -> dict[str, Any]:
-    """What the page's script draws: map, scene, the rehearsal's charts and slices; arguments as of `write_page`."""
+def _drawn(shown: Shown) -> dict[str, Any]:
+    """What the page's script draws: map, scene and slices."""
+    case, pick = shown.case, shown.chosen
     return {
-        "map": map_data(case, candidates, pick, raster),
-        "scene": scene_figure(case, anatomy, candidates, plan, user_cache(), pick),
-        "charts": None if rehearsal is None else rehearsal_charts(rehearsal, demanding(anatomy)),
-        "slices": slices_data(slices),
+        "map": map_data(case, shown.candidates, pick, shown.raster),
+        "scene": scene_figure(case, shown.anatomy, shown.candidates, shown.plan, user_cache(), pick),
+        "slices": slices_data(shown.slices),
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
     }
+
+
+def _rehearsed(rehearsal: Any | None, away: frozenset[str], film: str | None, failures: Sequence[str]) -> list[Block]:
+    """The rehearsal's numbers, and its curves over time."""
+    alt = "True tip to true target, and true needle to true structures, over time"
+    curves = [] if rehearsal is None else [picture(rehearsal_png(rehearsal, away), alt)]
+    return [*patient.rehearsal(rehearsal, away, film, failures), *curves]
 
 
 def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[str, Any] | None) -> dict[str, Any]:
     """What the page says of chances, budget and rooms; nothing where the case declares no errors."""
     if uncertainty is None:
         return {"chances": None, "budget": None, "rooms": None}
+    facts, tips = uncertainty.budget, uncertainty.picture
+    costs = "What each source of the error costs, and what changes leave"
+    budget = patient.budget(facts)
+    budget[1:1] = [] if facts is None else [picture(budget_png(facts), costs)]
+    rooms = patient.rooms(uncertainty.rooms)
+    if rooms and tips is not None:
+        rooms.append(picture(tips, "Tips of all rooms in the frame of the needle"))
     return {
-        "chances": chances_section(uncertainty.breakdown, registration),
-        "budget": None if uncertainty.budget is None else budget_section(uncertainty.budget),
-        "rooms": rooms_section(uncertainty.rooms, uncertainty.picture),
+        "chances": blocks_html(patient.chances(uncertainty.breakdown, registration)),
+        "budget": blocks_html(budget) if budget else None,
+        "rooms": blocks_html(rooms),
     }
+
+
+def _doubts(candidates: Candidates, anatomy: Any) -> Markup:
+    """What could not be known, and, folded, what was noted besides."""
+    warned = (*(one.sentence for one in candidates.findings), *anatomy.warnings)
+    noted = tuple(one.sentence for one in anatomy.findings if one.severity is Severity.NOTE)
+    return blocks_html([Warn(warned) if warned else Markup("<p>None.</p>"), Warn(noted, f"Notes ({len(noted)})")])
+
+
+def chance_card(breakdown: UncertaintyBreakdown) -> Card:
+    """Both chances and the expected error, for the top of the page."""
+    detail = (
+        f"touches anything forbidden {chance_text(breakdown.p_touch_any)}; expected tip error "
+        f"{number(breakdown.budget.rms_mm, 2, 'mm')} (rms); not modelled: {breakdown.not_modelled}"
+    )
+    return Card("chance to hit", chance_text(breakdown.p_hit), detail)
 
 
 def _refused(candidates: Candidates) -> str:
@@ -182,29 +219,20 @@ def _refused(candidates: Candidates) -> str:
     return f"All {len(candidates):,} directions are refused ({counts})."
 
 
-def _cards(
-    candidates: Candidates,
-    pick: Pick | None,
-    plan: Any | None,
-    rehearsal: Any | None,
-    breakdown: UncertaintyBreakdown | None,
-    refusal: str,
-) -> list[Card]:
-    safe = int(candidates.safe.sum())
-    if safe == 0:
+def _cards(shown: Shown) -> list[Card]:
+    candidates, rehearsal, refusal = shown.candidates, shown.rehearsal, shown.refusal
+    if not candidates.safe.any():
         return []
+    breakdown = None if shown.uncertainty is None else shown.uncertainty.breakdown
     cards = [] if breakdown is None else [chance_card(breakdown)]
     cards.append(_window_card(candidates))
-    if pick is not None:
-        cards.append(_direction_card(*pick, best=pick == best_pick(candidates)))
+    if shown.chosen is not None:
+        cards.append(_direction_card(*shown.chosen, best=shown.chosen == best_pick(candidates)))
     if not candidates.arm_checked:
         cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
-    if plan is None:
-        cards.append(
-            Card("plan", "failed", refusal, bad=True)
-            if refusal
-            else Card("plan", "not requested", tables.NOT_REQUESTED)
-        )
+    if shown.plan is None:
+        failed = Card("plan", "failed", refusal, bad=True)
+        cards.append(failed if refusal else Card("plan", "not requested", patient.NOT_REQUESTED))
     if rehearsal is not None:
         touched = len(rehearsal.contacts)
         detail = f"{touched} contact{'s' if touched != 1 else ''}" if touched else "no contact"
@@ -325,38 +353,6 @@ def scan_date(case: Any) -> str:
             if found is not None and found.is_slice:
                 return found.date
     return ""
-
-
-SHOWN_MM = 0.005
-"""A source that costs less would be 0.00."""
-
-
-def budget_section(facts: Mapping[str, Any]) -> Markup:
-    """The picture, and its numbers.
-
-    Args:
-        facts: As ``register --json`` has them under ``budget``, of the direction that is shown.
-    """
-    now, best = facts["expected_mm"], facts["best"]
-    won = now - best["expected_mm"]
-    head = f"Expected tip error of this insertion: {now:.2f} mm (rms)"
-    text = f"{head}. The next {won:.2f} mm is won by {best['text']}." if won >= SHOWN_MM else f"{head}."
-    form = (
-        "<p>{}</p>"
-        '<p><img src="{}" style="max-width:100%" alt="What each source of the error costs, and what changes leave"></p>'
-    )
-    sources = [
-        (one["text"], f"{one['alone_mm']:.2f}", f"{one['without_mm']:.2f}")
-        for one in facts["sources"]
-        if one["alone_mm"] >= SHOWN_MM
-    ]
-    changes = [(one["text"], f"{one['expected_mm']:.2f}") for one in facts["changes"]]
-    numbers = two(
-        table(("source", "alone, mm", "all but it, mm"), sources, kind="numbers"),
-        table(("with this one change", "expected, mm"), changes, kind="numbers"),
-    )
-    shown = Markup(form).format(text, png_address(budget_png(facts)))
-    return shown + numbers + faint(f"Not modelled: {facts['not_modelled']}.")
 
 
 MOST_BYTES = 2_900_000

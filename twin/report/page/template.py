@@ -2,8 +2,6 @@
 
 ``base.html`` holds the head, the cards, the inputs and the scripts; each page extends it. What a page is given by name
 is text, escaped, or `Markup`, HTML already. A template that names what it is not given is an error.
-
-The page's charts of a rehearsal over time, as plotly figures.
 """
 
 from __future__ import annotations
@@ -12,13 +10,11 @@ import base64
 import gzip
 import io
 import json
-import math
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
@@ -53,9 +49,14 @@ def write_html(template: str, path: Path, **parts: object) -> None:
     Raises:
         jinja2.UndefinedError: The template names a part that is not given.
     """
-    text = _environment().get_template(template).render(parts)
+    text = filled(template, **parts)
     with atomic(Path(path)) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def filled(template: str, **parts: object) -> str:
+    """A template's text, with what it names."""
+    return _environment().get_template(template).render(parts)
 
 
 @cache
@@ -88,101 +89,13 @@ def packed(text: str) -> Markup:
     return Markup(base64.b64encode(gzip.compress(text.encode("utf-8"), PACKED, mtime=0)).decode("ascii"))
 
 
-def data_address(picture: Path) -> str:
-    """A PNG as an address that carries it."""
-    return png_address(picture.read_bytes())
-
-
 def png_address(picture: bytes) -> str:
-    """The same of a PNG that is no file."""
+    """Data address of a PNG in memory."""
     return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
 
 
 def image_address(image: Image.Image, compress_level: int) -> str:
-    """The same of a picture that is no PNG yet."""
+    """Data address of an image, encoded as PNG."""
     stream = io.BytesIO()
     image.save(stream, format="PNG", compress_level=compress_level)
     return png_address(stream.getvalue())
-
-
-MOST_STRUCTURES = 6
-"""Curves of clearance: so many of the nearest structures; the table has the rest."""
-
-MOST_POINTS = 600
-
-NAMED_PHASE = 0.07
-"""Fraction of the time that a phase must last to carry its name; shorter ones would overlap."""
-
-
-COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-"""Okabe and Ito's, one for each curve."""
-
-
-def rehearsal_charts(rehearsal: Any, keep_away: frozenset[str]) -> dict[str, Any]:
-    """Two figures as plain values: ``distance`` (tip to target) and ``clearance`` (needle to structures)."""
-    every = max(1, len(rehearsal.times_s) // MOST_POINTS)
-    times = rehearsal.times_s[::every]
-    away = np.linalg.norm(rehearsal.tip_true_ct[::every] - rehearsal.target_true_ct, axis=1)
-    distance = curve("tip to target", times, np.round(away, 3)) | {"line": {"color": "#00684a"}}
-    names = [name for name in rehearsal.clearance_mm if name in keep_away]
-    nearest = sorted(names, key=lambda n: float(np.min(rehearsal.clearance_mm[n], initial=np.inf)))
-    curves = [
-        curve(name.replace("_", " "), rehearsal.clearance_times_s, np.round(rehearsal.clearance_mm[name], 2))
-        for name in nearest[:MOST_STRUCTURES]
-    ]
-    return {
-        "distance": {
-            "data": [distance],
-            "layout": _layout("true tip to true target, mm") | _phase_marks(rehearsal),
-        },
-        "clearance": {
-            "data": curves,
-            "layout": _layout("true needle to true structure, mm") | {"shapes": [_contact_line()]},
-        },
-    }
-
-
-def curve(name: str, x: Any, y: Any, mode: str = "lines") -> dict[str, Any]:
-    """One trace of a flat chart, as plotly's script reads it; what is no finite number is a gap."""
-    heights = [float(value) if math.isfinite(value) else None for value in y]
-    return {"type": "scatter", "name": name, "mode": mode, "x": np.asarray(x).tolist(), "y": heights}
-
-
-def _phase_marks(rehearsal: Any) -> dict[str, Any]:
-    """A dotted line where each phase begins, and its name where there is room."""
-    long = NAMED_PHASE * rehearsal.times_s[-1]
-    shapes, names = [], []
-    for phase, start, length in _phases(rehearsal):
-        line = {"color": "#999999", "width": 1, "dash": "dot"}
-        shapes.append({"type": "line", "x0": start, "x1": start, "y0": 0, "y1": 1, "yref": "paper", "line": line})
-        at = {"x": start, "y": 1, "yref": "paper", "xanchor": "left", "yanchor": "top", "showarrow": False}
-        names += [at | {"text": phase}] if length > long else []
-    return {"shapes": shapes, "annotations": names}
-
-
-def _contact_line() -> dict[str, Any]:
-    """Across the chart at 0 mm."""
-    ends = {"x0": 0, "x1": 1, "xref": "paper", "y0": 0, "y1": 0}
-    return {"type": "line", **ends, "line": {"color": "#d6001e", "width": 1}}
-
-
-def _phases(rehearsal: Any) -> list[tuple[str, float, float]]:
-    """Name, start and length of each phase, s."""
-    phase, times = rehearsal.phase, rehearsal.times_s
-    starts = np.concatenate([[0], np.flatnonzero(phase[1:] != phase[:-1]) + 1])
-    ends = np.append(starts[1:], len(times) - 1)
-    return [(str(phase[i]), float(times[i]), float(times[j] - times[i])) for i, j in zip(starts, ends, strict=True)]
-
-
-def _layout(title: str) -> dict[str, Any]:
-    return {
-        "height": 330,
-        "margin": {"l": 55, "r": 15, "t": 46, "b": 45},
-        "xaxis": {"title": {"text": "time, s"}},
-        "yaxis": {"title": {"text": title}, "rangemode": "tozero"},
-        "legend": {"orientation": "h", "y": 1.22},
-        "hovermode": "x unified",
-        "colorway": list(COLOURS),
-        "plot_bgcolor": "#fbfbfc",
-        "paper_bgcolor": "#ffffff",
-    }

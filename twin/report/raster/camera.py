@@ -20,7 +20,7 @@ from puncture_twin.planning.geometry.rigid import frame_along
 
 @dataclass(frozen=True, eq=False)
 class ViewCamera:
-    """Where one looks from, in the CT frame.
+    """A virtual camera in the CT frame.
 
     Attributes:
         eye: Shape (3,), mm.
@@ -52,7 +52,7 @@ class ViewCamera:
         return float(self.height / 2 / np.tan(self.fov / 2))
 
     def finer(self, factor: int) -> ViewCamera:
-        """The same view with more pixels."""
+        """This view with more pixels."""
         return replace(self, width=self.width * factor, height=self.height * factor)
 
     def project(self, points_ct: Floats) -> Floats:
@@ -79,7 +79,7 @@ SPARE = 1.05
 
 
 def camera_around(points_ct: Floats, toward: Floats, up: Floats, *, fov: float, width: int, height: int) -> ViewCamera:
-    """A camera that looks along ``toward`` and has every point in the picture.
+    """A camera that looks along ``toward`` and has every point in view.
 
     Args:
         points_ct: Shape (n, 3), what must be seen.

@@ -18,7 +18,7 @@ SAMPLES = 2
 
 @dataclass(frozen=True, eq=False)
 class RasterShot:
-    """What a camera saw of opaque things, in the sample grid.
+    """Opaque surfaces as a camera sees them, in the sample grid.
 
     Attributes:
         colour: Shape (h, w, 3), 0..255.

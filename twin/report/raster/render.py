@@ -286,7 +286,7 @@ def _pixels(solid: View, glass: View, band: int, rows: slice) -> NDArray[np.uint
     behind, shells = Drawn.empty(1, size), Drawn.empty(MAX_SHELLS, size)
     solid.draw(np.zeros(size, dtype=np.float32), behind, corner, solid.of_band(band))
     glass.draw(behind.inverse[0], shells, corner, glass.of_band(band))
-    held = np.empty((1 + MAX_SHELLS, SAMPLES * SAMPLES, 4), dtype=np.float32)
+    held = np.zeros((1 + MAX_SHELLS, SAMPLES * SAMPLES, 4), dtype=np.float32)  # what is not there is blended at 0
     pixels = np.empty((size[0] // SAMPLES, size[1] // SAMPLES, 3), dtype=np.uint8)
     place: Any = tuple(LIGHT), solid.grid, corner
     finish(solid.look, glass.look, *place, behind.triangle, shells.triangle, tuple(BACKGROUND), held, pixels)
@@ -310,7 +310,7 @@ def _bands(camera: ViewCamera) -> list[slice]:
 
 
 def _in_bands(camera: ViewCamera, work: Callable[[int, slice], T]) -> list[T]:
-    """What a function makes of the number and the rows of every band; the processors share them."""
+    """Call a function with number and rows of every band, on several processors, and collect its results."""
     bands = _bands(camera)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(work, range(len(bands)), bands))
@@ -345,14 +345,8 @@ class MovingPicture:
         """The picture without what moves, shape (h, w, 3)."""
         return self._picture
 
-    @property
-    def changed_pixels(self) -> PixelBox:
-        """Where the last picture may differ from `still`."""
-        left, top, right, bottom = self.changed
-        return PixelBox(left // SAMPLES, top // SAMPLES, -(-right // SAMPLES), -(-bottom // SAMPLES))
-
     def another(self) -> MovingPicture:
-        """The same picture for another thread: what stands still is shared."""
+        """A copy of this picture for another thread; what does not move is shared."""
         made = copy(self)
         made._with_own_arrays()
         return made

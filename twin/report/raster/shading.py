@@ -86,7 +86,7 @@ def shade_nearest(
         inverse: Shape (h, w), 1/z.
         triangle: Shape (h, w), -1 for none.
         colour: Shape (h, w, 3), written where the triangle is nearer than ``depth``.
-        depth: Shape (h, w), mm along the ray, written likewise.
+        depth: Shape (h, w), mm along the ray, written too.
     """
     scale, height, width = grid
     for top in range(0, triangle.shape[0], 2):

@@ -24,7 +24,6 @@ from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
-from puncture_twin.twin.report.raster.compositing import PixelBox
 from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
 from puncture_twin.twin.report.scene.film_file import Frame, Part, Pixels, write_gif, write_mp4
 from puncture_twin.twin.report.scene.film_text import BELOW, FrameText, FrameWords, model_note
@@ -128,7 +127,7 @@ def _with_still(frames: Iterable[Frame], count: int) -> Iterator[Frame]:
 
 
 class _Scene(NamedTuple):
-    """What a film is drawn from: a frame without what moves (HEIGHT, WIDTH, 3), and what is drawn over it."""
+    """Ingredients of a film's frames: the image of what does not move (HEIGHT, WIDTH, 3), and what is drawn over it."""
 
     ground: Pixels
     views: _Views
@@ -164,9 +163,8 @@ def _frames(scene: _Scene, times: FilmTimes, progress: Count | None) -> Iterator
     rows = scene.words.rows(times.moments)
     for number, pictures in enumerate(_drawn_ahead(scene.views, [scene.poses(row) for row in rows])):
         row, moment = rows[number], times.moments[number]
-        wide = scene.words.over_wide(pictures.wide, moment)
         yield (
-            pictures.changed(wide) if wide is pictures.wide else Part(0, 0, wide),
+            Part(0, 0, scene.words.over_wide(pictures.wide, moment)),
             Part(VIEW_WIDTH, 0, scene.words.over_near(pictures.near)),
             Part(0, VIEW_HEIGHT, scene.words.below(row, moment)),
         )
@@ -175,17 +173,10 @@ def _frames(scene: _Scene, times: FilmTimes, progress: Count | None) -> Iterator
 
 
 class _Pictures(NamedTuple):
-    """The two views of a frame, each (h, w, 3), and where the overview may differ from what stands still."""
+    """The two views of a frame, each (h, w, 3)."""
 
     wide: Pixels
     near: Pixels
-    box: PixelBox
-
-    def changed(self, wide: Pixels) -> Part:
-        """That part of the overview, from even column and row to even column and row."""
-        left, top, right, bottom = self.box
-        left, top = left // 2 * 2, top // 2 * 2
-        return Part(left, top, wide[top : bottom + bottom % 2, left : right + right % 2])
 
 
 class _Views(NamedTuple):
@@ -196,8 +187,7 @@ class _Views(NamedTuple):
 
     def at(self, poses: Sequence[Floats]) -> _Pictures:
         """Both, with the links and at last the tool at their poses T_ct_body."""
-        wide, near = self.wide.at(poses), self.near.at(poses[-1:])
-        return _Pictures(wide, near, self.wide.changed_pixels)
+        return _Pictures(self.wide.at(poses), self.near.at(poses[-1:]))
 
     def another(self) -> _Views:
         """For another thread."""
@@ -244,7 +234,7 @@ def _planned_path(plan: Any) -> SceneBody:
 
 
 def _tool_layer(case: Any) -> Layer:
-    """All that the flange carries, in its frame: the needle points along +z."""
+    """All that the flange carries, flange frame: the needle points along +z."""
     tip = np.array([0.0, 0.0, case.needle.length_mm])
     bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0])).all
     own = [] if case.tool is None else [Surface(case.tool.mesh, palette.HOLDER)]

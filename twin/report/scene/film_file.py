@@ -1,8 +1,4 @@
-"""The film as a file: what changes from frame to frame is put on a ground, and goes to the encoder as it takes it.
-
-The encoder works on brightness and on the colour of every four pixels (ITU-R BT.601, Y'CbCr 4:2:0). Handed that, of
-the parts that changed, it has half as much to read and nothing to convert.
-"""
+"""The film as a file: what changes from frame to frame is put on a ground, and goes to the encoder as whole frames."""
 
 from __future__ import annotations
 
@@ -20,7 +16,8 @@ from puncture_twin.planning.base.files import atomic
 Pixels = NDArray[np.uint8]
 """Shape (h, w, 3)."""
 
-SAME_BYTES = ("-threads", "4", "-filter_threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact")
+SAME_BYTES = ("-threads", "4", "-filter_threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact",
+              "-sws_flags", "bitexact+accurate_rnd")  # fmt: skip
 """x264 writes other bytes for another number of threads, and left alone it takes as many as there are cores."""
 
 QUALITY = ("-crf", "20", "-preset", "veryfast", "-movflags", "+faststart")
@@ -32,7 +29,7 @@ SIZES = b"stsz"
 
 
 class Part(NamedTuple):
-    """A part of a frame that may differ from the ground; column, row and both sizes are even."""
+    """A part of a frame that may differ from the ground."""
 
     left: int
     top: int
@@ -42,48 +39,12 @@ class Part(NamedTuple):
 Frame = Sequence[Part]
 
 
-class Planes(NamedTuple):
-    """Brightness (h, w), and blue and red against it, each (h / 2, w / 2); bytes."""
-
-    light: NDArray[np.uint8]
-    blue: NDArray[np.uint8]
-    red: NDArray[np.uint8]
-
-
-def planes_of(pixels: Pixels) -> Planes:
-    """What an encoder takes of RGB, its sizes even (ITU-R BT.601, 16..235 and 16..240)."""
-    r, g, b = (pixels[..., k].astype(np.uint16) for k in range(3))
-    light = (66 * r + 129 * g + 25 * b + np.uint16(128 + 16 * 256)) >> 8
-    four_r, four_g, four_b = (_fours(one).astype(np.int32) for one in (r, g, b))
-    blue = (-38 * four_r - 74 * four_g + 112 * four_b + 4 * (128 + 128 * 256)) >> 10
-    red = (112 * four_r - 94 * four_g - 18 * four_b + 4 * (128 + 128 * 256)) >> 10
-    return Planes(light.astype(np.uint8), blue.astype(np.uint8), red.astype(np.uint8))
-
-
-def _fours(values: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """The sums of squares of two by two."""
-    rows = values[::2] + values[1::2]
-    return rows[:, ::2] + rows[:, 1::2]
-
-
 def put_on(ground: Pixels, frame: Frame) -> Pixels:
     """The whole frame."""
     whole = ground.copy()
     for left, top, pixels in frame:
         whole[top : top + pixels.shape[0], left : left + pixels.shape[1]] = pixels
     return whole
-
-
-def encoded(ground: Pixels, frames: Iterable[Frame]) -> Iterator[bytes]:
-    """Whole frames as the encoder takes them, plane after plane."""
-    still = planes_of(ground)
-    for frame in frames:
-        whole = Planes(*(plane.copy() for plane in still))
-        for left, top, pixels in frame:
-            for plane, part, half in zip(whole, planes_of(pixels), (1, 2, 2), strict=True):
-                row, column = top // half, left // half
-                plane[row : row + part.shape[0], column : column + part.shape[1]] = part
-        yield b"".join(plane.tobytes() for plane in whole)
 
 
 def write_mp4(ground: Pixels, frames: Iterable[Frame], path: Path, fps: int) -> None:
@@ -104,7 +65,6 @@ def write_mp4(ground: Pixels, frames: Iterable[Frame], path: Path, fps: int) -> 
         writer = imageio_ffmpeg.write_frames(
             str(temporary),
             (width, height),
-            pix_fmt_in="yuv420p",
             fps=fps,
             codec="libx264",
             quality=None,
@@ -114,8 +74,8 @@ def write_mp4(ground: Pixels, frames: Iterable[Frame], path: Path, fps: int) -> 
         writer.send(None)
         sent = 0
         try:
-            for frame in encoded(ground, frames):
-                writer.send(frame)
+            for frame in frames:
+                writer.send(put_on(ground, frame))
                 sent += 1
         finally:
             writer.close()
@@ -148,7 +108,7 @@ def _boxes(film: bytes, begin: int, end: int) -> Iterator[tuple[bytes, int, int]
 
 
 def write_gif(ground: Pixels, frames: Iterable[Frame], path: Path, fps: int) -> None:
-    """The same as `write_mp4`, as a GIF."""
+    """Write a film as a GIF; arguments as of `write_mp4`."""
     images = [Image.fromarray(put_on(ground, frame)).quantize(128) for frame in frames]
     with atomic(path) as temporary:
         images[0].save(temporary, format="GIF", save_all=True, append_images=images[1:], loop=0, duration=1000 // fps)

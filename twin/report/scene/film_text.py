@@ -1,4 +1,4 @@
-"""What is written into a frame of the film: time, phase, distances, contacts."""
+"""Text in a frame of the film: time, phase, distances, contacts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report import annotate
-from puncture_twin.twin.report.numbers import number
+from puncture_twin.twin.report.present import number
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.scene.film_file import Pixels
 
@@ -73,7 +73,7 @@ class FrameText:
 
 
 class FrameWords:
-    """What is written into frames whose overview is upper left, with the close-up beside it and numbers below.
+    """Text of frames whose overview is upper left, with the close-up beside it and numbers below.
 
     Args:
         source: Where the words come from.

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def"
-"""What stands in the scene, as coloured meshes in the CT frame: the same for picture, film and page.
+"""The scene as coloured meshes in the CT frame, for image, film and page.
 
 Whether a surface hides its own back from whoever is outside of it.
 """
@@ -84,7 +84,7 @@ class SceneBody:
         return Surface(self.mesh, self.colour, self.alpha, rim, self.solid)
 
     def seen_from(self, eye_ct: Floats) -> Surface:
-        """The same for an eye (3,), mm: solid where that is seen to be so, and the eye is not within its box."""
+        """This part for an eye (3,), mm: solid where it looks solid, and the eye is not within its box."""
         low, high = self.mesh.bounds
         within = bool(np.all((low <= eye_ct) & (eye_ct <= high)))
         return replace(self.surface, solid=not within and self._hides_its_back)
@@ -229,7 +229,7 @@ class ArmPicture:
 
     @property
     def plate(self) -> SceneBody:
-        """What the base stands on: that it does stand somewhere; a case does not say what carries it."""
+        """A plate under the arm's base, to show that it is mounted; a case does not say on what."""
         T = self._T_ct_base
         top, down = np.asarray(T[:3, 3], dtype=np.float64), np.asarray(T[:3, 2], dtype=np.float64)
         return SceneBody("base plate", "arm", bar(top, top - PLATE_THICK_MM * down, PLATE_RADIUS_MM), palette.TABLE)

@@ -14,7 +14,8 @@ from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate, palette
-from puncture_twin.twin.report.numbers import nearest_text, number, target_text
+from puncture_twin.twin.report.numbers import nearest_text, target_text
+from puncture_twin.twin.report.present import number
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
 from puncture_twin.twin.report.scene.scene_parts import (

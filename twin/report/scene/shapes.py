@@ -48,7 +48,7 @@ def ring(T_ct_ring: Floats, inner: float, outer: float, thickness: float) -> Tri
 
 
 def corridor_mouth(candidates: Candidates, case: Any) -> TriangleMesh | None:
-    """Where a needle may enter: one patch on the skin for every safe cell of the grid, None when nothing is safe."""
+    """Patches of the skin where a needle may enter, one for every safe cell of the grid; None when nothing is safe."""
     cells = _cells(candidates, case)
     if cells is None:
         return None

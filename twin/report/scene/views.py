@@ -1,4 +1,4 @@
-"""Where to look from: the room with the arm, and close to the needle's path."""
+"""Views of the scene: the workcell with the arm, and close to the needle's path."""
 
 from __future__ import annotations
 

@@ -159,7 +159,6 @@ def _bent(axes: Axes, subject: Subject, plane: Plane, bent_mm: Floats) -> None:
 
 
 def _target(axes: Axes, plane: Plane) -> None:
-    """A cross at the target."""
     near, far = 0.03 * plane.half_mm, 0.09 * plane.half_mm
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         axes.plot((near * x, far * x), (near * y, far * y), color=css(TARGET_POINT), linewidth=2.4)

@@ -161,7 +161,7 @@ def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
 
 @nb.njit(cache=True, error_model="numpy")
 def _cut(vertices, faces, normal, offset):
-    """Where a plane cuts a mesh's triangles, shape (n, 2, 3), mm, in the order of the triangles.
+    """Segments in which a plane cuts a mesh's triangles, shape (n, 2, 3), mm, in the order of the triangles.
 
     Args:
         vertices: Shape (v, 3), mm, read-only.

@@ -13,8 +13,9 @@ from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.planning.search.bending import BEYOND_SKIN_MM, Stretch, stretches
 from puncture_twin.twin.report.annotate import FAINT, legend, write, write_image
 from puncture_twin.twin.report.figures import figure_of, pixels
-from puncture_twin.twin.report.numbers import number, target_text
+from puncture_twin.twin.report.numbers import target_text
 from puncture_twin.twin.report.palette import TARGET_POINT
+from puncture_twin.twin.report.present import number
 from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, TONES, Panel, Tone, draw_panel
 from puncture_twin.twin.report.slices.planes import body_planes, needle_planes
 from puncture_twin.twin.report.slices.subject import Subject
@@ -29,7 +30,7 @@ GAP, TOP, CAPTION = 16, 92, 30
 
 @dataclass(frozen=True, eq=False)
 class Slices:
-    """What was drawn of one direction.
+    """The drawn slices of one direction.
 
     Attributes:
         subject: The direction.
@@ -43,7 +44,7 @@ class Slices:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the lines mean, and what is missing."""
+        """Sentences on what the lines mean, and on what is missing."""
         subject = self.subject
         ct = NO_CT if subject.anatomy.scan is None else "The CT's nearest voxels, not smoothed."
         beads = " Beads: the edge of what is unknown." if subject.has_unknown else ""

@@ -1,4 +1,4 @@
-"""What the slices show of one direction, its needle and the structures near it, or of an image alone."""
+"""Subject of the slices: one direction, its needle and the structures near it, or an image alone."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.search.bending import insertion_along
 from puncture_twin.planning.search.choice import Pick
-from puncture_twin.twin.report.numbers import clearance_text, number
+from puncture_twin.twin.report.numbers import clearance_text
 from puncture_twin.twin.report.palette import OUTSIDE, organ_colours
+from puncture_twin.twin.report.present import number
 
 NEAR_MM = 30.0
 """A structure with a margin that lies nearer to the needle is drawn strongly and named."""
@@ -64,7 +65,7 @@ class Subject:
 
     @property
     def outward_ct(self) -> Floats:
-        """From the target along the needle, unit, shape (3,)."""
+        """Unit vector from the target along the needle, shape (3,)."""
         assert self.pick is not None
         return np.asarray(self.pick.candidates.outward_ct[self.pick.row])
 
@@ -75,7 +76,7 @@ class Subject:
 
     @cached_property
     def colours(self) -> dict[str, Rgb]:
-        """Of every structure, as in the other pictures; what is outside of the body is grey."""
+        """Colour of every structure, as in the other pictures; grey outside of the body."""
         inside = organ_colours(tuple(s.name for s in self.anatomy.structures))
         own = {} if self.pick is not None else {name: colour for name, (_, colour) in BESIDE.items()}
         return {**{s.name: OUTSIDE for s in self.anatomy.surroundings}, **inside, **own}
@@ -87,7 +88,7 @@ class Subject:
 
     @property
     def named(self) -> tuple[Near, ...]:
-        """Those that a legend names: the near ones, or the nearest, however far it lies."""
+        """Structures that a legend names: the near ones, or the nearest, however far it is."""
         return self.near or self._demanding[:1]
 
     @property
@@ -103,7 +104,7 @@ class Subject:
 
     @cached_property
     def _demanding(self) -> tuple[Near, ...]:
-        """All with a margin, nearest first."""
+        """All structures with a margin, nearest first."""
         if self.pick is None:
             return ()
         found, row = self.pick.candidates.clearance, self.pick.row

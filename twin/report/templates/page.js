@@ -318,11 +318,5 @@
   if (slices.length) showSlices(slices[0].theta_deg, slices[0].beta_deg);
   if (map.picked >= 0) choose(map.picked);
 
-  // ---- the charts ----------------------------------------------------------------------------------------------
-  for (const name of ["distance", "clearance"]) {
-    const place = byId(`chart-${name}`);
-    if (data.charts) Plotly.newPlot(place, data.charts[name].data, data.charts[name].layout, { ...config, displayModeBar: false });
-    else place.hidden = true;
-  }
   document.body.dataset.ready = "true";
 })();

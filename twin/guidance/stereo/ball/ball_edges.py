@@ -33,7 +33,7 @@ EDGE_WIDTH_PX = 0.8
 SAME_GREY = 0.4
 """In parts of the contrast: a light of fraction 0.4 shades the ball by less, what hides it differs by more."""
 DISC_RINGS = 0.85 * np.sqrt((np.arange(6) + 0.5) / 6)
-"""Radii at which the disc is read, in parts of the outline's: each ring stands for the same area."""
+"""Radii at which the disc is sampled, as fractions of the outline's: all rings have the same area."""
 
 
 class Grey(NamedTuple):

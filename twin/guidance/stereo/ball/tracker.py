@@ -75,7 +75,7 @@ DEFAULT = TrackerSettings()
 
 
 class DetectedBall(NamedTuple):
-    """A ball that was found."""
+    """A detected ball."""
 
     pixel: Floats
     """Shape (2,): the projection of the ball's centre, px."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose, skew
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, coefficient_slope, distort
 
@@ -107,9 +107,8 @@ def adjust(
     """
     problem = _Problem(tuple(cameras), np.asarray(T_c_bodies), np.asarray(points), seen, spreads)
     if problem.rows() < problem.free.sum() or not problem.free.any():
-        raise InputError(
-            f"{problem.rows()} equations for {problem.free.sum()} unknowns", where="bundle", allowed="at least as many"
-        )
+        what = f"{problem.rows()} equations for {problem.free.sum()} unknowns"
+        refuse(what, "bundle", "at least as many", "undetermined")
     start = np.zeros(int(problem.free.sum()))
     fit = least_squares(
         problem.errors, start, problem.jacobian, method="lm", x_scale=problem.scale(), ftol=TOLERANCE, xtol=TOLERANCE
@@ -128,7 +127,7 @@ def _inverse(information: Floats) -> Floats:
     """Inverse after scaling to a unit diagonal: the parameters' units differ by powers of ten."""
     scale = 1 / np.sqrt(np.diag(information))
     if not np.isfinite(scale).all() or np.linalg.cond(information * np.outer(scale, scale)) > 1e15:
-        raise InputError("a parameter that nothing determines", where="bundle", allowed="hold it or give it a spread")
+        refuse("a parameter that nothing determines", "bundle", "hold it or give it a spread", "undetermined")
     return np.asarray(np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))
 
 
@@ -225,7 +224,7 @@ class _Problem:
 
 
 def _project(camera: Camera, points_c: Floats) -> Floats:
-    """As ``Camera.project``, but smooth everywhere: a step of the search may pass behind a camera."""
+    """Project like ``Camera.project``, but smoothly everywhere: a step of the search may pass behind a camera."""
     points = apply(camera.T_camera_c, points_c)
     flat = points[:, :2] / points[:, 2:]
     return np.asarray(distort(flat, camera.distortion) * [camera.fx, camera.fy] + [camera.cx, camera.cy])

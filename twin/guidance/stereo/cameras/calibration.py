@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.twin.guidance.stereo.cameras.bundle import (
     CAMERA_PARAMETERS,
     Bundle,
@@ -144,42 +144,34 @@ def _parameters_known(bundle: Bundle, spread: Floats) -> float:
 def _check_shapes(points: Floats, pixels: Floats, names: Sequence[str] | None, where: str | Path) -> None:
     count = len(points)
     if points.shape != (count, 3) or pixels.shape != (count, 2) or (names is not None and len(names) != count):
-        raise InputError(
-            f"points of shape {points.shape}, pixels of shape {pixels.shape}",
-            where=where,
-            allowed="(n, 3), (n, 2), and n names if any",
-        )
+        what = f"points of shape {points.shape}, pixels of shape {pixels.shape}"
+        refuse(what, where, "(n, 3), (n, 2), and n names if any", "wrong_shape")
 
 
 def _check_points(points: Floats, pixels: Floats, names: Sequence[str], where: str | Path) -> None:
     lost = np.asarray(~np.isfinite(pixels).all(axis=1))
     if lost.any():
-        raise InputError(f"ball not found: {_listed(names, lost)}", where=where, allowed="every ball seen")
+        refuse(f"ball not found: {_listed(names, lost)}", where, "every ball seen", "ball_not_found")
     wrong = np.asarray(~np.isfinite(points).all(axis=1))
     if wrong.any():
-        raise InputError(f"position not finite: {_listed(names, wrong)}", where=where, allowed="finite mm")
+        refuse(f"position not finite: {_listed(names, wrong)}", where, "finite mm", "not_finite")
     distinct = len(np.unique(points, axis=0))
     if distinct < MIN_POINTS:
-        raise InputError(f"{distinct} distinct points", where=where, allowed=f"{MIN_POINTS} or more, not in a plane")
+        refuse(f"{distinct} distinct points", where, f"{MIN_POINTS} or more, not in a plane", "too_few_points")
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[2] < COPLANAR * spread[0]:
-        raise InputError(
-            f"the points are coplanar: {spread[2] / spread[0]:.2g} as thick as long",
-            where=where,
-            allowed=f"a set at least {COPLANAR:g} as thick as long, such as a 3 x 2 x 2 grid",
-        )
+        what = f"the points are coplanar: {spread[2] / spread[0]:.2g} as thick as long"
+        allowed = f"a set at least {COPLANAR:g} as thick as long, such as a 3 x 2 x 2 grid"
+        refuse(what, where, allowed, "points_coplanar")
 
 
 def _check_linear(linear: LinearFit, points: Floats, pixels: Floats, names: Sequence[str], where: str | Path) -> None:
     if linear.condition > CRITICAL:
-        raise InputError(
-            f"the points leave the camera free (condition {linear.condition:.2g})",
-            where=where,
-            allowed="points that are not on a plane and a line, or on a twisted cubic through the camera",
-        )
+        allowed = "points that are not on a plane and a line, or on a twisted cubic through the camera"
+        refuse(f"the points leave the camera free (condition {linear.condition:.2g})", where, allowed, "undetermined")
     behind = np.asarray(points @ linear.M[2, :3] + linear.M[2, 3] <= 0)
     if behind.any():
-        raise InputError(f"behind the camera: {_listed(names, behind)}", where=where, allowed="all in front of it")
+        refuse(f"behind the camera: {_listed(names, behind)}", where, "all in front of it", "behind_camera")
     misses = np.linalg.norm(project(linear.M, points) - pixels, axis=1)
     _check_misses(misses, names, where)
 
@@ -187,20 +179,16 @@ def _check_linear(linear: LinearFit, points: Floats, pixels: Floats, names: Sequ
 def _check_fit(bundle: Bundle, points: Floats, names: Sequence[str], where: str | Path) -> None:
     unseen = np.asarray(~np.isfinite(bundle.cameras[0].project(points)).all(axis=1))
     if unseen.any():
-        raise InputError(
-            f"behind the camera or beyond its lens: {_listed(names, unseen)}", where=where, allowed="all in its view"
-        )
+        what = f"behind the camera or beyond its lens: {_listed(names, unseen)}"
+        refuse(what, where, "all in its view", "behind_camera")
     _check_misses(np.linalg.norm(bundle.residuals_px, axis=1), names, where)
 
 
 def _check_misses(misses: Floats, names: Sequence[str], where: str | Path) -> None:
     worst = int(np.argmax(misses))
     if misses[worst] > MAX_RESIDUAL_PX:
-        raise InputError(
-            f"{names[worst]} misses by {misses[worst]:.1f} px: swapped, moved or found wrongly",
-            where=where,
-            allowed=f"residuals up to {MAX_RESIDUAL_PX:g} px",
-        )
+        what = f"{names[worst]} misses by {misses[worst]:.1f} px: swapped, moved or found wrongly"
+        refuse(what, where, f"residuals up to {MAX_RESIDUAL_PX:g} px", "point_misses")
 
 
 def _listed(names: Sequence[str], rows: NDArray[np.bool_]) -> str:

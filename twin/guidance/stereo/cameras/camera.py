@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply, frame_about, frame_along, pose
 
 ROTATION_TOLERANCE = 1e-6
@@ -53,15 +53,15 @@ class Camera:
         for name, shape in (("distortion", (4,)), ("T_camera_c", (4, 4))):
             array = np.array(getattr(self, name), dtype=np.float64)
             if array.shape != shape or not np.isfinite(array).all():
-                raise InputError(f"{name} has shape {array.shape} or is not finite", where="camera", allowed=str(shape))
+                refuse(f"{name} has shape {array.shape} or is not finite", "camera", str(shape), "wrong_shape")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         sizes = (self.width, self.height, self.fx, self.fy)
         if not (np.isfinite([*sizes, self.cx, self.cy]).all() and min(sizes) > 0):
-            raise InputError(f"size and focal length {sizes}", where="camera", allowed="finite and above 0")
+            refuse(f"size and focal length {sizes}", "camera", "finite and above 0", "not_positive")
         R = self.T_camera_c[:3, :3]
         if np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-            raise InputError("T_camera_c is not rigid", where="camera", allowed="a rotation and a translation")
+            refuse("T_camera_c is not rigid", "camera", "a rotation and a translation", "not_rigid")
 
     @property
     def center_c(self) -> Floats:
@@ -202,9 +202,7 @@ def stereo_pair(
         InputError: A size, length or distance that is not above 0.
     """
     if not (np.isfinite([baseline_mm, distance_mm]).all() and min(baseline_mm, distance_mm) > 0):
-        raise InputError(
-            f"baseline {baseline_mm:g} mm, distance {distance_mm:g} mm", where="stereo pair", allowed="above 0"
-        )
+        refuse(f"baseline {baseline_mm:g} mm, distance {distance_mm:g} mm", "stereo pair", "above 0", "not_positive")
     positions = [np.array([side * baseline_mm / 2, 0.0, -distance_mm]) for side in (-1, 1)]
     left, right = (
         looking_at(centre, np.zeros(3), (width, height), focal_px, distortion=distortion) for centre in positions

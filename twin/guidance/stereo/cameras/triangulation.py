@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import rq
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 
@@ -52,11 +52,8 @@ def triangulate(cameras: Sequence[Camera], pixels: Floats, covariances: Floats |
     """
     pixels = np.asarray(pixels, dtype=np.float64)
     if len(cameras) < 2 or pixels.ndim != 3 or pixels.shape[::2] != (len(cameras), 2):
-        raise InputError(
-            f"{len(cameras)} cameras and pixels of shape {pixels.shape}",
-            where="triangulation",
-            allowed="two or more cameras and pixels (cameras, n, 2)",
-        )
+        allowed = "two or more cameras and pixels (cameras, n, 2)"
+        refuse(f"{len(cameras)} cameras and pixels of shape {pixels.shape}", "triangulation", allowed, "wrong_shape")
     unit = np.broadcast_to(np.eye(2), (*pixels.shape, 2))
     whitening = np.linalg.inv(np.linalg.cholesky(unit if covariances is None else covariances))
     points = _linear(cameras, pixels)

@@ -1,1 +1,1 @@
-"""Everything that a session measured, estimated at once, and what that says of ball, target and needle."""
+"""Joint estimate of all that a session measured, and its predictions of ball, target and needle."""

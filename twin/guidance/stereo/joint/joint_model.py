@@ -366,9 +366,9 @@ def adjust(observed: Observed, guess: Guess, start: Unknowns | None = None) -> A
     try:
         fit = gauss_newton(x, model.linearised, Unknowns.moved, _arrived, MAX_ITERATIONS)
     except (InputError, np.linalg.LinAlgError, ValueError) as error:  # a camera that cannot be, or what is no number
-        raise NoAnswerError(UNSETTLED) from error
+        raise NoAnswerError(UNSETTLED, code="not_settled") from error
     if not (fit.settled and fit.determined):
-        raise NoAnswerError(UNSETTLED)
+        raise NoAnswerError(UNSETTLED, code="not_settled")
     covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
     chi2 = float(np.sum((fit.system.residuals + fit.system.slopes @ fit.step) ** 2))  # after the last step
     return Adjusted(model, fit.estimate, covariance, chi2, _freedom(fit.system), fit.iterations)

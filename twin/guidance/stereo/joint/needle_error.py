@@ -135,7 +135,7 @@ class _Flange:
         ball_c: Shape (3,), mm.
         R_c_flange: Shape (3, 3).
         rows: Shape (6, N): shift of the ball and rotation of the flange by the unknowns.
-        arrival_slopes: Shape (6, 6): likewise per rad of each joint.
+        arrival_slopes: Shape (6, 6): shift of the ball and rotation of the flange per rad of each joint.
     """
 
     ball_c: Floats

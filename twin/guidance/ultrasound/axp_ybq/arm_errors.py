@@ -24,7 +24,7 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import PARAMETERS, check_flanges, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
@@ -88,7 +88,7 @@ class DeclaredArm(NamedTuple):
 
 
 class DeclaredArms(NamedTuple):
-    """Both declared arms."""
+    """Declared errors of both arms."""
 
     probe: DeclaredArm
     needle: DeclaredArm
@@ -102,13 +102,13 @@ class ArmErrors(NamedTuple):
     """How both arms' errors move the flanges of a recording."""
 
     probe: Floats
-    """Shape (n, 6, 23), per standard deviation; (n, 6, 29) where play is declared."""
+    """Shape (n, 6, 23), motion per standard deviation of the probe's arm; (n, 6, 29) where play is declared."""
     needle: Floats
-    """The same."""
+    """The motion by the needle's arm, likewise shaped."""
     probe_play: Floats
     """How the declared play moves the flange, shape (n, 6)."""
     needle_play: Floats
-    """The same."""
+    """How the play of the needle's arm moves its flange, shape (n, 6)."""
     probe_arrival: Floats
     """Covariance, shape (n, 6, 6)."""
     needle_arrival: Floats
@@ -123,7 +123,7 @@ def arm_errors(declared: DeclaredArms, recording: Recording) -> ArmErrors:
     """
     q_probe, q_needle = recording.q_probe, recording.q_needle
     if q_probe is None or q_needle is None:
-        raise InputError("the arms' errors need the joints", where="recording", allowed="columns A_q1_deg to B_q6_deg")
+        refuse("the arms' errors need the joints", "recording", "columns A_q1_deg to B_q6_deg", "missing_column")
     for arm, q, T, of in ((declared.probe, q_probe, recording.A, "A"), (declared.needle, q_needle, recording.B, "B")):
         names = [f"{of} in pose {name}" for name in recording.names]
         check_flanges(arm.model, q, T, names=names, where="recording")

@@ -1,11 +1,14 @@
-"""From a recording to a calibration: checks, start, fit, noise; a refusal where the poses cannot show the unknowns."""
+"""From a recording to a calibration of A X P = Y B Q: checks, closed form, robust fit, noise.
+
+It is refused where the poses cannot determine every unknown. Letters and frames: docs/concepts/selfcalibration.md.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibration_of, with_length
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
@@ -61,17 +64,20 @@ def calibrate(
 ) -> Calibration:
     """Solve A X P = Y B Q: closed form, then weighted least squares over the poses that agree.
 
+    A: T_base1_end1, B: T_base2_end2, of every pose; P: the tip in the image; X: T_end1_image; Y: T_base1_base2; Q: the
+    tip in end2.
+
     Args:
         recording: At least 16 poses (20 are better); 7 with ``known_tip``; unknowns / 3 + 1 with ``start``.
-        noise: Of both arms and the image; None finds the residuals' spread inside and across the image by itself.
+        noise: Of both arms and the image; None estimates the residuals' spread, inside and across the image.
         known_tip: t_Q, shape (3,), mm, frame end2, where it is known.
-        needle_length_mm: Distance along the shaft from the flange's origin to the tip: holds a constant error of the
-            detected tip along the shaft, which nothing else can.
-        scale: Find mm per unit of P along both axes of the image.
-        robust: Set aside poses that disagree with the others.
-        direction: Let measured directions take part, where the recording has them.
-        start: Begin here instead of at the closed form.
-        arms: How far both arms may lastingly be from their nominal models; the recording then needs joints. None takes
+        needle_length_mm: Distance along the shaft from the flange's origin to the tip: determines a constant error of
+            the detected tip along the shaft, which nothing else does.
+        scale: Whether mm per unit of P, along both axes of the image, is estimated.
+        robust: Whether poses that disagree with the others are set aside.
+        direction: Whether measured needle directions take part, where the recording has them.
+        start: Where the fit begins, instead of at the closed form.
+        arms: Declared errors of both arms that repeat from pose to pose; the recording then needs joints. None takes
             all errors of the flanges for noise.
 
     Raises:
@@ -79,16 +85,19 @@ def calibrate(
         Degenerate: The poses cannot show every unknown. It names the motion and proposes further poses.
     """
     if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
-        raise InputError(f"needle length {needle_length_mm}", where="needle_length_mm", allowed="a positive number, mm")
+        refuse(f"needle length {needle_length_mm}", "needle_length_mm", "a positive number, mm", "not_positive")
     _check(recording, known_tip, scale, start)
+    # 1. Where to begin.
     errors = None if arms is None else arm_errors(arms, recording)
     poses = recording if errors is None else without_play(recording, errors)
     estimate = start or closed_form(poses, known_tip=known_tip, scale=scale)
     if start is not None and known_tip is not None:
         estimate = estimate._replace(t_Q=np.asarray(known_tip, dtype=np.float64))
+    # 2. The fit: outliers, observability, directions, noise.
     active = active_columns(tip=known_tip is None, scale=scale, direction=False)
     problem = Problem(poses, noise or UNWEIGHTED, active, arms=errors)
     solved = _solve(problem, estimate, robust=robust, direction=direction and recording.v is not None)
+    # 3. What the recording cannot show, and the result with its covariance.
     cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None)
     cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
     if arms is not None and recording.turn_probe is None and any(arm.play_rad > 0.0 for arm in arms):
@@ -99,21 +108,21 @@ def calibrate(
 
 def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: Estimate | None) -> None:
     if recording.pixels and not scale:
-        raise InputError("the tip is in pixels", where="recording", allowed="mm, or mm per pixel to be found (scale)")
+        refuse("the tip is in pixels", "recording", "mm, or mm per pixel to be found (scale)", "wrong_unit")
     if known_tip is not None and (np.shape(known_tip) != (3,) or not np.isfinite(known_tip).all()):
-        raise InputError(f"known tip {known_tip}", where="known_tip", allowed="three finite numbers, mm, frame end2")
+        refuse(f"known tip {known_tip}", "known_tip", "three finite numbers, mm, frame end2", "not_finite")
     least = LEAST_POSES if known_tip is None else LEAST_POSES_KNOWN_TIP
     if start is not None:
         least = len(active_columns(tip=known_tip is None, scale=scale, direction=False)) // 3 + 1
     if len(recording) < least:
         allowed = f"{least} or more" + (f", better {ADVISED_POSES}" if least == LEAST_POSES else "")
-        raise InputError(f"{len(recording)} poses", where="recording", allowed=allowed)
+        refuse(f"{len(recording)} poses", "recording", allowed, "too_few_poses")
 
 
 def _solve(
     problem: Problem, start: Estimate, *, robust: bool, direction: bool
 ) -> tuple[Problem, RobustFit, Observability, SeenDirection]:
-    """The tips' fit, then that with the directions and the estimated noise, where they take part.
+    """Fit the tips, require that all unknowns are observable, then fit again with directions and estimated noise.
 
     Raises:
         InputError: Most poses disagree, or the directions contradict them.

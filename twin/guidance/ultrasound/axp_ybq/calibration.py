@@ -54,7 +54,7 @@ class Calibration:
         rms_mm: Root mean square length of the residuals of the poses that were used.
         weights: One per pose, shape (n,): 1 used, 0 set aside.
         outliers: Names of the poses set aside.
-        image: What errors of the image the residuals show, doubted or not; None where the poses cannot show them.
+        image: What errors of the image the residuals show, significant or not; None where the poses cannot show them.
         findings: What the recording says against itself.
         iterations: Steps of the refinement, all rounds together.
         condition: Least over largest singular value of the Jacobian, lengths in 100 mm.
@@ -131,7 +131,7 @@ class Calibration:
         return self.covariance if self.small_sample is None else self.small_sample.covariance
 
     def corrected(self, poses: Recording) -> tuple[Floats, Floats]:
-        """Both flanges moved by the estimated errors of the arms: A and B, each (n, 4, 4), mm.
+        """Poses A and B of both flanges, corrected by the estimated errors of the arms, each (n, 4, 4), mm.
 
         Args:
             poses: Nominal flanges, with joints where arms are declared.
@@ -277,7 +277,7 @@ def calibration_of(
         weights=read_only(1.0 * kept),
         outliers=tuple(name for name, used in zip(names, kept, strict=True) if not used),
         image=image,
-        findings=directions if image is None or not image.doubted else (*directions, image.finding()),
+        findings=directions if image is None or not image.significant else (*directions, image.finding()),
         iterations=fit.iterations,
         condition=observability.ratio,
         covariance=read_only(at_fit.covariance[:p, :p]),

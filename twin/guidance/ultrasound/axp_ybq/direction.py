@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import Finding, InputError, Severity
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
     DIRECTION,
@@ -84,13 +84,13 @@ class SeenDirection(NamedTuple):
     agrees: NDArray[np.bool_]
     """Shape (n,)."""
     spread_rad: float
-    """Root mean square angle inside the image between what was measured and what V gives."""
+    """Root mean square angle inside the image between measured directions and those that V gives."""
     lean_rad: float
-    """The same across the image."""
+    """Root mean square angle across the image, out of its plane."""
     reversed: Bools
     """Shape (n,): the measured direction points from the tip to the hub."""
     sign_known: bool
-    """Whether the direction from flange to tip says which end of the needle the tip is."""
+    """Whether the direction from flange to tip determines which end of the needle is the tip."""
 
 
 def needle_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.bool_]) -> SeenDirection:
@@ -147,7 +147,7 @@ def agreed_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.
     backward = np.asarray(seen @ axis < 0.0)
     if backward[kept].sum() > 0.5 * kept.sum():
         what = f"{_counted(recording.names, backward, REVERSED)}: by it the tip would lie behind the flange"
-        raise InputError(what, where="recording", allowed=ALLOWED, code="directions_reversed")
+        refuse(what, "recording", ALLOWED, "directions_reversed")
     agrees = (angles <= max(FAR * middle / HALF_NORMAL, LEAST_ANGLE)) & ~backward
     total = (agrees & kept) @ seen
     V = np.asarray(total / np.linalg.norm(total))
@@ -175,7 +175,7 @@ def _refuse_scattered(estimate: Estimate, recording: Recording, kept: NDArray[np
         other = float(np.median(_common_axis(directions_end2(estimate, replace(recording, v=v)), kept)[1][kept]))
         if other < min(BETTER * middle, SCATTERED_RAD):
             what += f"; they would agree ({np.degrees(other):.1f} deg) if {slip}"
-    raise InputError(what, where="recording", allowed=ALLOWED, code="directions_scattered")
+    refuse(what, "recording", ALLOWED, "directions_scattered")
 
 
 def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection) -> tuple[Finding, ...]:
@@ -251,7 +251,7 @@ def tip_residuals(estimate: Estimate, recording: Recording) -> Floats:
 
 
 def tip_points(estimate: Estimate, recording: Recording) -> tuple[Floats, Floats]:
-    """The tip in end1, as the image says, and in base2, as the needle's arm says; both (n, 3), mm."""
+    """The tip in end1, by the image, and in base2, by the needle's arm; both (n, 3), mm."""
     in_end1 = (recording.P * estimate.scale) @ estimate.R_X[:, :2].T + estimate.t_X
     in_base2 = recording.B[:, :3, :3] @ estimate.t_Q + recording.B[:, :3, 3]
     return in_end1, in_base2

@@ -83,7 +83,7 @@ LEAST_FREEDOM = 15
 """Residuals minus unknowns below which inside and across are not distinguished: their ratio would be chance."""
 
 LEAST_RAD = 1e-9
-"""The same for directions."""
+"""Least deviation of directions that is estimated, rad: it keeps weights finite."""
 
 WIDEST_RATIO = 30.0
 """Inside and across the image are not taken to differ by more."""

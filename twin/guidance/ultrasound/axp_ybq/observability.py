@@ -92,7 +92,7 @@ def scaled_jacobian(
 
 
 def tips_centre(estimate: Estimate, recording: Recording) -> Floats:
-    """The middle of all tips as the needle's arm says, shape (3,), mm, base2."""
+    """The middle of all tips by the needle's arm, shape (3,), mm, base2."""
     return np.asarray(tip_points(estimate, recording)[1].mean(axis=0))
 
 
@@ -257,7 +257,7 @@ class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
         self.ratio = observability.ratio
         self.suggestion = suggestion
         what = "; ".join(motion.text for motion in self.motions) + f" (singular value ratio {self.ratio:.1e})"
-        super().__init__(what, where="recording", allowed=suggestion.text)
+        super().__init__(what, where="recording", allowed=suggestion.text, code="poses_too_alike")
 
 
 def require_observable(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) -> Observability:

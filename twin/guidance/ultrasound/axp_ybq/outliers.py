@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import facing
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import (
@@ -79,11 +79,8 @@ def settled(problem: Problem, fit: RobustFit, *, recheck: bool = True) -> Robust
 def _check_enough(problem: Problem, kept: Bools) -> None:
     n, unknowns = len(problem.recording), len(problem.active)
     if kept.sum() < max(LEAST_KEPT * n, unknowns / 3 + 1):
-        raise InputError(
-            f"only {int(kept.sum())} of {n} poses agree with each other",
-            where="recording",
-            allowed="a recording in which most tips are right",
-        )
+        allowed = "a recording in which most tips are right"
+        refuse(f"only {int(kept.sum())} of {n} poses agree with each other", "recording", allowed, "poses_disagree")
 
 
 HUBER_STEPS, TUKEY_STEPS = 6, 12
@@ -122,7 +119,7 @@ FALSE_ALARMS = 0.01
 """Chance that a recording without outliers loses a pose."""
 
 ROUNDING = 1e-6
-"""Mm, and rad: residuals of this size are rounding, and none of them stands out."""
+"""Mm, and rad: residuals of this size are rounding, and no outliers."""
 
 ALARM_FRACTION = 0.6
 """Fraction of the spread that is believed while outliers may be in it: a false alarm costs time, not accuracy."""

@@ -57,7 +57,7 @@ class Problem(NamedTuple):
     active: NDArray[np.int_]
     """Which of the 19 parameters are free."""
     lean_rad: float = 0.0
-    """How far needles lean out of the slice and still show: all that a direction seen in the image says across it."""
+    """How far a needle may lean out of the slice and still be seen; across, the image shows no more of a direction."""
     arms: ArmErrors | None = None
     """Errors of both arms, where they are declared."""
 
@@ -134,7 +134,7 @@ def covariances(
 
 
 def _propagated(estimate: Estimate, recording: Recording, noise: Noise, v_image: Floats | None) -> Floats:
-    """Both flanges' and the tip's noise in the residuals; every source is independent and isotropic."""
+    """Covariance of the residuals from the noise of flanges and tip; every source is independent and isotropic."""
     R_A, R_B = recording.A[:, :3, :3], recording.B[:, :3, :3]
     in_end1, _ = tip_points(estimate, recording)
     turn_A, turn_B = R_A @ skew(in_end1), -estimate.R_Y @ R_B @ skew(estimate.t_Q)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import brief
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from puncture_twin.planning.formats.points import joint_readings
@@ -64,7 +64,7 @@ class Recording:
         q_needle: Joints of the needle's arm, shape (n, 6), rad; given if and only if the probe's are.
         turn_probe: Direction of each probe joint's last rotation before it stopped, shape (n, 6): 1, -1, or 0
             where nobody knows. None where it was not recorded: the play's sign is then unknown.
-        turn_needle: The same of the needle's arm; both only with joints.
+        turn_needle: As ``turn_probe``, of the needle's arm; both only with joints.
         shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known. Only with
             directions; None where it was not measured: all directions then count the same.
 
@@ -92,9 +92,8 @@ class Recording:
         n = len(np.atleast_1d(self.A))
         names = tuple(self.names) or tuple(str(i + 1) for i in range(n))
         if n == 0 or len(names) != n or len(set(names)) != n:
-            raise InputError(
-                f"{n} poses and {len(set(names))} different names", where="recording", allowed="one name per pose"
-            )
+            what = f"{n} poses and {len(set(names))} different names"
+            refuse(what, "recording", "one name per pose", "duplicate_name")
         object.__setattr__(self, "names", names)
         object.__setattr__(self, "A", _rigid(self.A, "A", names))
         object.__setattr__(self, "B", _rigid(self.B, "B", names))
@@ -104,12 +103,12 @@ class Recording:
         if self.shaft_mm is not None:
             object.__setattr__(self, "shaft_mm", _lengths(self.shaft_mm, self.v, names))
         if (self.q_probe is None) != (self.q_needle is None):
-            raise InputError("joints of one arm only", where="recording", allowed="those of both, or none")
+            refuse("joints of one arm only", "recording", "those of both, or none", "joints_of_one_arm")
         for key in ("q_probe", "q_needle"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, _angles(getattr(self, key), key, names))
         if (self.turn_probe is None) != (self.turn_needle is None) or (self.turn_probe is not None and not self.joints):
-            raise InputError("turns without joints, or of one arm only", where="recording", allowed="both, with joints")
+            refuse("turns without joints, or of one arm only", "recording", "both, with joints", "joints_of_one_arm")
         for key in ("turn_probe", "turn_needle"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, _signs(getattr(self, key), key, names))
@@ -146,7 +145,7 @@ class Recording:
         """
         widths = [None if r.v is None else r.v.shape[1] for r in (self, other)]
         if widths[0] != widths[1] or self.pixels != other.pixels:
-            raise InputError("two recordings that hold different things", where="recording", allowed="the same columns")
+            refuse("two recordings that hold different things", "recording", "the same columns", "tables_differ")
         A, B, P = (np.concatenate([getattr(r, key) for r in (self, other)]) for key in "ABP")
         parts: dict[str, Any] = {key: _both(getattr(self, key), getattr(other, key)) for key in OPTIONAL}
         return Recording(A, B, P, pixels=self.pixels, **parts)
@@ -161,9 +160,11 @@ def _finite(values: Floats, what: str, names: tuple[str, ...], *, widths: tuple[
     array = np.array(values, dtype=np.float64)
     if array.ndim != 2 or len(array) != len(names) or array.shape[1] not in widths:
         wanted = " or ".join(f"({len(names)}, {width})" for width in widths)
-        raise InputError(f"{what} has shape {array.shape}", where="recording", allowed=wanted)
+        refuse(f"{what} has shape {array.shape}", "recording", wanted, "wrong_shape")
     bad = np.asarray(~(np.isfinite(array) & (np.abs(array) <= MAX_COORDINATE_MM)).all(axis=1))
-    _refuse_first(bad, names, what, "is not finite or out of range", f"numbers within {MAX_COORDINATE_MM:g}")
+    _refuse_first(
+        bad, names, what, "is not finite or out of range", f"numbers within {MAX_COORDINATE_MM:g}", "not_finite"
+    )
     array.setflags(write=False)
     return array
 
@@ -176,29 +177,31 @@ def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
 
 def _lengths(values: Floats, v: Floats | None, names: tuple[str, ...]) -> Floats:
     if v is None:
-        raise InputError("shaft_mm without directions", where="recording", allowed="beside v, or not at all")
+        refuse("shaft_mm without directions", "recording", "beside v, or not at all", "missing_column")
     array = _finite(np.reshape(values, (-1, 1)), "shaft_mm", names, widths=(1,))[:, 0]
-    _refuse_first(array < LEAST_SHAFT_MM, names, "shaft_mm", "is too little", f"at least {LEAST_SHAFT_MM:g} mm")
+    _refuse_first(
+        array < LEAST_SHAFT_MM, names, "shaft_mm", "is too little", f"at least {LEAST_SHAFT_MM:g} mm", "out_of_range"
+    )
     return array
 
 
 def _signs(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
     array = _finite(values, what, names, widths=(6,))
     bad = np.asarray(~np.isin(array, (-1.0, 0.0, 1.0)).all(axis=1))
-    _refuse_first(bad, names, what, "is no way to turn", "1, -1, or 0 where nobody knows")
+    _refuse_first(bad, names, what, "is no way to turn", "1, -1, or 0 where nobody knows", "bad_value")
     return array
 
 
 def _rigid(T: Floats, what: str, names: tuple[str, ...]) -> Floats:
     array = np.array(T, dtype=np.float64)
     if array.shape != (len(names), 4, 4):
-        raise InputError(f"{what} has shape {array.shape}", where="recording", allowed=f"({len(names)}, 4, 4)")
+        refuse(f"{what} has shape {array.shape}", "recording", f"({len(names)}, 4, 4)", "wrong_shape")
     _finite(array.reshape(len(names), 16), what, names, widths=(16,))
     R = array[:, :3, :3]
     error = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2))
     bad = (error > ROTATION_TOLERANCE) | (np.linalg.det(R) < 0) | (np.abs(array[:, 3] - [0, 0, 0, 1]).max(axis=1) > 0)
     allowed = f"a rotation (R^T R = 1 to {ROTATION_TOLERANCE:g}, determinant +1) and a translation, last row 0 0 0 1"
-    _refuse_first(bad, names, what, "is not a rigid motion", allowed)
+    _refuse_first(bad, names, what, "is not a rigid motion", allowed, "not_rigid")
     array.setflags(write=False)
     return array
 
@@ -207,14 +210,16 @@ def _directions(v: Floats, names: tuple[str, ...]) -> Floats:
     array = np.array(_finite(v, "v", names, widths=(2, 3)))
     lengths = np.linalg.norm(array, axis=1)
     flat = np.linalg.norm(array[:, :2], axis=1) < LEAST_IN_PLANE * lengths
-    _refuse_first(~np.any(array != 0, axis=1), names, "v", "has no length", "a direction")
-    _refuse_first(flat, names, "v", "points out of the image", "a needle that lies in the image")
+    _refuse_first(~np.any(array != 0, axis=1), names, "v", "has no length", "a direction", "zero_direction")
+    _refuse_first(flat, names, "v", "points out of the image", "a needle that lies in the image", "out_of_image")
     array /= lengths[:, None]
     array.setflags(write=False)
     return array
 
 
-def _refuse_first(bad: NDArray[np.bool_], names: tuple[str, ...], what: str, problem: str, allowed: str) -> None:
+def _refuse_first(
+    bad: NDArray[np.bool_], names: tuple[str, ...], what: str, problem: str, allowed: str, code: str
+) -> None:
     if bad.any():
         name = names[int(np.argmax(bad))]
-        raise InputError(f"{what} of pose {name} {problem}", where="recording", allowed=allowed)
+        refuse(f"{what} of pose {name} {problem}", "recording", allowed, code)

@@ -188,7 +188,7 @@ def refine(
     return Refined(fit.estimate, fit.iterations)
 
 
-DOUBTED = 0.01
+SIGNIFICANT = 0.01
 """A recording without such errors is said to have them once in a hundred."""
 CLEAR = 3.0
 """An error so many standard deviations from zero is named with the largest one."""
@@ -217,9 +217,9 @@ class ImageErrors(NamedTuple):
     """What they leave at the recorded tips, whatever the calibration does to make up for them."""
 
     @property
-    def doubted(self) -> bool:
+    def significant(self) -> bool:
         """Whether the test finds errors of the image."""
-        return self.probability < DOUBTED
+        return self.probability < SIGNIFICANT
 
     def finding(self) -> Finding:
         """One sentence: which errors, how large, how sure, and their effect at the tips."""

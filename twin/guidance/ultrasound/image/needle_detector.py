@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager
 
@@ -192,7 +192,7 @@ def detect(image: Pixels, imager: Imager, settings: DetectorSettings | None = No
     settings = settings or DetectorSettings()
     if image.shape != (imager.rows, imager.columns):
         size = f"({imager.rows}, {imager.columns})"
-        raise InputError(f"picture of shape {image.shape}", where="needle detector", allowed=f"{size}, the imager's")
+        refuse(f"picture of shape {image.shape}", "needle detector", f"{size}, the imager's", "wrong_shape")
     relative = over_background(image, imager)
     segment = _segment(relative, imager, settings)
     length = float(np.linalg.norm(segment.end - segment.start))
@@ -224,7 +224,6 @@ def over_background(image: Pixels, imager: Imager) -> Floats:
 
 
 def _segment(relative: Floats, imager: Imager, settings: DetectorSettings) -> Segment:
-    """The brightest segment, mm."""
     clipped = np.minimum(relative, BRIGHTEST) - 1.0 - EXPECTED
     small = np.asarray(cv2.GaussianBlur(clipped, (0, 0), COARSE / 1.5)[::COARSE, ::COARSE], dtype=np.float64)
     low, high = np.radians(settings.inclination_deg)

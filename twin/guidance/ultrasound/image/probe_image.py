@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 
 Complexes = NDArray[np.complexfloating]
 """Single precision inside: the display has 256 greys."""
@@ -195,7 +195,7 @@ class NeedleInImage(NamedTuple):
 
 
 class Lesion(NamedTuple):
-    """A ball that scatters less than what is around it."""
+    """A ball that scatters less than its surroundings."""
 
     centre_image: Floats
     """Shape (3,), mm."""
@@ -328,5 +328,5 @@ def _require_usable(needle: NeedleInImage) -> None:
     tip, direction = np.asarray(needle.tip_image), np.asarray(needle.direction_image)
     usable = tip.shape == (3,) and direction.shape == (3,) and bool(np.isfinite([*tip, *direction]).all())
     if not usable or abs(float(np.linalg.norm(direction)) - 1.0) > UNIT:
-        what = f"needle at {tip.tolist()} along {direction.tolist()}"
-        raise InputError(what, where="B-mode picture", allowed="a finite tip (3,) in mm and a unit direction (3,)")
+        allowed = "a finite tip (3,) in mm and a unit direction (3,)"
+        refuse(f"needle at {tip.tolist()} along {direction.tolist()}", "B-mode picture", allowed, "not_finite")

@@ -1,4 +1,4 @@
-"""The CT as a second witness of the segmentation: what it shows inside the body that no structure of the case names.
+"""A cross-check of the segmentation by the CT: what it shows inside the body that no structure of the case names.
 
 A rib that a segmentation lost, a stent, a calcified vessel: dense, and part of no structure. Gas outside of what may
 hold gas: a loop of bowel or a piece of lung that nobody labelled. Both become structures of role ``unknown``.
@@ -49,7 +49,7 @@ class Named(NamedTuple):
 
 
 class Unnamed(NamedTuple):
-    """What no structure names: closed surfaces in LPS mm, or None where there is nothing."""
+    """Closed surfaces of what no structure names, LPS mm; None where there is nothing."""
 
     dense: TriangleMesh | None
     gas: TriangleMesh | None

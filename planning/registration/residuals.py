@@ -17,11 +17,12 @@ import numpy as np
 from scipy.special import chdtrc, chdtri, fdtrc, fdtri
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import least_squares_map
 
-DOUBT = 0.001
-"""Residuals that honest noise exceeds once in 1,000 registrations contradict the declared noise."""
+REJECT_LEVEL = 0.001
+"""Significance level of rejection: honest noise exceeds such residuals once in 1,000 registrations."""
 
 MAX_FRE_MM = 5.0
 """Without a declared noise: markers that miss by more (rms) are not the same markers, or have moved."""
@@ -87,7 +88,7 @@ class ResidualTest:
         """The greatest FRE that passes."""
         if self.declared_fle_mm is None:
             return MAX_FRE_MM
-        return self.declared_fle_mm * float(np.sqrt(chdtri(self.freedom, DOUBT) / (3 * self.count)))
+        return self.declared_fle_mm * float(np.sqrt(chdtri(self.freedom, REJECT_LEVEL) / (3 * self.count)))
 
     @property
     def explained(self) -> bool:
@@ -139,8 +140,8 @@ class ResidualTest:
         scaled = "" if self.explained else f"; noise of {self.scale:.2f} times that would"
         return (
             f"fle_mm = {self.declared_fle_mm:g} {what} FRE {self.fre_mm:.2f} mm (chi-squared {self.chi_squared:.1f}, "
-            f"{100 * (1 - DOUBT):g} % stay below {chdtri(self.freedom, DOUBT):.1f} at {self.freedom} degrees of "
-            f"freedom){scaled}"
+            f"{100 * (1 - REJECT_LEVEL):g} % stay below {chdtri(self.freedom, REJECT_LEVEL):.1f} at "
+            f"{self.freedom} degrees of freedom){scaled}"
         )
 
     @property
@@ -175,11 +176,11 @@ class ResidualTest:
     @property
     def _f_ratio(self) -> float:
         """The ratio of two FRE of the same noise that is exceeded once in 1,000."""
-        return float(np.sqrt(fdtri(self.freedom, self.freedom, 1 - DOUBT)))
+        return float(np.sqrt(fdtri(self.freedom, self.freedom, 1 - REJECT_LEVEL)))
 
 
-class OddMarker(NamedTuple):
-    """A marker that the others contradict.
+class OutlierMarker(NamedTuple):
+    """A marker that does not fit the others.
 
     Attributes:
         name: Its name.
@@ -200,17 +201,26 @@ class OddMarker(NamedTuple):
             f"reading, and fit each other to {self.others_fre_mm:.1f} mm; check its name, touch and place in the CT"
         )
 
+    def finding(self) -> Finding:
+        """The same, as a warning."""
+        numbers: dict[str, float | str] = {
+            "marker": self.name,
+            "miss_mm": self.miss_mm,
+            "others_fre_mm": self.others_fre_mm,
+        }
+        return Finding("outlier_marker", Severity.WARNING, self.text(), numbers)
 
-def odd_marker(
+
+def outlier_marker(
     fit: Callable[[Floats, Floats], Floats],
     names: tuple[str, ...],
     points_ct: Floats,
     points_base: Floats,
     fle_mm: float | None,
-) -> OddMarker | None:
+) -> OutlierMarker | None:
     """The marker that least fits the others, if chance does not explain it.
 
-    A residual of the common fit hides it, since the odd marker pulls the fit. Marker i left out, the others fit with
+    A residual of the common fit hides it, since the outlier pulls the fit. Marker i left out, the others fit with
     residuals r_j and nu = 3 (n-1) - 6 degrees of freedom; they place it d_i off its reading, whose expected square is
     FLE^2 (1 + l_i^2) with l_i the leverage at its place (Fitzpatrick 1998). Where all markers err alike,
     F_i = (d_i^2 / 3) / ((1 + l_i^2) s^2) with s^2 = sum |r_j|^2 / nu follows F(3, nu).
@@ -226,9 +236,9 @@ def odd_marker(
     if count < LEAST_MARKERS:
         return None
     least = MIN_FLE_MM if fle_mm is None else fle_mm
-    found = [_left_out(fit, row, names, points_ct, points_base, least) for row in range(count)]
-    chance, odd = min((one for one in found if one is not None), key=lambda one: one[0], default=(1.0, None))
-    return odd if chance < FALSE_ALARM / count else None
+    tests = [_left_out(fit, row, names, points_ct, points_base, least) for row in range(count)]
+    chance, outlier = min((one for one in tests if one is not None), key=lambda one: one[0], default=(1.0, None))
+    return outlier if chance < FALSE_ALARM / count else None  # Bonferroni: each of the markers is tested
 
 
 def _left_out(
@@ -238,8 +248,8 @@ def _left_out(
     points_ct: Floats,
     points_base: Floats,
     least_fle_mm: float,
-) -> tuple[float, OddMarker] | None:
-    """How likely one marker's miss is by chance, and the marker; None where the others lie on a line."""
+) -> tuple[float, OutlierMarker] | None:
+    """Chance of a miss as large as one marker's, and the marker; None where the others lie on a line."""
     ct, base = np.delete(points_ct, row, axis=0), np.delete(points_base, row, axis=0)
     spread = np.linalg.svd(ct - ct.mean(axis=0), compute_uv=False)
     if spread[1] < LEAST_SPREAD * spread[0]:
@@ -251,7 +261,7 @@ def _left_out(
     miss = float(np.linalg.norm(apply(T, points_ct[row : row + 1]) - points_base[row]))
     lever = float(leverage(ct, points_ct[row : row + 1])[0])
     chance = float(fdtrc(3, freedom, miss**2 / 3 / ((1 + lever**2) * variance)))
-    return chance, OddMarker(names[row], miss, len(ct), float(np.sqrt(squares / len(ct))))
+    return chance, OutlierMarker(names[row], miss, len(ct), float(np.sqrt(squares / len(ct))))
 
 
 WARNED = 0.01
@@ -279,7 +289,7 @@ class NoiseTest:
 
     @property
     def probability(self) -> float:
-        """Of residuals as large as these, if the declaration holds."""
+        """Chance of residuals as large as these, if the declaration holds."""
         return float(chdtrc(self.freedom, self.chi_squared))
 
     @property
@@ -290,7 +300,7 @@ class NoiseTest:
     @property
     def explained(self) -> bool:
         """Whether a registration with such residuals is taken at all without the case's consent."""
-        return self.found or self.probability >= DOUBT
+        return self.found or self.probability >= REJECT_LEVEL
 
     @property
     def estimate(self) -> float:
@@ -306,7 +316,7 @@ class NoiseTest:
 
     @property
     def scale(self) -> float:
-        """By which the declared deviations are multiplied: 1 where the declaration holds."""
+        """Factor of the declared deviations: 1 where the declaration holds."""
         return self.estimate if self.found or not self.agrees else 1.0
 
     @property
@@ -362,13 +372,13 @@ class Conditioning:
         spread_ratio: s2/s1, singular values of the centred markers.
         altitude_mm: Least altitude of the widest triangle of markers.
         leverage: Expected TRE at the target over FLE.
-        flags: The weak points in words; empty for a good set.
+        flags: The weak points, warnings; empty for a good set.
     """
 
     spread_ratio: float
     altitude_mm: float
     leverage: float
-    flags: tuple[str, ...]
+    flags: tuple[Finding, ...]
 
 
 def leverage(markers: Floats, points: Floats) -> Floats:
@@ -398,11 +408,14 @@ def conditioning(markers: Floats, target: Floats) -> Conditioning:
     lever = float(leverage(markers, target)[0])
     flags = []
     if ratio < WEAK_SPREAD:
-        flags.append(f"markers lie almost on a line (s2/s1 {ratio:.2f} < {WEAK_SPREAD})")
+        said = f"markers lie almost on a line (s2/s1 {ratio:.2f} < {WEAK_SPREAD})"
+        flags.append(Finding("markers_on_a_line", Severity.WARNING, said, {"spread_ratio": ratio}))
     if altitude < WEAK_ALTITUDE_MM:
-        flags.append(f"the widest marker triangle is flat (altitude {altitude:.0f} < {WEAK_ALTITUDE_MM:.0f} mm)")
+        said = f"the widest marker triangle is flat (altitude {altitude:.0f} < {WEAK_ALTITUDE_MM:.0f} mm)"
+        flags.append(Finding("flat_marker_triangle", Severity.WARNING, said, {"altitude_mm": altitude}))
     if lever > WEAK_LEVERAGE:
-        flags.append(f"the target is far from the markers (TRE/FLE {lever:.1f} > {WEAK_LEVERAGE:.0f})")
+        said = f"the target is far from the markers (TRE/FLE {lever:.1f} > {WEAK_LEVERAGE:.0f})"
+        flags.append(Finding("target_far_from_markers", Severity.WARNING, said, {"leverage": lever}))
     return Conditioning(ratio, altitude, lever, tuple(flags))
 
 

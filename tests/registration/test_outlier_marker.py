@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.noise_test import FALSE_ALARM, odd_marker
 from puncture_twin.planning.registration.registration import register
+from puncture_twin.planning.registration.residuals import FALSE_ALARM, outlier_marker
 
 TURN = np.array([0.3, -0.2, 1.0])
 T_BASE_CT = pose(exp_rotation(TURN), left_jacobian(TURN) @ [300.0, -50.0, 100.0])
@@ -28,7 +28,7 @@ def markers(seed, noise_mm=0.4, moved=None, by_mm=0.0):
 
 def odd(pairs, fle_mm=None):
     """The odd marker of a set."""
-    return odd_marker(fit_rigid, pairs.names, pairs.points_ct, pairs.points_base, fle_mm)
+    return outlier_marker(fit_rigid, pairs.names, pairs.points_ct, pairs.points_base, fle_mm)
 
 
 @pytest.mark.parametrize("moved", range(6))
@@ -36,7 +36,7 @@ def test_a_marker_that_slipped_is_called_by_its_name(moved):
     """A residual of some 4 mm among five below 1.5: named, with how far the others place it from its reading."""
     pairs = markers(3, moved=moved, by_mm=8.0)
     found = register(pairs, method="rigid", target_ct=TARGET)
-    (said,) = [flag for flag in found.flags if "does not fit" in flag]
+    (said,) = [flag.sentence for flag in found.flags if flag.code == "outlier_marker"]
     assert said.startswith(f"marker {NAMES[moved]} does not fit: the other 5 place it")
     told = odd(pairs)
     rest = [row for row in range(6) if row != moved]
@@ -64,10 +64,10 @@ def test_tiny_residuals_and_few_markers_name_nobody():
     pairs = markers(1, moved=1, by_mm=8.0)
     assert odd(MarkerPairs(NAMES[:3], pairs.points_ct[:3], pairs.points_base[:3])) is None
     row = np.array([[0.0, 0, 0], [50, 0, 0], [100, 0, 0], [40, 80, 0]])
-    assert odd_marker(fit_rigid, NAMES[:4], row, row + [0, 0, 1.0], None) is None
+    assert outlier_marker(fit_rigid, NAMES[:4], row, row + [0, 0, 1.0], None) is None
 
 
 def test_a_refusal_names_it_too():
     """Where the declared noise does not explain the residuals, the line says which marker to look at."""
-    with pytest.raises(InputError, match=r"does not explain FRE .*; marker D does not fit: the other 5"):
+    with refused("residuals_too_large"):
         register(markers(2, moved=3, by_mm=9.0), method="rigid", target_ct=TARGET, fle_mm=1.0)

@@ -1,61 +1,68 @@
-"""The search of one structure: bundles of directions against the packed surface, exact distances out."""
+"""The search of one structure: bundles of directions against the packed surface, exact distances out.
+
+For each bundle: an upper bound for every member, a walk down the tree that collects the blocks whose lower bound does
+not exceed the worst of them (branch and bound), and `measure_bundle`, which measures these blocks.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.clearance.kernels.bounds import ZERO, disc_bounds, lower_upper_bounds
+from puncture_twin.planning.clearance.kernels.bounds import ZERO, disc_bounds, tighten_upper_bounds
 from puncture_twin.planning.clearance.kernels.bundle_search import FOUR, GROWN, direction, measure_bundle
-from puncture_twin.planning.clearance.kernels.lanes import LANES, at_most, bare, lowest
-from puncture_twin.planning.clearance.kernels.side_by_side import NODE_ROWS, Found, NeedleAxes, Scratch
+from puncture_twin.planning.clearance.kernels.lanes import LANES, bare, lanes_at_most, lowest_bit
+from puncture_twin.planning.clearance.kernels.side_by_side import NODE_ROWS, NeedleAxes, Scratch, SearchOutput
 
 BEHIND = np.float32(-1e6)
-"""Radius of what only fills up the last group of found blocks: the disc bound takes it as behind the target, mm."""
+"""Radius of the lanes that only fill up the last group of blocks: `disc_bounds` takes them as behind the target, mm."""
 
 COUNTED = ("bundles", "nodes", "blocks found", "axes", "filters", "block tests", "triangle tests")
-"""What `search_tiles` counts: the times it went through each of its stages, a node and a filter being 16 discs."""
+"""What `search_bundles` counts: how often it does each of its steps; a node and a filter are 16 discs."""
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
-    surface, all_nodes, slack, origin, lengths, at_target, nearest, tiles, scratch, found, lanes
+def search_bundles(  # type: ignore[no-untyped-def]  # numba infers
+    surface, all_nodes, slack, origin, lengths, at_target, nearest, bundles, scratch, found, lanes
 ):
-    """Distance and depth of every axis; a structure's whole search.
+    """Find distance and depth of every axis from one structure.
 
     Args:
         surface: `Blocks.triangles`, ``local`` and ``base``.
         all_nodes: See `bounds.disc_bounds`, made for this target.
         slack: Rounding of a node's coordinate, mm.
-        origin: Shape (3,), the target, where the axes start.
-        lengths: Shape (n,), of the axes, in the tiles' order, mm.
-        at_target: Distance of the target itself from the surface, mm; bounds every answer from above.
+        origin: Shape (3,), the target, where the axes start, mm.
+        lengths: Shape (n,), of the axes, in the bundles' order, mm.
+        at_target: Distance of the target itself from the surface, mm: an upper bound of every axis' distance.
         nearest: Row of the triangle that is nearest to the target.
-        tiles: `Tiles.outward`, ``starts``, ``middle`` and ``chord``.
+        bundles: `Bundles.outward`, ``starts``, ``middle`` and ``chord``.
         scratch: `Scratch`, for this structure's groups.
-        found: `Found`, written in the tiles' order; the counts are raised.
+        found: `SearchOutput`, written in the bundles' order; the counts are raised.
         lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
     """
     triangles, local, base = bare(surface[0]), bare(surface[1]), bare(surface[2])
-    outward, starts, middle, chords = bare(tiles[0]), bare(tiles[1]), bare(tiles[2]), bare(tiles[3])
+    outward, starts, middle, chords = bare(bundles[0]), bare(bundles[1]), bare(bundles[2]), bare(bundles[3])
     nodes, work, answer = bare(all_nodes), _bare_scratch(scratch), _bare_found(found)
     target, seed = (origin[0], origin[1], origin[2]), nearest
     length = bare(lengths)
-    for tile in range(len(middle)):
-        low, high = starts[tile], starts[tile + 1]
+    for bundle in range(len(middle)):
+        low, high = starts[bundle], starts[bundle + 1]
         shortest, longest = length[low], length[low]
         for i in range(low + 1, high):
             shortest, longest = min(shortest, length[i]), max(longest, length[i])
         needle = NeedleAxes(target, length, np.float32(longest), np.float32(slack))
+        # 1. Upper bounds: the target's distance, or that of the triangle nearest to the last bundle, a neighbour.
         _begin(outward, low, high, at_target, nearest, lanes, work, answer)
         if seed != nearest:
             corners = _corners(triangles, seed, target)
-            lower_upper_bounds(work.frames32, lanes, corners, np.float32(shortest), FOUR * needle.slack, work.upper)
+            # The shortest axis is a part of every member's axis: a distance from it bounds theirs from above.
+            tighten_upper_bounds(work.frames32, lanes, corners, np.float32(shortest), FOUR * needle.slack, work.upper)
         worst = ZERO
         for k in range(high - low):
             worst = max(worst, work.upper[k])
-        axis = direction(work.frames32, middle[tile] - low)
-        count = _collect(nodes, base, axis, np.float32(chords[tile]), needle, worst, work, answer)
+        # 2. One walk for the cone of all members, by its lower bounds; 3. the exact distances.
+        axis = direction(work.frames32, middle[bundle] - low)
+        count = _collect(nodes, base, axis, np.float32(chords[bundle]), needle, worst, work, answer)
         seed = nearest
         if count > 0:
             _gather(nodes, count, work)
@@ -66,7 +73,7 @@ def search_tiles(  # type: ignore[no-untyped-def]  # numba infers
 def _bare_scratch(s):  # type: ignore[no-untyped-def]  # numba infers
     """The scratch arrays without their reference counts."""
     return Scratch(
-        bare(s.found), bare(s.chosen), bare(s.bounds), bare(s.stack), bare(s.frames), bare(s.frames32), bare(s.upper),
+        bare(s.blocks), bare(s.chosen), bare(s.bounds), bare(s.stack), bare(s.frames), bare(s.frames32), bare(s.upper),
         bare(s.pairs), bare(s.squares), bare(s.least), bare(s.errors), bare(s.tried), bare(s.corners),
     )  # fmt: skip
 
@@ -74,7 +81,7 @@ def _bare_scratch(s):  # type: ignore[no-untyped-def]  # numba infers
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _bare_found(f):  # type: ignore[no-untyped-def]  # numba infers
     """The output arrays without their reference counts."""
-    return Found(bare(f.square), bare(f.depth), bare(f.triangle), bare(f.counts))
+    return SearchOutput(bare(f.square), bare(f.depth), bare(f.triangle), bare(f.counts))
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
@@ -85,7 +92,7 @@ def _single(u):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _across(u):  # type: ignore[no-untyped-def]  # numba infers
-    """Two unit vectors that make a frame with u (Duff et al., J. Comput. Graph. Tech. 6, 2017, the revised frame)."""
+    """Two unit vectors that complete u to a frame (Duff et al., J. Comput. Graph. Tech. 6, 2017, the revised frame)."""
     sign = 1.0 if u[2] >= 0.0 else -1.0
     a = -1.0 / (sign + u[2])
     b = u[0] * u[1] * a
@@ -94,7 +101,7 @@ def _across(u):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _begin(outward, low, high, start, nearest, lanes, work, answer):  # type: ignore[no-untyped-def]  # numba infers
-    """Set up a bundle: its members' frames and the first upper bound; lanes to spare repeat the last member."""
+    """Set up a bundle: its members' frames and first upper bounds; unused lanes repeat the last member."""
     for i in range(low, high):
         answer.square[i], answer.depth[i], answer.triangle[i] = start * start, 0.0, nearest
     for k in range(lanes):
@@ -112,7 +119,7 @@ def _begin(outward, low, high, start, nearest, lanes, work, answer):  # type: ig
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _corners(triangles, row, o):  # type: ignore[no-untyped-def]  # numba infers
-    """A triangle's corners from the target, nine float32 numbers."""
+    """A triangle's corners from the target, subtracted in float64 and rounded to nine float32 numbers."""
     x, y, z = o
     t = triangles[row]
     a, b, c = (t[0] - x, t[1] - y, t[2] - z), (t[3] - x, t[4] - y, t[5] - z), (t[6] - x, t[7] - y, t[8] - z)
@@ -121,7 +128,10 @@ def _corners(triangles, row, o):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _collect(nodes, base, axis, chord, needle, worst, work, answer):  # type: ignore[no-untyped-def]  # numba infers
-    """Walk the tree: the blocks that may be nearer than ``worst`` to some axis of a bundle."""
+    """Collect the blocks that may be nearer than ``worst`` to some axis of a bundle; how many.
+
+    A walk down the tree, a group of 16 nodes at a time: node j of a level has group j of the level below.
+    """
     stack, bounds, top = work.stack, work.bounds, len(base) - 1
     stack[0, 0], stack[0, 1] = base[top], top
     waiting, count = 1, 0
@@ -130,12 +140,12 @@ def _collect(nodes, base, axis, chord, needle, worst, work, answer):  # type: ig
         first, level = stack[waiting, 0], stack[waiting, 1]
         disc_bounds(nodes, first, axis, chord, needle.longest, needle.slack, bounds, 0)
         answer.counts[1] += 1
-        bits, above = at_most(bounds, 0, worst), (first - base[level]) * LANES
-        while bits != 0:
-            child = above + lowest(bits)
-            bits &= bits - 1
+        bits, above = lanes_at_most(bounds, 0, worst), (first - base[level]) * LANES
+        while bits != 0:  # once for each lane that passed, no matter how many did not
+            child = above + lowest_bit(bits)
+            bits &= bits - 1  # clears the lowest bit
             if level == 0:
-                work.found[count] = child
+                work.blocks[count] = child
                 count += 1
             else:
                 stack[waiting, 0], stack[waiting, 1] = base[level - 1] + child, level - 1
@@ -147,9 +157,9 @@ def _collect(nodes, base, axis, chord, needle, worst, work, answer):  # type: ig
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _gather(nodes, count, work):  # type: ignore[no-untyped-def]  # numba infers
-    """Copy the nodes of the found blocks side by side; what else the last group holds counts as behind the target."""
+    """Copy the nodes of the collected blocks into whole groups; unused lanes of the last count as behind the target."""
     for k in range(count):
-        group, lane = work.found[k] // LANES, work.found[k] % LANES
+        group, lane = work.blocks[k] // LANES, work.blocks[k] % LANES
         for row in range(NODE_ROWS):
             work.chosen[k // LANES, row, k % LANES] = nodes[group, row, lane]
     for k in range(count, (count + LANES - 1) // LANES * LANES):

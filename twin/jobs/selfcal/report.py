@@ -1,0 +1,301 @@
+"""What ``selfcal`` found: plain values for ``--json``, and the sections that the terminal and ``report.html`` show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.puncture import Puncture
+from puncture_twin.twin.guidance.ultrasound.summaries import (
+    calibration_summary,
+    choice_summary,
+    puncture_summary,
+    trial_summary,
+)
+from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
+from puncture_twin.twin.report.figures import png
+from puncture_twin.twin.report.page.template import Card
+from puncture_twin.twin.report.present import (
+    Block,
+    Field,
+    Section,
+    Table,
+    Warn,
+    facts as facts_table,
+    footer,
+    grid,
+    number,
+    origin_section,
+    picture,
+    text,
+    vector,
+    write_page as write_job_page,
+)
+
+Facts = Mapping[str, Any]
+"""What `selfcal_facts` returns: mm and degrees."""
+
+REASON_TEXT = MappingProxyType(
+    {
+        "ok": "can be taken",
+        "tip_outside_phantom": "tip outside the phantom",
+        "probe_out_of_reach": "probe arm cannot reach",
+        "needle_out_of_reach": "needle arm cannot reach",
+        "probe_arm_collision": "probe arm would touch itself, the table or the phantom",
+        "needle_arm_collision": "needle arm would touch itself, the table or, with more than the needle, the phantom",
+        "arms_collide": "the arms, or probe and needle, would touch",
+    }
+)
+"""Of the reasons for which a drawn pose is not taken."""
+
+NOISE_TEXT = MappingProxyType(
+    {
+        "robot_mm": "stated noise of each flange, mm per axis",
+        "robot_deg": "stated noise of each flange, ° per axis",
+        "image_mm": "stated noise of the tip in the image, mm per axis",
+        "off_plane_mm": "stated deviation of the tip from the slice, mm",
+        "direction_deg": "noise of the direction in the image, °",
+        "inside_image_mm": "spread of the residuals in the image, mm per axis",
+        "across_image_mm": "spread of the residuals across the slice, mm",
+    }
+)
+HELD_OUT = "Held-out: predicted minus true tip at poses that were not recorded, with what is left of the arms’ errors."
+
+
+def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
+    """Poses, calibration, trials, punctures, and what was written."""
+    return {
+        **calibration_summary(run.calibration, run.recording),
+        "name": run.name,
+        "inputs": inputs_document(run.inputs),
+        "candidates": None if run.candidates is None else run.candidates.counts,
+        "choice": None if run.choice is None else choice_summary(run.choice),
+        "trials": [trial_summary(trial) for trial in run.trials],
+        "punctures": puncture_summary(run.punctures),
+        "seconds": {stage: round(seconds, 3) for stage, seconds in run.stages.seconds.items()},
+        "files": [str(path) for path in run.files],
+        "warnings": list(run.warnings),
+    }
+
+
+def selfcal_text(found: Facts) -> str:
+    """The sections for a terminal, then the files."""
+    notes = tuple(f"note: {one['sentence']}" for one in found["findings"] if one["severity"] == "note")
+    head = Section(f"{'case' if found['trials'] else 'recording'} {found['name']}", [Warn(notes)] if notes else [])
+    return text([head, *sections(found), *footer(found["files"], found["warnings"], found["seconds"])])
+
+
+def write_page(run: SelfcalRun, sheet: Path | None, workcell: Path | None, path: Path) -> Path:
+    """Write the page.
+
+    Args:
+        run: What was done.
+        sheet: The B-mode pictures; None for a recording.
+        workcell: The picture of the workcell; None for a recording.
+        path: The HTML to write; it appears whole or not at all.
+    """
+    found, seed = selfcal_facts(run), run.trials[0].seed if run.trials else None
+    residuals = picture(residual_picture(run.calibration, run.recording), "Residual of each pose, and v over u")
+    shown = [*sections(found)]
+    shown[2:2] = [_numbers(run.calibration), Section("residuals", [RESIDUALS, residuals])]
+    if sheet is not None and workcell is not None and seed is not None:
+        if run.punctures:
+            errors = picture(puncture_picture(run.punctures), "Error of every target beside what is expected")
+            shown.insert(5, Section("", [errors]))
+        shown += _pictures(seed, sheet, workcell)
+    title, origin = f"{run.name}: ultrasound self-calibration", origin_section(seed)
+    return write_job_page(path, title, EQUATION, _cards(found), shown, run.inputs, origin=origin)
+
+
+EQUATION = "A X p = Y B q: X probe flange to image, Y base 1 to base 2, q the tip in the needle's flange frame."
+RESIDUALS = (
+    "Y B q − A X p of every pose, in the axes of the image. Small residuals do not prove a small error at a target."
+)
+
+
+def sections(found: Facts) -> list[Section]:
+    """What the terminal and the page both show."""
+    shown = [
+        Section("what the data cannot show", [Warn(tuple(found["cannot_show"]))]),
+        Section("calibration", [facts_table([*CALIBRATION, *_if_known(found)], found)]),
+    ]
+    if found["trials"]:
+        shown += [
+            Section("the needle sent to targets seen in the image", _punctures(found)),
+            Section("seeds, each a room of its own", [grid(TRIAL, found["trials"]), HELD_OUT]),
+            Section("poses", _poses(found)),
+        ]
+    return shown
+
+
+CALIBRATION = (
+    Field("poses used", lambda one: f"{one['poses'] - len(one['set_aside'])} of {one['poses']}"),
+    Field("set aside", lambda one: ", ".join(one["set_aside"]) or "none"),
+    Field("residuals, rms", "residual_rms_mm", 3, "mm"),
+    Field("expected tip error, rms", lambda one: f"{one['predicted_tre_mm']:.3f} mm, {counted(one)}"),
+    Field("tip in the needle's flange frame", lambda one: vector(one["tip_end2_mm"], 3, "mm")),
+    Field("needle direction there", lambda one: vector(one["needle_direction_end2"], 5)),
+    Field("iterations", "iterations"),
+    Field("condition σ_min/σ_max, lengths in 100 mm", lambda one: f"{one['condition']:.2e}"),
+)
+TRIAL = (
+    Field("seed", lambda one: str(one["seed"])),
+    Field("residual rms", "residual_rms_mm", 3, "mm"),
+    Field("expected error", "predicted_tre_mm", 3, "mm"),
+    Field("held-out tip error rms", "held_out_error_rms_mm", 3, "mm"),
+    Field("tip found: mean along", lambda one: one["detected_tip_along_mm"][0], 2, "mm"),
+    Field("sd", lambda one: one["detected_tip_along_mm"][1], 2, "mm"),
+    Field("angle sd", lambda one: one["detected_angle_deg"][1], 2, "°"),
+    Field("tip to target rms", lambda one: one["punctures"] and one["punctures"]["error_rms_mm"], 2, "mm"),
+    Field("true contacts", "true_contacts"),
+    Field("not used", lambda one: "; ".join(f"{count} {why}" for why, count in one["missed"].items()) or "none"),
+    Field("set aside", lambda one: ", ".join(one["set_aside"]) or "none"),
+)
+PUNCTURES = (
+    Field("targets", "targets"),
+    Field("true tip to true target, rms", "error_rms_mm", 2, "mm"),
+    Field("median", "error_median_mm", 2, "mm"),
+    Field("worst", "error_worst_mm", 2, "mm"),
+    Field("across the needle, rms", "lateral_rms_mm", 2, "mm"),
+    Field("along the needle, mean (+ is too deep)", "depth_mean_mm", 2, "mm"),
+    Field("along the needle, rms", "depth_rms_mm", 2, "mm"),
+    Field("expected (rms): calibration and arms", "predicted_rms_mm", 2, "mm"),
+    Field("expected (rms): with the target's reading", "predicted_with_reading_rms_mm", 2, "mm"),
+)
+
+
+def counted(found: Facts) -> str:
+    """What the expected error holds."""
+    return "noise alone" if found["arms"] is None else "noise and the arms' declared errors"
+
+
+def _if_known(found: Facts) -> list[tuple[str, str]]:
+    """Of the declared arms, and the noise."""
+    arms = found["arms"]
+    rows = [] if arms is None else [("χ² of the residuals over their freedom", number(arms["chi2_per_freedom"], 2))]
+    return rows + [(NOISE_TEXT[key], number(value, 3)) for key, value in found["noise"].items()]
+
+
+def _punctures(found: Facts) -> list[Block]:
+    if found["punctures"] is None:
+        return ["No target could be reached without touching."]
+    words = (
+        "In the twin, with the true arms: the target is read off the image (with the reading's error), the needle's "
+        "arm goes where the calibration says. Targets were not recorded before."
+    )
+    return [words, facts_table(PUNCTURES, found["punctures"])]
+
+
+def _poses(found: Facts) -> list[Block]:
+    choice, recorded = found["choice"], found["poses"]
+    counts = [(REASON_TEXT[key], f"{value:,}") for key, value in found["candidates"].items() if value]
+    bounds = (
+        Field(f"expected error with the {recorded} recorded poses", "chosen_bound_mm", 3, "mm"),
+        Field(f"{recorded} at random, median of {choice['random_sets']} choices", "random_bound_median_mm", 3, "mm"),
+        Field("at random, the best of them", "random_bound_best_mm", 3, "mm"),
+    )
+    drawn = Table(("what became of a drawn pose", "draws"), tuple(counts))
+    return [(drawn, facts_table(bounds, choice)), "Cramér-Rao bounds over all candidates, with the usual noise."]
+
+
+def _pictures(seed: int, sheet: Path, workcell: Path) -> list[Section]:
+    marks, room = "B-mode pictures with detected and true tips", "Both arms about the phantom"
+    words = "One recorded pose, by the drawing. The needle is drawn 3 mm thick; blue: the slice that the image shows."
+    seen = f"Of seed {seed}. The detector sees the grey picture alone."
+    return [
+        Section("B-mode pictures", [seen, picture(sheet, marks)]),
+        Section("the room", [picture(workcell, room), words]),
+    ]
+
+
+def _numbers(found: Calibration) -> Section:
+    """Both transforms, and how well each number is known."""
+    matrices = facts_table([("T_end1_image (X), mm", _matrix(found.X)), ("T_base1_base2 (Y), mm", _matrix(found.Y))])
+    known = Table(("parameter", "sd"), tuple((name, f"{value:.4f}") for name, value in deviations(found).items()))
+    note = "w: a small turn, R exp([w]×); t: a shift; V: the needle’s direction."
+    return Section("how well each number is known", [matrices, known, note])
+
+
+def _matrix(T: Any) -> Markup:
+    lines = ["  ".join(f"{value:10.5f}" for value in row[:3]) + f"  {row[3]:9.3f}" for row in T[:3]]
+    return Markup("<pre>{}</pre>").format("\n".join(lines))
+
+
+def deviations(found: Calibration) -> dict[str, float]:
+    """Standard deviation of every parameter, by name; rotations in degrees."""
+    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
+    return {
+        name.replace("_rad", "_deg"): float(np.degrees(value) if name.endswith("_rad") else value)
+        for name, value in zip(found.parameters, sigma, strict=True)
+    }
+
+
+def _cards(found: Facts) -> list[Card]:
+    aside, poses, reached = found["set_aside"], found["poses"], found["punctures"]
+    expected = number(found["predicted_tre_mm"], 2, "mm")
+    cards = [
+        Card("expected error of the calibration", expected, f"rms at the tip: {counted(found)}"),
+        Card("residuals", number(found["residual_rms_mm"], 2, "mm"), "rms length of the poses that were used"),
+        Card("poses", f"{poses - len(aside)} of {poses}", f"set aside: {', '.join(aside) or 'none'}"),
+    ]
+    if reached is not None:
+        detail = (
+            f"rms over {reached['targets']} targets, worst {number(reached['error_worst_mm'], 2, 'mm')}; calibration, "
+            f"arms and reading let expect {number(reached['predicted_with_reading_rms_mm'], 2, 'mm')}"
+        )
+        cards.insert(0, Card("tip to target, true", number(reached["error_rms_mm"], 2, "mm"), detail))
+    return cards
+
+
+COLOURS = ("#0072b2", "#e69f00", "#009e73")
+"""Okabe and Ito's blue, orange, green."""
+
+SET_ASIDE = "#d6001e"
+
+
+def residual_picture(found: Calibration, recording: Recording) -> bytes:
+    """A PNG of each pose's residual in the image frame: its three components, and v over u; set aside by name."""
+    rotated = np.einsum("nji,nj->ni", recording.A[:, :3, :3] @ found.X[:3, :3], found.residuals)
+    aside = np.isin(recording.names, found.outliers)
+    figure = Figure(figsize=(12.0, 4.0), dpi=110, layout="constrained")
+    by_pose, in_image = figure.subplots(1, 2)
+    for axis, label in enumerate(("u, along the face", "v, into the depth", "across the slice")):
+        by_pose.plot(np.flatnonzero(~aside), rotated[~aside, axis], "o", ms=4, color=COLOURS[axis], label=label)
+        by_pose.plot(np.flatnonzero(aside), rotated[aside, axis], "x", color=SET_ASIDE)
+    in_image.plot(*rotated[~aside, :2].T, "o", ms=4, color=COLOURS[0], label="used")
+    in_image.plot(*rotated[aside, :2].T, "x", color=SET_ASIDE, label="set aside")
+    for row in np.flatnonzero(aside):
+        in_image.annotate(recording.names[row], rotated[row, :2], (5, 3), textcoords="offset points", fontsize=8)
+    by_pose.set(xlabel="pose", ylabel="residual, mm")
+    in_image.set(xlabel="residual along u, mm", ylabel="residual along v, mm", aspect="equal", adjustable="datalim")
+    return _finished(figure)
+
+
+def puncture_picture(reached: Sequence[Puncture]) -> bytes:
+    """A PNG of every target's error, in the order reached, beside what calibration and reading let expect."""
+    x = np.arange(1, len(reached) + 1)
+    figure = Figure(figsize=(12.0, 3.6), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(x, [one.error_mm for one in reached], "o", color=COLOURS[0], label="distance")
+    axes.plot(x, [one.lateral_mm for one in reached], "o", color=COLOURS[2], label="across the needle")
+    expected = [one.expected_mm for one in reached]
+    axes.plot(x, expected, "--", color="#5b616b", label="expected (rms): calibration and reading")
+    axes.set(xlabel="target", ylabel="true tip to true target, mm", ylim=(0, None))
+    return _finished(figure)
+
+
+def _finished(figure: Figure) -> bytes:
+    for axes in figure.axes:
+        axes.grid(color="0.9")
+        axes.set_axisbelow(True)
+        axes.legend(fontsize=8)
+    return png(figure)

@@ -1,0 +1,371 @@
+"""What a servo command found: one table of plain values for ``--json``, and the sections that terminal and page show.
+
+Above, the facts: nothing else is read below. Below, each fact once: its name, its key, its digits and its unit.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.search.uncertainty_breakdown import chance_text
+from puncture_twin.twin.guidance.stereo.experiment import (
+    ServoTrial,
+    Statistics,
+    TargetRow,
+    declaration_test,
+    needle_statistics,
+)
+from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleOutcome
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
+from puncture_twin.twin.jobs.servo.liu2007 import (
+    TABLE_1,
+    TABLE_2,
+    Liu2007Tables,
+    paper_columns,
+    paper_gain_mm,
+    paper_servo_only_at_least,
+)
+from puncture_twin.twin.report.page.template import Card
+from puncture_twin.twin.report.present import (
+    Block,
+    Field,
+    Section,
+    Table,
+    Warn,
+    facts as facts_table,
+    footer,
+    grid,
+    number,
+    percent,
+    picture,
+    text,
+    write_page,
+)
+
+PHASES = {"open_loop": "by mapping and robot alone", "servoed": "after the servo"}
+"""By mapping and robot alone, and after the servo."""
+
+NO_TOUCH = "not computed: the case has no structures"
+"""Of ``p_touch``: which is something else than 0."""
+
+NOT_MODELLED = "a rod that bends, cameras that move after the calibration, tissue"
+
+DOUBTED = 0.01
+"""Chance of residuals so large below which the declaration is doubted, as in the CT case."""
+
+Facts = Mapping[str, Any]
+"""What `servo_facts` or `reproduction_facts` returns: mm, shares 0..1."""
+
+
+def servo_facts(case: ServoCase, trials: Sequence[ServoTrial], ours: Statistics) -> dict[str, Any]:
+    """A case's sessions, each seed and all together."""
+    stops = Counter(row.stop for one in trials for row in one.rows)
+    return {
+        "case": case.name,
+        "inputs": inputs_document(case.inputs),
+        "tolerance_mm": case.file.servo.tolerance_mm,
+        "estimate": case.file.servo.estimate,
+        "stops": dict(stops),
+        "statistics": {**ours._asdict(), "after_over_mapping": ours.after_over_mapping},
+        "sessions": [_session(one) for one in trials],
+        "needle": _needle(case, trials),
+    }
+
+
+def _needle(case: ServoCase, trials: Sequence[ServoTrial]) -> dict[str, Any]:
+    """The needle against the anatomy, predicted beside realised, over all seeds."""
+    test = declaration_test(trials)
+    rows = [row for one in trials for row in one.rows]
+    found = {phase: needle_statistics([getattr(row, f"needle_{phase}") for row in rows]) for phase in PHASES}
+    return {
+        **{phase: None if one is None else one._asdict() for phase, one in found.items()},
+        "hit_radius_mm": case.file.target.hit_radius_mm,
+        "p_touch": None,
+        "p_touch_note": NO_TOUCH,
+        "wrong_belief": case.wrong_belief,
+        "declared": case.errors.stated(),
+        "declaration": None if test is None else {**test._asdict(), "p": test.p},
+    }
+
+
+def reproduction_facts(result: Liu2007Tables) -> dict[str, Any]:
+    """The paper's tables, and our sessions in a room like the paper's."""
+    tilted = result.tilted
+    calibration = tilted.case.file.calibration.tilt_deg
+    return {
+        "holds": result.passed,
+        "conditions": [{"words": one.text, "holds": one.passed} for one in result.conditions],
+        "paper_gain_mm": paper_gain_mm(),
+        "gain": tilted.gain._asdict(),
+        "gain_with_the_rod_tilted_alike": result.straight.gain._asdict(),
+        "tilted_more_deg": 0.0 if calibration is None else calibration - tilted.case.file.tool.tilt_deg,
+        "paper": [{**column._asdict(), "holds": column.passed} for column in paper_columns()],
+        "paper_table_1_mm": list(TABLE_1),
+        "paper_table_2_mm": [list(row) for row in TABLE_2],
+        "paper_servo_only_at_least_mm": list(paper_servo_only_at_least()),
+        **servo_facts(tilted.case, tilted.trials, tilted.ours),
+    }
+
+
+def _session(one: ServoTrial) -> dict[str, Any]:
+    finished = not one.refused
+    return {
+        "seed": one.seed,
+        "refused": one.refused or None,
+        "stereo_mm": list(one.stereo_mm),
+        "calibration_rms_px": list(one.rms_px),
+        "fre_mm": one.fre_mm if finished else None,
+        "robot_residual_mm": one.robot_residual_mm if finished else None,
+        "targets": [_target(row) for row in one.rows],
+    }
+
+
+def _target(row: TargetRow) -> dict[str, Any]:
+    needles = {f"needle_{phase}": getattr(row, f"needle_{phase}") for phase in PHASES}
+    return {**row._asdict(), **{key: None if one is None else _outcome(one) for key, one in needles.items()}}
+
+
+def _outcome(one: NeedleOutcome) -> dict[str, Any]:
+    return {**one._asdict(), "half_axes_mm": list(one.half_axes_mm), "in_region": one.in_region}
+
+
+class Pictures(NamedTuple):
+    """What a page shows beside the numbers."""
+
+    convergence: Path
+    cameras: Sequence[Path]
+
+
+def servo_text(facts: Facts) -> str:
+    """The sections for a terminal, then the files."""
+    head = Section(f"case {facts['case']}", [])
+    return text([head, *sections(facts), *footer(facts["files"])])
+
+
+def write_servo_page(case: ServoCase, facts: Facts, pictures: Pictures, path: Path) -> Path:
+    """Write ``servo.html``: the sections, and the pictures of the first seed, on one page that needs no network."""
+    count = len(facts["sessions"][0]["targets"])
+    title = f"{case.name}: visual servoing onto {count} targets"
+    return write_page(path, title, _setup(case), _cards(facts), sections(facts, pictures), case.inputs)
+
+
+def sections(facts: Facts, pictures: Pictures | None = None) -> list[Section]:
+    """Everything that is shown: the paper, where it is compared, the first seed, all seeds, needle, calibration."""
+    first = facts["sessions"][0]
+    return [
+        *(_paper(facts) if "paper" in facts else ()),
+        Section(f"every target of seed {first['seed']}, true errors in mm", _targets(first)),
+        *(() if pictures is None else _shown(pictures)),
+        Section("all seeds", [facts_table(STATISTICS, facts["statistics"])]),
+        Section("the needle against the anatomy", _needle_blocks(facts["needle"], first)),
+        Section("calibration", [facts_table(CALIBRATION, first), *_stereo(first)]),
+    ]
+
+
+def _mean_and_most(ours: Facts, name: str) -> str:
+    return f"{number(ours[f'{name}_mean'], 3)} and {number(ours[f'{name}_max'], 3, 'mm')}"
+
+
+TARGET = (
+    Field("target", "target"),
+    Field("mapping", "mapping_mm", 2),
+    Field("expected", "expected_tre_mm", 2),
+    Field("before", "before_mm", 2),
+    Field("after", "after_mm", 2),
+    Field("servo-only", "servo_only_mm", 3),
+    Field("corrections", "steps"),
+    Field("ended", lambda row: row["stop"].replace("_", " ")),
+)
+STATISTICS = (
+    Field("sessions", lambda ours: f"{ours['seeds']} seeds" + f"; {ours['refused']} sessions could not be held" * bool(
+        ours["refused"])),
+    Field("targets", "targets"),
+    Field("stereo, mean and maximum", lambda ours: _mean_and_most(ours, "stereo")),
+    Field("mapping, mean", "mapping_mean", 3, "mm"),
+    Field("mapping, rms", "mapping_rms", 3, "mm"),
+    Field("what the mapping expects of itself, rms", "expected_tre_rms", 3, "mm"),
+    Field("before, mean", "before_mean", 3, "mm"),
+    Field("after, mean", "after_mean", 3, "mm"),
+    Field("after over mapping (its floor is 1)", "after_over_mapping", 3),
+    Field("servo-only, mean and maximum", lambda ours: _mean_and_most(ours, "servo_only")),
+    Field("corrections, median", "median_steps", 1),
+    Field("not confirmed", lambda ours: percent(ours["not_confirmed"])),
+)  # fmt: skip
+CALIBRATION = (
+    Field("residual of each camera (rms)", lambda one: " and ".join(
+        number(px, 3) for px in one["calibration_rms_px"]) + " px"),
+    Field("robot against C after the rigid fit (mean)", "robot_residual_mm", 2, "mm"),
+    Field("markers, residual (rms; not the accuracy at a target)", "fre_mm", 2, "mm"),
+)  # fmt: skip
+
+
+def _targets(first: Facts) -> list[Block]:
+    if first["refused"]:
+        return [Warn((f"not held: {first['refused']}",))]
+    words = (
+        "mapping: estimated to true target; expected: what the mapping says of itself (rms); before: true ball to true "
+        "target where the robot alone brought it; after: the same after the servo; servo-only: true ball to estimated "
+        "target, the part that the servo answers for"
+    )
+    return [grid(TARGET, first["targets"]), words]
+
+
+def _shown(pictures: Pictures) -> list[Section]:
+    convergence = picture(pictures.convergence, "Distance from ball to estimated target against corrections")
+    cameras = [picture(one, one.stem) for one in pictures.cameras]
+    return [Section("how the servo came to rest", [convergence]), Section("through the cameras", cameras)]
+
+
+def _stereo(first: Facts) -> list[Block]:
+    points = first["stereo_mm"]
+    if not points:
+        return []
+    return [f"stereo at {len(points)} points: mean {sum(points) / len(points):.3f}, max {max(points):.3f} mm"]
+
+
+def _of_needle(key: str, digits: int = 2) -> Any:
+    return lambda row: None if row["needle_servoed"] is None else number(row["needle_servoed"][key], digits)
+
+
+NEEDLE = (
+    Field("target", "target"),
+    Field("expected", lambda row: "unknown" if row["needle_servoed"] is None else _of_needle("predicted_rms_mm")(row)),
+    Field("95 % half axes", lambda row: (one := row["needle_servoed"]) and " x ".join(
+        f"{mm:.2f}" for mm in one["half_axes_mm"])),
+    Field("lateral", _of_needle("lateral_mm")),
+    Field("depth", _of_needle("depth_mm")),
+    Field("direction °", _of_needle("predicted_direction_deg")),
+    Field("chance to hit", lambda row: (one := row["needle_servoed"]) and one["p_hit"] and chance_text(one["p_hit"])),
+    Field("realised", _of_needle("realised_mm")),
+)  # fmt: skip
+"""Of a target's needle at the servo's last look, mm."""
+
+
+def _needle_blocks(needle: Facts, first: Facts) -> list[Block]:
+    """Over all seeds by each way, realised beside predicted; what must be known before; each needle of one seed."""
+    radius = needle["hit_radius_mm"]
+    rows = [
+        ("tip error, rms, mm", *_both(needle, "realised_rms_mm", "predicted_rms_mm")),
+        ("direction, rms, °", *_both(needle, "realised_direction_deg", "predicted_direction_deg")),
+        ("inside of the 95 % ellipsoid", *_both(needle, "coverage_95", "")),
+        *([] if radius is None else [(f"hit, within {radius:g} mm", *_both(needle, "hit_share", "mean_p_hit"))]),
+    ]
+    warned = []
+    if needle["wrong_belief"]:
+        warned.append("The rooms were drawn from [rehearsal.errors]: the belief is wrong by design.")
+    test = needle["declaration"]
+    tested = "not tested, the joint estimate does not settle"
+    if test is not None:
+        tested = "residuals {chi_squared:.0f} for {freedom} degrees of freedom, p = {p:.3f}".format(**test)
+        if test["p"] < DOUBTED:
+            warned.append(f"WARNING: {tested}: what was measured lies farther apart than declared")
+    return [
+        Table(("realised / predicted", *PHASES.values()), tuple(rows)),
+        Warn(tuple(warned)),
+        "The needles of one seed share its room: seeds count, not needles. "
+        f"Declared errors: {tested}. Chance to touch: {NO_TOUCH}. Not modelled: {NOT_MODELLED}.",
+        f"Each needle of seed {first['seed']} after the servo, mm; expected (rms) holds what the tolerance leaves; "
+        "unknown where nothing was seen at the end, or the measurements contradict each other:",
+        grid(NEEDLE, first["targets"]),
+    ]
+
+
+def _both(needle: Facts, realised: str, predicted: str) -> list[str]:
+    """Of each way."""
+    cells = []
+    for one in map(needle.__getitem__, PHASES):
+        if one is None:
+            cells.append("unknown")
+        elif realised.endswith(("_mm", "_deg")):
+            cells.append(f"{one[realised]:.3f} / {one[predicted]:.3f}")
+        else:
+            cells.append(f"{100 * one[realised]:.1f} / {100 * one.get(predicted, 0.95):.1f} %")
+    return cells
+
+
+def _setup(case: ServoCase) -> str:
+    plan, robot, servo, arm = case.file.cameras, case.file.robot, case.file.servo, case.errors.stated()
+    return (
+        f"Two cameras of {plan.size_px[0]} x {plan.size_px[1]} px, {plan.baseline_mm:g} mm apart, "
+        f"{plan.distance_mm:g} mm away, noise {plan.noise_grey:g} grey levels; centre by {plan.centre}; "
+        f"{robot.model} off by {arm['link_mm']:g} mm, {arm['joint_deg']:g}°, play {arm['backlash_deg']:g}°, "
+        f"repeatability {arm['repeatability_deg']:g}°; measuring arm {case.errors.measuring_mm:g} mm an axis, "
+        f"12 points over {' x '.join(f'{mm:g}' for mm in case.file.calibration.size_mm)} mm; "
+        f"tolerance {servo.tolerance_mm:g} mm; "
+        f"estimate: {'joint' if servo.estimate == 'joint' else 'the chain'}."
+    )
+
+
+def _cards(facts: Facts) -> list[Card]:
+    ours, tolerance = facts["statistics"], facts["tolerance_mm"]
+    ratio, most, steps = f"{ours['after_over_mapping']:.3f}", f"{ours['servo_only_max']:.3f}", ours["median_steps"]
+    return [
+        Card("before the servo", number(ours["before_mean"], 2, "mm"), "mean, true ball to true target"),
+        Card("after the servo", number(ours["after_mean"], 2, "mm"), f"{ratio} times the mapping's"),
+        Card("servo-only", number(ours["servo_only_mean"], 3, "mm"), f"mean; at most {most} mm"),
+        Card("not confirmed", percent(ours["not_confirmed"]), f"within {tolerance:g} mm; median {steps:g} steps"),
+    ]
+
+
+def _paper(facts: Facts) -> list[Section]:
+    """The paper's tables beside ours, what the servo is worth, and what the exit code demands."""
+    first, ours = facts["sessions"][0], facts["statistics"]
+    rows = [
+        {"theirs": dict(zip(("mapping", "before", "after"), theirs, strict=True)), "least": least, **row}
+        for theirs, least, row in zip(
+            facts["paper_table_2_mm"], facts["paper_servo_only_at_least_mm"], first["targets"], strict=False
+        )
+    ]
+    gains = [
+        f"{facts[key]['mean']:.2f} (standard error {facts[key]['error']:.2f})"
+        for key in ("gain", "gain_with_the_rod_tilted_alike")
+    ]
+    both = zip(facts["paper_table_1_mm"], first["stereo_mm"], strict=False)
+    points = ((f"{theirs:.2f}", f"{own:.2f}") for theirs, own in both)
+    words = (
+        "The paper's head, robot, points and targets are not ours: compare means, not rows. It did not measure what "
+        "the servo alone leaves; by the triangle's inequality it is at least |after − mapping|. "
+        f"Rows of the twin: seed {first['seed']}."
+    )
+    return [
+        Section("Liu et al. 2007, and ours", [words, (_means(facts), grid(_PAPER_ROW, rows))]),
+        Section("its ten points, stereo, mm", [Table(("paper", "ours"), tuple(points))]),
+        Section("what the servo is worth", [
+            f"gain, before − after: {gains[0]} mm with the rod tilted {facts['tilted_more_deg']:.0f} deg more during "
+            f"the calibration than at the targets; {gains[1]} mm tilted alike; paper {facts['paper_gain_mm']:.2f} mm; "
+            f"after over mapping {ours['after_over_mapping']:.3f}, paper {1.00 / 1.06:.2f}, below 1 by chance",
+            "the tilt is ours: the paper states none, and what gave its robot the error is not known",
+        ]),
+        Section("demanded here (the exit code)", [Table((), tuple(
+            (one["words"], "holds" if one["holds"] else "DOES NOT HOLD") for one in facts["conditions"]))]),
+    ]  # fmt: skip
+
+
+_PAPER_ROW = (
+    Field("target", "target"),
+    *(Field(name, f"theirs.{name}", 2) for name in ("mapping", "before", "after")),
+    Field("servo-only", lambda row: f"≥ {row['least']:.2f}"),
+    Field("ours: mapping", "mapping_mm", 2),
+    *TARGET[3:7],
+)
+
+
+def _means(facts: Facts) -> Table:
+    """Mean and maximum of each column: as printed, by the paper's own rows, and over all targets of all our seeds."""
+    ours, rows = facts["statistics"], [row for one in facts["sessions"] for row in one["targets"]]
+    lines = []
+    for column in facts["paper"]:
+        name = column["name"]
+        most = ours["stereo_max"] if name == "stereo" else max(row[f"{name}_mm"] for row in rows)
+        note = "" if column["holds"] else " (not what the rows give)"
+        printed = "{printed_mean:.2f} / {printed_max:.2f}".format(**column) + note
+        by_rows = "{mean:.3f} / {max:.2f}".format(**column)
+        lines.append((name, printed, by_rows, f"{ours[f'{name}_mean']:.2f} / {most:.2f}"))
+    alone = f"{ours['servo_only_mean']:.3f} / {ours['servo_only_max']:.2f}"
+    lines.append(("servo-only", "not measured", "–", alone))
+    head = ("mean / maximum, mm", "paper, printed", "paper, by its rows", f"ours, {ours['seeds']} seeds")
+    return Table(head, tuple(lines))

@@ -1,0 +1,417 @@
+"""A patient's search, plan, rehearsal, registration and error budget as blocks that terminal and page both show.
+
+Each takes what was computed, or the plain values of it that ``--json`` prints too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from puncture_twin.planning.base.reasons import UNSEEN_AIR, Reason, css
+from puncture_twin.planning.plan.plan import CLEARANCE_TEXT
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.explain import deep_text
+from puncture_twin.planning.search.uncertainty_breakdown import LEAST_FRACTION, UncertaintyBreakdown, chance_text
+from puncture_twin.planning.search.windows import MOST_WINDOWS, Window, find_windows
+from puncture_twin.planning.uncertainty.sources import SOURCES
+from puncture_twin.twin.report.numbers import (
+    ReasonCount,
+    arm_text,
+    clearance_text,
+    expected_text,
+    nearest_structure,
+    reason_counts,
+)
+from puncture_twin.twin.report.present import Block, Field, Table, Warn, bold, facts, grid, number, percent, vector
+
+CONE_TEXT = MappingProxyType(
+    {
+        "grid": "by the directions of the search, to one step; a certificate proves it",
+        "certificate": "proven by the certificate",
+    }
+)
+"""Where the safe cone comes from."""
+
+LEAST_SHOWN = 5e-5
+"""A chance or share below it rounds to nothing."""
+
+SHOWN_MM = 0.005
+"""A source that costs less would be 0.00."""
+
+NO_CHANCES = "No chances: they need markers, the arm, and a direction that organs and arm allow."
+NOT_REQUESTED = "this run searched only; the plan command plans the arm's motion"
+"""Where no plan was made because nobody wanted one."""
+
+TRE_TEXT = "expected TRE at the target (rms), markers alone"
+TIP_ERROR_TEXT = "expected tip error (rms), in the plan's configuration of the arm"
+"""Of the registration, and of the whole insertion with the arm's declared errors."""
+
+MOST_NEAREST = 12
+"""Structures whose least clearance in a rehearsal is listed."""
+
+
+def counts(candidates: Candidates) -> list[Block]:
+    """How many directions fell to which reason; also the map's legend."""
+    rows = (
+        (
+            Markup('<span class="patch {}" style="background-color:{}"></span>{}').format(
+                _hatches(line), css(line.colour), line.text
+            ),
+            percent(line.solid_angle),
+            f"{line.count:,}",
+            Markup("<code>{}</code>").format(line.code),
+        )
+        for line in reason_counts(candidates)
+    )
+    return [Table(("verdict", "of solid angle", "directions", "code"), tuple(rows)), f"{arm_text(candidates)}."]
+
+
+def _hatches(line: ReasonCount) -> str:
+    """The class of a patch with the lines that the map has over its colour."""
+    if line.code != Reason.UNKNOWN_REGION.value:
+        return ""
+    return "hatched air" if line.colour == UNSEEN_AIR else "hatched"
+
+
+def windows(candidates: Candidates) -> list[Block]:
+    """The best candidate of each window, with the window's size."""
+    found = find_windows(candidates).windows
+    if not found:
+        return ["No direction is safe, so there is nothing to rank."]
+    return [grid(_window_fields(candidates), found[:MOST_WINDOWS]), _windows_text(candidates, len(found))]
+
+
+def _window_fields(candidates: Candidates) -> list[Field]:
+    button = Markup('<button type="button" class="pick" data-row="{}">{}</button>')
+
+    def best(values: Any) -> Any:
+        return lambda window: float(values[window.best])
+
+    def nearest(window: Window) -> tuple[str, float]:
+        return nearest_structure(candidates, window.best)
+
+    path, ranking = candidates.path, candidates.ranking
+    return [
+        Field("window", lambda window: button.format(window.best, window.number)),
+        Field("rank", lambda window: str(ranking.rank[window.best])),
+        Field("θ °", lambda window: f"{np.degrees(candidates.theta[window.best]):.4g}"),
+        Field("β °", lambda window: f"{np.degrees(candidates.beta[window.best]):.4g}"),
+        Field("cost", best(ranking.cost), 3),
+        Field("clearance", lambda window: nearest(window)[1], 1, "mm"),
+        Field("nearest structure", lambda window: nearest(window)[0].replace("_", " ") or None),
+        Field("path", best(path.length), 1, "mm"),
+        Field("skin angle", best(np.degrees(path.skin_angle)), 1, "°"),
+        Field("crossed tissue", best(path.tissue), 1, "mm"),
+        Field("reach margin", best(candidates.arm.margin), 2),
+        Field("safe cone", best(np.degrees(candidates.safe_cone)), 1, "°"),
+        Field("window's area", lambda window: window.square_deg, 0, "deg²"),
+        Field("on the skin", lambda window: window.entry_cm2, 1, "cm²"),
+    ]
+
+
+def _windows_text(candidates: Candidates, count: int) -> str:
+    shown = f"{MOST_WINDOWS} of {count}" if count > MOST_WINDOWS else f"All {count}"
+    text = f"{shown} windows (connected sets of safe directions), each with its best."
+    if candidates.cone_source:
+        source = CONE_TEXT[candidates.cone_source]
+        text += f" Safe cone: off by so much in any direction a needle stays safe for the organs, {source}."
+    return text
+
+
+def plan(
+    plan: Any | None,
+    at_patient: Iterable[tuple[str, str]] = (),
+    refusal: str = "",
+    *,
+    declared: bool = False,
+    notes: Sequence[str] = (),
+) -> list[Block]:
+    """The plan's numbers, or why there is none, and how its path, or that of the best direction, is found.
+
+    Args:
+        plan: The plan, or None.
+        at_patient: Names and values for whoever stands at the patient.
+        refusal: Why there is no plan although one was requested; "" where none was.
+        declared: Whether the case declares the arm's errors, which a plan's expected error then counts.
+        notes: What else must be known of it, one sentence each.
+    """
+    if plan is None:
+        best = facts(at_patient)
+        why = Warn((f"Planning failed: {refusal}",)) if refusal else f"No plan was requested: {NOT_REQUESTED}."
+        path: list[Block] = ["Path of the best direction:", best] if best.rows else []
+        return [why, *path]
+    rows = [
+        ("direction", f"θ {np.degrees(plan.theta):g}°, β {np.degrees(plan.beta):g}°"),
+        ("arm", str(plan.model.name)),
+        ("roll about the needle", f"{np.degrees(plan.roll):.1f}°"),
+        ("standoff (tip to target)", number(plan.standoff_mm, 1, "mm")),
+        *at_patient,
+        ("entry point, CT frame", vector(plan.entry_ct, 1, "mm")),
+        ("target, CT frame", vector(plan.target_ct, 1, "mm")),
+        ("approach", f"{plan.approach.times_s[-1]:.1f} s, {len(plan.approach.q)} waypoints"),
+        ("insertion", f"{plan.insertion.times_s[-1]:.1f} s, {len(plan.insertion.q)} waypoints"),
+        *((CLEARANCE_TEXT[phase], number(float(mm), 1, "mm")) for phase, mm in plan.clearance_mm.items()),
+        (TIP_ERROR_TEXT if declared else TRE_TEXT, expected_text(plan.expected_target_error_mm)),
+        ("seed", str(plan.seed)),
+    ]
+    return [facts(rows), *notes]
+
+
+def rehearsal(
+    done: Any | None, keep_away: frozenset[str], film: str | None = None, failures: Sequence[str] = ()
+) -> list[Block]:
+    """The rehearsal's numbers; clearances of the structures that the needle must keep away from; a link to the film."""
+    if done is None:
+        return [Markup("<p>Not rehearsed.</p>")]
+    touched = [
+        f"{c.link} touches {c.body} at {c.time_s:.2f} s"
+        f"{f' ({c.depth_mm:.2f} mm deep)' if math.isfinite(c.depth_mm) else ''}"
+        for c in done.contacts
+    ]
+    fraction = np.max(done.max_joint_speed / done.speed_limits)
+    least = sorted(
+        ((name, float(np.min(mm))) for name, mm in done.clearance_mm.items() if name in keep_away and len(mm)),
+        key=lambda item: item[1],
+    )
+    rows = [
+        ("tip error at the end", bold(number(done.tip_error_mm, 2, "mm"))),
+        *([] if done.standing is None else [("of all", done.standing.text)]),
+        ("its lateral part", number(done.lateral_mm, 2, "mm")),
+        ("its depth part", f"{number(abs(done.depth_mm), 2, 'mm')} too {'deep' if done.depth_mm >= 0 else 'shallow'}"),
+        ("expected by the plan (rms)", expected_text(done.predicted_error_mm)),
+        ("the true needle", _true_needle(least)),
+        ("contacts", "; ".join(touched) or "none"),
+        ("insertion", done.followed_text),
+        ("force", done.force_text),
+        ("fastest joint", f"{100 * fraction:.0f} % of its limit{'' if fraction <= 1 else ' (too fast)'}"),
+        ("joint speeds, °/s", ", ".join(f"{v:.0f}" for v in np.degrees(done.max_joint_speed))),
+        ("their limits, °/s", ", ".join(f"{v:.0f}" for v in np.degrees(done.speed_limits))),
+        ("truth", str(getattr(done, "truth_source", "–"))),
+        ("seed", str(done.seed)),
+        *([("film", Markup('<a href="{}">{}</a>').format(film, film))] if film else ()),
+    ]
+    named = ((name.replace("_", " "), clearance_text(mm)) for name, mm in least[:MOST_NEAREST])
+    nearest = Table(("structure", "least clearance mm"), tuple(named))
+    more = f"The {MOST_NEAREST} nearest of {len(least)} structures to keep away from."
+    warned = Warn(tuple(f"the answer is no: {one}" for one in failures))
+    return [warned, (facts(rows), nearest), *([more] if len(least) > MOST_NEAREST else [])]
+
+
+def _true_needle(least: Sequence[tuple[str, float]]) -> str:
+    name, mm = least[0] if least else ("nothing", math.nan)
+    if mm < 0:
+        return f"crosses what it must avoid: {name}{deep_text(mm)}"
+    return f"keeps {number(mm, 2, 'mm')} at least from what it must avoid: {name}"
+
+
+def rooms(found: Mapping[str, Any] | None) -> list[Block]:
+    """What happened in many rooms, beside what was predicted; nothing without rooms.
+
+    Args:
+        found: A `Distribution` as plain values.
+    """
+    if found is None:
+        return []
+    if found["realised_rms_mm"] is None:
+        return [Warn((f"{found['rooms']} rooms: in none did the arm reach the pose that its registration asked for",))]
+    touched = (
+        (f"touched {name.replace('_', ' ')}", fraction, found["p_touch_by_structure"][name])
+        for name, fraction in found["touch_share_by_structure"].items()
+    )
+    shares = (
+        ("inside of the 95 % ellipsoid", found["coverage_95"], 0.95),
+        ("hit the target", found["hit_share"], found["mean_p_hit"]),
+        ("touched anything forbidden", found["touch_share"], found["mean_p_touch"]),
+        *((text, fraction, chance) for text, fraction, chance in touched if max(fraction, chance) >= LEAST_SHOWN),
+    )
+    rows = [("tip error, rms, mm", f"{found['realised_rms_mm']:.3f}", f"{found['predicted_rms_mm']:.3f}")]
+    rows += [(text, _percent(fraction), _percent(chance)) for text, fraction, chance in shares]
+    head = (f"{found['rooms']:,} rooms, seed {found['seed']}", "realised", "predicted")
+    return [Table(head, tuple(rows)), Warn(tuple(_reserves(found))), *_sources(found)]
+
+
+def _percent(fraction: float) -> str:
+    return f"{100 * fraction:.2f} %"
+
+
+def _reserves(found: Mapping[str, Any]) -> list[str]:
+    """What a reader must know before believing the table."""
+    said = []
+    if found["wrong_belief"]:
+        said.append("The rooms were drawn from [rehearsal.errors]: the belief is wrong by design.")
+    if found["unreached"]:
+        said.append(f"In {found['unreached']:,} rooms the arm did not reach the pose; they are not counted.")
+    if found["guessed_touches"]:
+        how = "a posture was assumed (touch.csv, q1_deg to q6_deg)"
+        said.append(f"Nobody says how the arm touched the markers: {how}.")
+    return said
+
+
+def _sources(found: Mapping[str, Any]) -> list[Block]:
+    """Of the predicted variance; the needle that bends, the simulator, and what is left out."""
+    shares = sorted(found.get("predicted_share", {}).items(), key=lambda source: -source[1])
+    named = [f"{SOURCES[name].text} {100 * part:.0f} %" for name, part in shares if part >= LEAST_FRACTION]
+    said = [f"Of the predicted variance: {', '.join(named)}."] if named else []
+    if found.get("deflection_mm") is not None:
+        said.append(f"The needle bends by {found['deflection_mm']:.2f} mm, to a side drawn in each room.")
+    if found.get("physics") is not None:
+        said.append(
+            "{rooms} of them in the simulator: tips at most {largest_apart_mm:.4f} mm from those of the kinematics; "
+            "contacts in {rooms_with_contacts}.".format(**found["physics"])
+        )
+    return [*said, f"Not modelled: {found['not_modelled']}."]
+
+
+def chances(breakdown: UncertaintyBreakdown | None, registration: Mapping[str, Any] | None) -> list[Block]:
+    """Chances, expected error and its sources, the declaration's test, and what would have to be better.
+
+    Args:
+        breakdown: Of the chosen direction, or None where it has no chances.
+        registration: As plain values, for the FLE and its interval.
+    """
+    if breakdown is None:
+        return [Markup("<p>{}</p>").format(NO_CHANCES)]
+    budget, (name, chance) = breakdown.budget, breakdown.likeliest
+    rows = [
+        ("chance to hit the target", bold(chance_text(breakdown.p_hit))),
+        ("chance to touch anything forbidden, at most", chance_text(breakdown.p_touch_any)),
+        *([("most likely touched", f"{name.replace('_', ' ')}, {chance_text(chance)}")] if name else []),
+        ("expected tip error (rms), this insertion", number(budget.rms_mm, 2, "mm")),
+        ("across the needle (rms)", number(budget.lateral_mm, 2, "mm")),
+        ("along the needle (rms)", number(budget.depth_mm, 2, "mm")),
+        ("half axes of the 95 % ellipsoid", vector(budget.half_axes_mm, 2, "mm")),
+        ("error of a marker, CT and touch (FLE, rms)", _fle(registration or {})),
+        ("the declared errors", breakdown.declaration),
+        ("not modelled", breakdown.not_modelled),
+    ]
+    shares = ((SOURCES[source].text, f"{100 * fraction:.1f} %") for source, fraction in breakdown.sources())
+    goals = Warn(tuple(goal.text() for goal in breakdown.goals))
+    return [goals, (facts(row for row in rows if row[1]), Table(("source", "of the error's variance"), tuple(shares)))]
+
+
+def _fle(registration: Mapping[str, Any]) -> str:
+    """With its interval where it is estimated; "" where it is not known."""
+    if registration.get("fle_mm") is None:
+        return ""
+    return number(registration["fle_mm"], 3, "mm") + _interval(registration.get("fle_interval_mm"))
+
+
+def _interval(bounds: Sequence[float] | None, of: str = "") -> str:
+    """A 95 % interval; nothing where both bounds are one."""
+    low, high = bounds or (0.0, 0.0)
+    return f" ({of}95 %: {number(low, 3)} to {number(high, 3)})" if low < high else ""
+
+
+REGISTRATION = (
+    Field("method", lambda one: "joint fit of pose and arm" if one["method"] == "joint" else one["method"]),
+    Field("FRE (rms residual; not the accuracy at the target)", "fre_mm", 3, "mm"),
+    Field("mean residual (Chen 2019, Eq. 16)", "mean_error_mm", 3, "mm"),
+    Field("FLE", _fle),
+    Field("FLE from", "fle_source"),
+    Field("TRE along the shaft, target to hub", lambda one: vector(one["expected_tre_along_shaft_mm"], 3, "mm")),
+    Field("half axes of the 95 % ellipsoid at the target, by the readings alone", lambda one: vector(
+        one["half_axes_95_mm"], 2, "mm")),
+    Field("of its variance", lambda one: ", ".join(
+        f"{name} {100 * part:.0f} %" for name, part in one["share"].items())),
+    Field("marker spread s₂/s₁", "spread_ratio", 2),
+    Field("least altitude of the triangle", "altitude_mm", 1, "mm"),
+    Field("TRE(target)/FLE", "leverage", 2),
+)  # fmt: skip
+
+
+def registration(report: Mapping[str, Any] | None) -> list[Block]:
+    """The registration's numbers from a mapping of plain values; absent ones are left out."""
+    if not report:
+        return [Markup("<p>The case has no markers: where the patient lies was stated, or is not known.</p>")]
+    expected = number(report.get("expected_tre_target_mm", math.nan), 2, "mm")
+    of_rms = _interval(report.get("expected_tre_target_interval_mm"), "of that rms, ")
+    rows = [(TRE_TEXT, bold(expected) + of_rms), *facts(REGISTRATION, report).rows]
+    flags, residuals = tuple(map(str, report.get("flags") or ())), report.get("residual_mm") or {}
+    without = report.get("without") or {}
+    markers = [
+        Field("marker", lambda item: item[0]),
+        Field("residual mm", lambda item: float(item[1]), 3),
+        *([Field("TRE without it, mm", lambda item: without[item[0]]["rms_mm"], 3)] if without else []),
+        *([Field("p of the residuals then", lambda item: f"{without[item[0]]['probability']:.2g}")] if without else []),
+    ]
+    weak = Warn(tuple(f"weak: {flag}" for flag in flags)) if flags else "no flag raised"
+    shown = (facts(rows), grid(markers, residuals.items())) if residuals else (facts(rows),)
+    return [shown, weak, *_advice(report)]
+
+
+def _advice(report: Mapping[str, Any]) -> list[Block]:
+    """What one insertion is worth, whether the declared errors hold, and where one more marker helps."""
+    said: list[Block] = []
+    if "one_insertion_95_mm" in report:
+        said.append(
+            f"one insertion ends within {report['one_insertion_95_mm']:.3f} mm in 95 of 100, by the markers and by the "
+            f"target, read {report['target_read']}; arm, needle and tissue come on top"
+        )
+    if "declaration" in report:
+        said.append(report["declaration"]["text"])
+    if report.get("one_more") is not None:
+        more = report["one_more"]
+        place = f"{vector(more['point_mm'], 0, 'mm')} {more['space']}"
+        said.append(f"one more marker helps most at {place}: {more['rms_mm']:.3f} mm")
+    if report.get("correction") is not None:
+        said.append(_correction(report["correction"]))
+    return said
+
+
+def _correction(found: Mapping[str, Any]) -> str:
+    """Both expectations of a corrected aim, and where the correction is the best one."""
+    joints = ", ".join(f"{angle:.2f}" for angle in found["joints_deg"])
+    return (
+        "aim corrected for the insertion at theta {theta_deg:.0f}, beta {beta_deg:.0f} (joints {joints} deg): moved by "
+        "{moved_mm:.2f} mm and {turned_deg:.2f} deg; expected there {expected_mm:.2f} mm (rms), not corrected "
+        "({uncorrected_method}) {uncorrected_mm:.2f} mm; it trusts what [errors] says of the arm"
+    ).format(**{**found, "joints": joints})
+
+
+def budget(found: Mapping[str, Any] | None) -> list[Block]:
+    """What each source costs, what one change would leave, and the change that wins most.
+
+    Args:
+        found: As ``register --json`` has it under ``budget``, of the direction that is shown.
+    """
+    if found is None:
+        return []
+    now, best = found["expected_mm"], found["best"]
+    said = [f"Expected tip error of this insertion, markers and arm together: {now:.2f} mm (rms)"]
+    if "limit_95_mm" in found:
+        said[0] += (
+            ", inserted at theta {theta_deg:.0f}, beta {beta_deg:.0f}: {expected_lateral_mm:.2f} across it and "
+            "{expected_depth_mm:.2f} along it; one of 20 insertions ends beyond {limit_95_mm:.2f} mm"
+        ).format(**found)
+    if now - best["expected_mm"] >= SHOWN_MM:
+        said.append(f"The next {now - best['expected_mm']:.2f} mm is won by {best['text']}")
+    sources = grid(
+        (Field("source", "text"), Field("alone", "alone_mm", 2, "mm"), Field("all but it", "without_mm", 2, "mm")),
+        (one for one in found["sources"] if one["alone_mm"] >= SHOWN_MM),
+    )
+    changed = grid((Field("with this one change", "text"), Field("expected, mm", "expected_mm", 2)), found["changes"])
+    return [f"{'. '.join(said)}.", (sources, changed), f"Not modelled: {found['not_modelled']}."]
+
+
+def certificate(summary: Mapping[str, Any]) -> list[Block]:
+    """What a certificate says of the cap; where nothing is safe, that this is proven, and to what."""
+    fraction = summary["undecided_share"]
+    undecided = "" if fraction is None else f" ({100 * fraction:.2f} % of the cap)"
+    area = f"{summary['undecided_square_deg']:.1f} square degrees{undecided}"
+    if summary["safe_cells"] == 0:
+        left = f", except perhaps in {area} of undecided cells" if summary["undecided_cells"] else ""
+        touch = summary["touch"]
+        reached = "is safe" if touch is None else f"keeps the margins of a chance to touch of {touch:g}"
+        said = f"proven: no direction of the cap {reached}, to {summary['size_deg']:g} deg{left}"
+    else:
+        fraction = summary["safe_share"]
+        safe = "" if fraction is None else f" ({100 * fraction:.1f} % of the cap)"
+        said = f"certified to {summary['size_deg']:g} deg: safe {summary['safe_square_deg']:.1f} square degrees{safe}"
+        said += f", undecided {area}"
+    return [f"{said}; {summary['queries']} exact queries", f"not certified: {', '.join(summary['not_certified'])}"]
