@@ -288,15 +288,12 @@ def test_the_cells_of_a_picture_are_those_of_its_directions(grid):
     assert near[np.flatnonzero(flat >= 0), flat[flat >= 0]][~pole[flat >= 0]].all()
 
 
-def test_only_pixels_at_borders_are_mixed():
-    """Inside a cell the colour is the cell's own; at a border it is the mean of four samples."""
+def test_a_pixel_has_the_colour_of_its_cell():
+    """No two cells are mixed: whoever shows the raster smaller smooths it."""
     case = world.make_case()
     found = world.make_candidates(case, step_deg=5.0)
     size, view = 120, map_view(case, found)
-    raster = map_raster(found, view, size)
-    fine = MapCells.of(found).picture(view, 2 * size)
-    table = np.vstack([np.c_[row_colours(found), np.full(len(found), 255)], np.zeros(4)])[fine]
-    table[..., :3] *= table[..., 3:] / 255
-    mean = table.reshape(size, 2, size, 2, 4).mean(axis=(1, 3))
-    mean[..., :3] /= np.maximum(mean[..., 3:], 1) / 255
-    assert np.abs(raster.rgba - mean).max() <= 0.5 + 1e-6
+    raster, rows = map_raster(found, view, size), MapCells.of(found).picture(view, size)
+    plain = (rows >= 0) & ~np.append(found.verdict.reason == "unknown_region", False)[rows]
+    assert plain.mean() > 0.3
+    assert np.array_equal(raster.rgba[plain], np.c_[row_colours(found), np.full(len(found), 255)][rows[plain]])
