@@ -199,3 +199,24 @@ def test_a_shell_in_front_counts_beside_a_table_that_was_cut_off():
     assert found.cut_off[(board > 4.0) & (x > 150.0)].mean() > 0.85
     assert (1, 0) in {side.face for side in found.sides}
     assert (1, -1) not in {side.face for side in found.sides}
+
+
+@pytest.mark.parametrize(
+    ("core_hu", "cover_hu", "bone_hu", "limb"),
+    [
+        (20.0, 20.0, 20.0, False),
+        (-120.0, 400.0, -120.0, False),
+        (20.0, 20.0, 600.0, True),
+        (120.0, 120.0, 120.0, False),
+    ],
+)
+def test_a_board_of_one_section_is_a_limb_only_with_a_bone_within(core_hu, cover_hu, bone_hu, limb):
+    """A gel mat in noise, and foam in a hard cover, hold voxels as dense as bone; a limb holds a bone."""
+    off, height = np.abs(X - 198.0), np.abs(Y - 283.0)
+    scene, board = np.where(trunk() > 0.0, 20.0, -1000.0), (height < 21.0) & (off < 190.0)
+    scene[board] = cover_hu
+    scene[(height < 18.0) & (off < 187.0)] = core_hu
+    scene[np.hypot(off, height) < 9.0] = bone_hu
+    found = body_mask(noisy(scene, 60.0).astype(np.float32), SPACING, where="ct", shown=Shown(table="none"))
+    assert found.body[board].any() == limb
+    assert found.body[trunk() > 0.0].mean() > 0.98

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.body.cut_ends import Box, Content, content_of, shifted, spacing_of
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown, TableSide, touching_tables
 from puncture_twin.planning.anatomy.body.unscanned import find_unscanned, measured_hu
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, grown
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, grown, widened
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume, canonical, in_order
 from puncture_twin.planning.geometry.parts import largest_part, middle_of, parts_of
@@ -293,18 +293,22 @@ def detached_limbs(hu: NDArray[np.float32], parts: Iterable[Piece], spacing_mm: 
         parts: As `thick_parts` finds them.
         spacing_mm: Shape (3,).
     """
-    voxel_ml = float(np.prod(spacing_mm)) / 1000.0
     limbs = []
     for part in parts:
         values = hu[part.box][part.mask]
-        if len(values) * voxel_ml < MIN_LIMB_ML:
+        if len(values) * np.prod(spacing_mm) < 1000.0 * MIN_LIMB_ML:
             continue
-        low, high = SOFT_TISSUE_HU
-        soft = low <= float(np.median(values)) <= high
-        bone_ml = np.count_nonzero(values > BONE_HU) * voxel_ml
-        if soft and (bone_ml >= MIN_BONE_ML or not _one_section(part.mask, hu.shape[2])):
+        soft = SOFT_TISSUE_HU[0] <= float(np.median(values)) <= SOFT_TISSUE_HU[1]
+        if soft and (not _one_section(part.mask, hu.shape[2]) or _holds_bone(part.mask, hu[part.box], spacing_mm)):
             limbs.append(part)
     return tuple(limbs)
+
+
+def _holds_bone(part: Bools, hu: NDArray[np.float32], spacing_mm: Floats) -> bool:
+    """Whether a bone lies within a part: it holds together, which noise does not, and is no table's hard cover."""
+    cover = widened(np.pad(~part, 1, constant_values=True), np.ceil(OPENING_MM / spacing_mm).astype(int))
+    bone = parts_of(~cover[1:-1, 1:-1, 1:-1] & (hu > BONE_HU))
+    return bool(bone.sizes.max(initial=0) * np.prod(spacing_mm) >= 1000.0 * MIN_BONE_ML)
 
 
 def limb_warnings(limbs: Sequence[Piece], trunk: Bools, voxel_ml: float) -> Iterator[str]:
@@ -325,12 +329,7 @@ def _side(limb: Piece, middle: Floats) -> str:
 
 def _one_section(part: Bools, slices: int) -> bool:
     """Whether the part is the same in nearly every slice of the image, as a table is."""
-    present = part.any(axis=(0, 1))
-    if np.count_nonzero(present) < ALIKE * slices:
-        return False
-    section = part[:, :, present].mean(axis=2) > 0.5
+    section = part[:, :, part.any(axis=(0, 1))].mean(axis=2) > 0.5
     both = (part & section[:, :, None]).sum(axis=(0, 1))
     either = (part | section[:, :, None]).sum(axis=(0, 1))
-    alike = np.zeros(slices)
-    alike[: len(both)] = both / np.maximum(either, 1)
-    return bool(np.mean(alike) > ALIKE)
+    return bool((both / np.maximum(either, 1)).sum() > ALIKE * slices)
