@@ -237,10 +237,10 @@ def _check_names(case: Case, structures: list[Structure]) -> None:
 
 
 def _check_demands(case: Case, structures: list[Structure]) -> None:
-    """Refuse a case without margins: every path would be "safe", which says nothing about a patient."""
-    if not any(structure.demands_margin for structure in structures):
+    """Refuse a patient without margins: every path would be "safe". A phantom may hold nothing but its target."""
+    if case.region != "phantom" and not any(structure.demands_margin for structure in structures):
         what = "no structure is to be avoided, so that no verdict would say anything about safety"
-        refuse(what, case.path, 'at least one structure of role "avoid" or "unknown"', "nothing_to_avoid")
+        refuse(what, case.path, 'a structure of role "avoid" or "unknown", or region = "phantom"', "nothing_to_avoid")
 
 
 def surface_distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:

@@ -149,6 +149,18 @@ def test_a_lesion_or_an_organ_as_target_has_no_such_warning(tmp_path, capfd):
     assert not any("a name that" in one for one in prepare(tmp_path, arm=False).anatomy.warnings)
 
 
+def test_a_phantom_may_hold_nothing_but_its_target(tmp_path, capfd):
+    """A block with one ball was refused, and no option helped; of a patient that still says nothing about safety."""
+    patient(tmp_path, ("bolt", inside(HERE, 10.0)))
+    for one in tmp_path.glob("*.nii.gz"):
+        if one.name not in ("scan.nii.gz", "bolt.nii.gz"):
+            one.unlink()
+    code, said = init(capfd, tmp_path, "--target", "-40,0,10", "--space", "LPS", "--region", "other")
+    assert code == 2 and 'region = "phantom"' in said[-1]
+    code, _ = init(capfd, tmp_path, "--target", "-40,0,10", "--space", "LPS", "--region", "phantom")
+    assert code == 0
+
+
 @pytest.mark.parametrize("name", ["C1 lateral mass", "lateral_mass_left", "LateralMass_C1"])
 def test_a_lateral_mass_is_a_vertebra(name):
     """It was a lesion, crossed where it held the target."""
