@@ -442,6 +442,7 @@ def test_a_refusal_is_the_one_object_of_json(folder, capfd, change, arguments, c
     assert error["code"] == code
     assert where in error["where"]
     assert error["sentence"] in captured.err
+    assert error["allowed"] and f"; allowed: {error['allowed']}" in captured.err
 
 
 def test_that_nothing_is_found_is_the_one_object_of_json(capfd):

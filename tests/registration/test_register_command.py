@@ -37,6 +37,13 @@ def test_two_lists_register_without_a_case(capfd):
     assert not np.allclose(ras["T_base_ct"], found["T_base_ct"])  # the CT's list is in the stated space too
 
 
+def test_two_lists_print_no_empty_row_and_no_empty_section(capfd):
+    """A row of empty brackets and a heading without a line stood there."""
+    assert main(["register", *LISTS, TARGET]) == OK
+    said = capfd.readouterr().out
+    assert "FRE" in said and "()" not in said and "error budget" not in said
+
+
 @pytest.mark.parametrize("fle", [None, 0.5])
 def test_two_lists_say_how_sure_they_are_and_what_would_help(fle, capfd):
     """The isotropic formulas' own error (Fitzpatrick 1998); the ellipsoid holds 95 %; dropping costs, adding helps."""

@@ -196,11 +196,12 @@ def _answered(command: Callable[[], object]) -> object:
     try:
         return command()
     except (PlanningError, ClickException) as error:
+        what, _, allowed = _line_and_code(error)[0].partition("; allowed: ")
         document = {
             "code": getattr(error, "code", "command_line"),
-            "sentence": getattr(error, "what", _line_and_code(error)[0]),
+            "sentence": getattr(error, "what", what),
             "where": getattr(error, "where", ""),
-            "allowed": getattr(error, "allowed", ""),
+            "allowed": getattr(error, "allowed", allowed),
             "numbers": getattr(error, "numbers", None) or getattr(error, "counts", {}),
         }
         print_answer({"error": document}, "", as_json=True)

@@ -53,9 +53,9 @@ def percent(fraction: float) -> str:
 
 
 def vector(values: Iterable[float | None], digits: int, unit: str = "") -> str:
-    """A point or axis in brackets."""
+    """A point or axis in brackets; "" of no values."""
     inside = ", ".join(number(value, digits) for value in values)
-    return f"({inside}) {unit}".rstrip()
+    return f"({inside}) {unit}".rstrip() if inside else ""
 
 
 FOLDED = 10

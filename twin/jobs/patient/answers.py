@@ -282,6 +282,6 @@ def registration_text(report: dict[str, Any]) -> str:
     target = f", target {vector(report['target_mm'], 1, 'mm')} {report['space']}" if "target_mm" in report else ""
     return text([
         Section(f"case {report['case']}: registration{target}", patient.registration(report)),
-        Section("error budget", patient.budget(report.get("budget"))),
+        *(Section("error budget", patient.budget(one)) for one in [report.get("budget")] if one),
         *(Section(f"{kind}: {one}", []) for kind in ("warning", "note") for one in report[f"{kind}s"]),
     ])  # fmt: skip
