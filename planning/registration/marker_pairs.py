@@ -68,7 +68,7 @@ def match(
         missing = sorted(wanted - set(points.names))
         if missing:
             near = "".join(did_you_mean(name, set(points.names) - set(other.names)) for name in missing[:1])
-            allowed = "the same names on both sides, or registration.use = [names]"
+            allowed = "the same names on both sides, or a case with registration.use = [names]"
             refuse(f"{', '.join(missing)} missing on the {side} side{near}", where, allowed, "markers_missing")
     if len(set(names)) < len(names):
         refuse(f"names repeat: {', '.join(names)}", where, "unique names", "duplicate_name")
