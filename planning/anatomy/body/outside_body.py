@@ -29,10 +29,11 @@ LEAST_HU = -1024
 """What is below counts as this in a mean: some scanners write less than air has."""
 DENSE_HU = -700.0
 """A single voxel above this is no noise (ten times that of a low-dose image)."""
-MIN_PIECE_MM3 = 100.0
-"""Pieces that hold less above ``BODY_HU`` are noise, or cloth: a full line of 4 mm diameter has this in 8 mm of its
-length. A gown on the skin of a real chest has -850, and -600 in its folds; it stops no needle. So has a line with a
-bore (4 and 2.6 mm) in voxels of 2 mm and more, and one of 2 mm in any: it is not seen."""
+MIN_PIECE_MM3, MIN_SOFT_MM3, SOLID_HU = 100.0, 500.0, -250.0
+"""Pieces that hold less above ``BODY_HU`` are noise, or cloth; where nothing in them is solid, less than the second: a
+full line of 4 mm diameter has the first in 8 mm of its length, between voxels of 3 mm the second in 30. A gown on the
+skin of a real chest has -850, and -260 in its folds; it stops no needle. So has a line with a bore (4 and 2.6 mm) in
+voxels of 2 mm and more, and one of 2 mm in any: it is not seen."""
 BULKY_ML = 50.0
 """Pieces of this volume that the border of the image cuts (a table, a mattress) go on beyond it, also between the
 places where they are cut: of a table that sags below the image both ends are seen."""
@@ -167,7 +168,8 @@ def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
         return stiff
     box = box_in(solid, margin=2)
     near = parts_of(widened(solid[box], (1, 1, 1)), corners=True)
-    large = near.counts(solid[box]) >= MIN_PIECE_MM3 / np.prod(spacing_mm)
+    least_mm3 = np.where(near.counts(solid[box] & (hu[box] > SOLID_HU)) > 0, MIN_PIECE_MM3, MIN_SOFT_MM3)
+    large = near.counts(solid[box]) * np.prod(spacing_mm) >= least_mm3
     stiff[box] |= widened(near.painted(large), (1, 1, 1)) & mask[box]
     return stiff
 

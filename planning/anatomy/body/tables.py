@@ -32,6 +32,9 @@ a round back as flat over 100 mm has a radius of 1.2 m. More of the side beyond 
 DRAWN_WIDTH_MM, RUN_MM = 100.0, 20.0
 """Over so much of its width together, of runs of so much: single lines of sight may be drawn by chance. Of a real
 abdomen in air no side keeps to a line over more than 63 mm."""
+ONE_PIECE_MM, ONE_PIECE = 0.25, 0.9
+"""Ends of a table keep so near to one another from slice to slice, or thrice their noise, .99 of them and more in drawn
+CTs. Of a trunk's straight back it is .80: nothing beyond it is free, but it has no edge."""
 SMOOTH_ALONG_MM = 12.0
 """Ends are averaged so far along the bed: a table is constant there, noise is not."""
 THICKEST_MM, ALIKE_MM = 80.0, 5.0
@@ -281,10 +284,12 @@ class _View(NamedTuple):
         along_mm, across_mm = float(self.spacing_mm[axis]), float(self.spacing_mm[1 - axis])
         ends_mm = np.where(self.counts, _smooth(self.ends * along_mm, float(self.spacing_mm[2])), np.nan)
         slope, outward = self._slope(ends_mm), 1.0 if end else -1.0
-        at, drawn = self._drawn(ends_mm, slope)
+        at, drawn, off_mm = self._drawn(ends_mm, slope)
         edge_mm = EDGE_MM if self.touching else -np.inf
         if self.touching and drawn.sum() * across_mm < DRAWN_WIDTH_MM:
             edge_mm, slope, (at, drawn) = 0.0, np.zeros(len(at)), self._flat(self.ends * along_mm)
+        elif self.touching and not self._one_piece(off_mm[drawn]):
+            edge_mm = 0.0
         sink = slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
         drawn &= outward * (at + slope * middle[2] * self.spacing_mm[2]) > outward * middle[axis] * along_mm
         width_mm = drawn.sum() * across_mm
@@ -326,16 +331,22 @@ class _View(NamedTuple):
         enough = [slope for slope, width in zip(slopes, widths, strict=True) if width >= NEARLY * max(widths)]
         return min(enough, key=lambda slope: float(np.abs(slope).max()))
 
-    def _drawn(self, ends_mm: Floats, slope: Floats) -> tuple[Floats, Bools]:
-        """Where most ends of each line of sight are in slice 0, shape (n,), mm, and whether it is drawn."""
-        count = ends_mm.shape[1]
-        level = ends_mm - slope[:, None] * np.arange(count) * self.spacing_mm[2]
-        at = _medians(level)
-        near = np.abs(level - at[:, None]) <= self.near_mm
-        return at, near.mean(axis=1) >= DRAWN_FRACTION
+    def _drawn(self, ends_mm: Floats, slope: Floats) -> tuple[Floats, Bools, Floats]:
+        """Where most ends of each line of sight are in slice 0, shape (n,), mm; which are drawn; how far off each is."""
+        off_mm = ends_mm - slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
+        at = _medians(off_mm)
+        off_mm -= at[:, None]
+        return at, (np.abs(off_mm) <= self.near_mm).mean(axis=1) >= DRAWN_FRACTION, off_mm
+
+    def _one_piece(self, off_mm: Floats) -> bool:
+        """Whether ends (n, nz), mm off their lines, keep to one another but for their noise: a back does so less."""
+        noise_mm = float(np.nanmedian(np.abs(np.diff(self.ends, 2, axis=1)))) * float(self.spacing_mm[self.face[0]])
+        apart_mm = np.abs(off_mm - _medians(off_mm.T))
+        near = apart_mm <= max(ONE_PIECE_MM, 3.0 * noise_mm)
+        return bool(near.sum() >= ONE_PIECE * np.isfinite(apart_mm).sum())
 
     def _flat(self, ends_mm: Floats) -> tuple[Floats, Bools]:
-        """As `_drawn` of ends that lie in one plane across their axis, along a part of the bed too."""
+        """As `_drawn`, of ends that lie in one plane across their axis, along a part of the bed too."""
         plane, count = _commonest(ends_mm, DRAWN_MM), ends_mm.shape[1]
         beyond = (ends_mm - plane) * (1.0 if self.face[1] else -1.0) > self.near_mm
         run = min(count, int(np.ceil(FLAT_LENGTH_MM / self.spacing_mm[2])))
