@@ -10,6 +10,7 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     BULKY_ML,
     CUT_AT_MM,
     OutsideImage,
+    outside_mask,
     outside_surface,
 )
 from puncture_twin.planning.anatomy.body.tables import TableSide
@@ -38,6 +39,26 @@ def bar() -> TriangleMesh:
     surface = outside_surface(in_air(), mask, where="bar")
     assert surface is not None
     return surface
+
+
+@pytest.mark.parametrize(
+    ("hu", "voxels", "seen"), [(-270.0, 12, False), (-230.0, 12, True), (-230.0, 6, False), (-400.0, 18, False)]
+)
+def test_a_fold_of_cloth_is_air_and_what_is_solid_is_not(hu, voxels, seen):
+    """Of 12 mm3 a voxel: cloth of half of water's density; one voxel of a line's middle; noise; a longer fold."""
+    image = in_air()
+    image.hu[20, 15, :voxels] = -420.0
+    image.hu[20, 15, voxels // 2] = hu
+    assert outside_mask(image, -900.0).any() == seen
+
+
+def test_a_line_between_voxels_is_seen_by_its_length():
+    """Nowhere denser than -400 HU, in 60 mm of its length; 24 mm of it may be cloth."""
+    image = in_air()
+    image.hu[20:22, 15:17] = -400.0
+    assert outside_mask(image, -900.0)[20:22, 15:17].all()
+    image.hu[20:22, 15:17, 8:] = -1000.0
+    assert not outside_mask(image, -900.0).any()
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -67,6 +67,17 @@ def test_a_cradle_that_holds_together_with_the_body_is_drawn(slope):
     assert np.all(beyond[:, 1] * 4.0 > truth[beyond[:, 0], beyond[:, 2]] - 2.5)
 
 
+@pytest.mark.parametrize(("bulge_mm", "edge_mm"), [(0.0, 30.0), (0.9, 0.0)])
+def test_a_back_that_is_nearly_one_section_has_no_table_s_edge(bulge_mm, edge_mm):
+    """Nothing behind it is free; beside a table its edge is not free either, beside a back that bulges the flank is."""
+    bulge = bulge_mm * np.sin((Z - 78.0) / 25.0) * np.cos((X - 198.0) / 30.0)
+    support = cradle(radius_mm=150.0, thick_mm=60.0, half_mm=110.0) + 125.0 * bulge
+    scene = np.maximum(np.where(Y < 150.0, trunk(), -500.0), support)
+    (back,) = drawn(noisy(scene, 5.0), scene > 0.0)
+    last = np.flatnonzero(back.lines)[-1]
+    assert back.line[last, 16] - back.line[last + 8, 16] == pytest.approx(edge_mm / 4.0, abs=2.5)
+
+
 def test_a_short_image_shows_no_drawn_side():
     """Over 40 mm every body is nearly one section: nothing is said of its sides."""
     scene = np.maximum(trunk(), cradle())[:, :, :8]

@@ -332,7 +332,7 @@ class _View(NamedTuple):
         return min(enough, key=lambda slope: float(np.abs(slope).max()))
 
     def _drawn(self, ends_mm: Floats, slope: Floats) -> tuple[Floats, Bools, Floats]:
-        """Where most ends of each line of sight are in slice 0, shape (n,), mm; which are drawn; how far off each is."""
+        """Where most ends of each line of sight are in slice 0, shape (n,), mm; which are drawn; how far off each."""
         off_mm = ends_mm - slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
         at = _medians(off_mm)
         off_mm -= at[:, None]
