@@ -78,6 +78,19 @@ def test_a_back_that_is_nearly_one_section_has_no_table_s_edge(bulge_mm, edge_mm
     assert back.line[last, 16] - back.line[last + 8, 16] == pytest.approx(edge_mm / 4.0, abs=2.5)
 
 
+@pytest.mark.parametrize(("last", "slope"), [(19, (0.0, 0.0)), (24, (0.0, 0.05)), (13, (0.0, 0.0))])
+def test_a_cradle_that_ends_in_the_image_is_drawn_as_far_as_it_goes(last, slope):
+    """However it is bent; nothing of what lies above its far side is beyond it."""
+    shell = np.where(np.arange(32) <= last, cradle(slope=slope), -500.0)
+    scene = noisy(np.maximum(trunk(), shell))
+    (back,) = drawn(scene, scene > 0.0)
+    across_mm = np.abs(np.arange(100) * 4.0 - 198.0)
+    truth = 232.0 - 250.0 + np.sqrt(274.0**2 - across_mm[:, None] ** 2) + slope[1] * (np.arange(32) * 5.0 - 80.0)
+    seen = np.ix_(across_mm < 110.0, np.arange(32) <= last)
+    assert back.face == (1, -1)
+    assert np.abs(back.line * 4.0 - truth)[seen].max() < 2.5
+
+
 def test_a_short_image_shows_no_drawn_side():
     """Over 40 mm every body is nearly one section: nothing is said of its sides."""
     scene = np.maximum(trunk(), cradle())[:, :, :8]

@@ -26,9 +26,6 @@ DRAWN_MM = 0.75
 """A line of sight is drawn where the surface keeps within this of one line; noise moves it by some 0.3 mm."""
 DRAWN_FRACTION = 0.8
 """Of the slices at least."""
-FLAT_LENGTH_MM, BEYOND_FRACTION = 50.0, 0.01
-"""Where lines of sight end in one plane, along so much of the bed is enough: a board may be shorter than the image, and
-a round back as flat over 100 mm has a radius of 1.2 m. More of the side beyond it, and the plane is a step."""
 DRAWN_WIDTH_MM, RUN_MM = 100.0, 20.0
 """Over so much of its width together, of runs of so much: single lines of sight may be drawn by chance. Of a real
 abdomen in air no side keeps to a line over more than 63 mm."""
@@ -39,8 +36,8 @@ SMOOTH_ALONG_MM = 12.0
 """Ends are averaged so far along the bed: a table is constant there, noise is not."""
 THICKEST_MM, ALIKE_MM = 80.0, 5.0
 """No table is thicker, and beside the body it is as thick to so much all over."""
-LEAST_LENGTH_MM = 50.0
-"""In a shorter image every body is nearly one section along the bed: tables are not told."""
+LEAST_LENGTH_MM, LEAST_SLICES = 50.0, 12
+"""A shorter image, or fewer slices of a part of one, may show any body as one section: tables are not told."""
 TILTS_FROM_MM = 100.0
 """From this length of the image on, a bed at an angle to the slices' axis is looked for too."""
 TILTS = np.tan(np.radians(np.linspace(-4.0, 4.0, 17)))
@@ -287,8 +284,8 @@ class _View(NamedTuple):
         at, drawn, off_mm = self._drawn(ends_mm, slope)
         edge_mm = EDGE_MM if self.touching else -np.inf
         if self.touching and drawn.sum() * across_mm < DRAWN_WIDTH_MM:
-            edge_mm, slope, (at, drawn) = 0.0, np.zeros(len(at)), self._flat(self.ends * along_mm)
-        elif self.touching and not self._one_piece(off_mm[drawn]):
+            return max(filter(None, self._parts(middle)), key=lambda side: side.width_mm, default=None)
+        if self.touching and not self._one_piece(off_mm[drawn]):
             edge_mm = 0.0
         sink = slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
         drawn &= outward * (at + slope * middle[2] * self.spacing_mm[2]) > outward * middle[axis] * along_mm
@@ -345,15 +342,18 @@ class _View(NamedTuple):
         near = apart_mm <= max(ONE_PIECE_MM, 3.0 * noise_mm)
         return bool(near.sum() >= ONE_PIECE * np.isfinite(apart_mm).sum())
 
-    def _flat(self, ends_mm: Floats) -> tuple[Floats, Bools]:
-        """As `_drawn`, of ends that lie in one plane across their axis, along a part of the bed too."""
-        plane, count = _commonest(ends_mm, DRAWN_MM), ends_mm.shape[1]
-        beyond = (ends_mm - plane) * (1.0 if self.face[1] else -1.0) > self.near_mm
-        run = min(count, int(np.ceil(FLAT_LENGTH_MM / self.spacing_mm[2])))
-        near = (np.abs(ends_mm - plane) <= self.near_mm).astype(np.float32)
-        along = scipy.ndimage.uniform_filter1d(near, run, axis=1, mode="constant").max(axis=1)
-        step = beyond.sum() > BEYOND_FRACTION * np.isfinite(ends_mm).sum()
-        return np.full(len(ends_mm), plane), (along > 1.0 - 0.5 / run) & ~step
+    def _parts(self, middle: Floats) -> Iterator[TableSide | None]:
+        """The sides of the parts of the bed between slices at which something as wide as a table begins or ends."""
+        axis, count = self.face[0], self.ends.shape[1]
+        ends_mm = np.nan_to_num(self.ends, nan=-1e6) * self.spacing_mm[axis]
+        moved = np.abs(ends_mm[:, 2:] - ends_mm[:, :-2]) >= ALIKE_MM
+        whole = np.pad(moved.sum(axis=0) * self.spacing_mm[1 - axis] < DRAWN_WIDTH_MM, 1, constant_values=True)
+        for (part,) in scipy.ndimage.find_objects(scipy.ndimage.label(whole)[0]):
+            slices = part.stop - part.start
+            if max(LEAST_SLICES, LEAST_LENGTH_MM / self.spacing_mm[2]) <= slices < count:
+                view = self._replace(ends=self.ends[:, part], counts=self.counts[:, part])
+                side, steps = view.side(middle - [0.0, 0.0, part.start]), np.arange(count) - part.start
+                yield side and side._replace(line=side.line[:, :1] + np.diff(side.line[:, :2]) * steps)
 
 
 def _medians(values: Floats) -> Floats:
