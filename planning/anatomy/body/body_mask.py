@@ -143,18 +143,12 @@ def ct_image(volume: Volume) -> CtImage:
 
 
 def body_mask(
-    hu: NDArray[np.float32],
-    spacing_mm: NDArray[np.float64],
-    *,
-    where: str | Path,
-    shown: Shown = PATIENT,
-    unscanned: Bools | None = None,
+    hu: NDArray[Any], spacing_mm: Floats, *, where: str | Path, shown: Shown = PATIENT, unscanned: Bools | None = None
 ) -> BodyMask:
     """Finds the patient, or the phantom, in a CT.
 
-    Threshold, opening, largest component without the table that touches it, and every other component that looks like a
-    limb; then air that each of them encloses in an axial slice is filled, and so is air at the border of the volume
-    that does not look like the room's. Filling too much is the safe side: it turns "air" at the border into "unknown".
+    Threshold, opening, largest part without the table that touches it, and all others that look like a limb; then air
+    that each encloses in an axial slice is filled, and air at the image's border that does not look like the room's.
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
@@ -166,17 +160,6 @@ def body_mask(
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
     """
-    body, tables, warnings = _found(hu, spacing_mm, where, shown)
-    unscanned = find_unscanned(hu) if unscanned is None else unscanned
-    if unscanned.any() and (grown(body) & unscanned & ~body).any():
-        warnings.append(UNSCANNED)
-    return BodyMask(body, unscanned, tuple(warnings), tables)
-
-
-def _found(
-    hu: NDArray[np.float32], spacing_mm: Floats, where: str | Path, shown: Shown
-) -> tuple[Bools, tuple[TableSide, ...], list[str]]:
-    """The body with all that was filled, the tables that touch it, and what the user should know."""
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
     dense = hu > BODY_HU
     trunk, parts = np.zeros(hu.shape, bool), thick_parts(dense, spacing_mm)
@@ -185,8 +168,7 @@ def _found(
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
         refuse(what, where, f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body", "no_body")
-    warnings: list[str] = []
-    tables: tuple[TableSide, ...] = ()
+    tables, warnings = tuple[TableSide, ...](), list[str]()
     if shown.tables:
         touching = touching_tables(hu, trunk, spacing_mm, shown, level=BODY_HU)
         tables, warnings = touching.sides, list(touching.warnings)
@@ -201,7 +183,10 @@ def _found(
     _fill_cut_lungs(filled, hu, voxel_ml, warnings)
     if filled.all():
         refuse("no air around the body", where, "a CT that shows the skin somewhere", "no_air")
-    return filled, tables, warnings
+    unscanned = find_unscanned(hu) if unscanned is None else unscanned
+    if unscanned.any() and (grown(filled) & unscanned & ~filled).any():
+        warnings.append(UNSCANNED)
+    return BodyMask(filled, unscanned, tuple(warnings), tables)
 
 
 def filled_slices(mask: Bools) -> Bools:
@@ -221,7 +206,10 @@ def filled_slices(mask: Bools) -> Bools:
 
 
 def _fill_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> None:
-    """Fills air regions that are not the room: small ones, and those with the density of lung."""
+    """Fills air regions that are not the room: small ones, and those with the density of lung.
+
+    Filling too much is the safe side: it turns "air" at the border into "unknown".
+    """
     air = parts_of(~body)
     denser = air.counts(hu > OUTSIDE_AIR_HU)
     inside = (air.sizes * voxel_ml < MIN_OUTSIDE_ML) | (2 * denser > air.sizes)
@@ -332,4 +320,4 @@ def _one_section(part: Bools, slices: int) -> bool:
     section = part[:, :, part.any(axis=(0, 1))].mean(axis=2) > 0.5
     both = (part & section[:, :, None]).sum(axis=(0, 1))
     either = (part | section[:, :, None]).sum(axis=(0, 1))
-    return bool((both / np.maximum(either, 1)).sum() > ALIKE * slices)
+    return bool(np.sum(both / np.maximum(either, 1)) > ALIKE * slices)

@@ -421,7 +421,8 @@ def find_support(
     near = [face for face in near if face[0] == 1 or arms]  # at its sides only an arm may lie unseen
     if supports:  # arms may lie on what a face cuts beside the body
         beside = [face for face in near if any(face[0] != axis for axis in supports)]
-        near = [face for face in beside if _cuts(outside, face) and _gap_mm(body, face, spacing_mm) > 0.0]
+        cut = [face for face in beside if outside.take(face[1], axis=face[0]).any(axis=0).mean() >= CUT_FRACTION]
+        near = [face for face in cut if _gap_mm(body, face, spacing_mm) > 0.0]
     return Support(drawn, bool(supports), () if shown.phantom and not supports else tuple(near))
 
 
@@ -442,11 +443,6 @@ def support_warnings(seen: bool, open_faces: Sequence[Face]) -> Iterator[str]:
             )
     if not seen and not open_faces:
         yield "the CT shows nothing that the body lies on; what is beyond its faces counts as air"
-
-
-def _cuts(outside: Bools, face: Face) -> bool:
-    axis, end = face
-    return bool(outside.take(end, axis=axis).any(axis=0).mean() >= CUT_FRACTION)
 
 
 def _gap_mm(body: Bools, face: Face, spacing_mm: Floats) -> float:
