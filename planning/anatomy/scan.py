@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
-from puncture_twin.planning.anatomy.body.limbs import limb_search
+from puncture_twin.planning.anatomy.body.limbs import LimbSearch, limb_search
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_LONG_MM,
     OutsideImage,
@@ -135,19 +135,27 @@ class Scan:
             target_ct: Shape (3,), LPS mm.
             structures: Of the case: bones that they name are no evidence of a limb.
         """
-
-        def make() -> TriangleMesh | None:
-            if not self._ct.shown.limbs:
-                return None
-            search = limb_search(self._ct, self._body, target_ct, structures)
-            limbs = search.limbs()
-            if not limbs.any():
-                return None
-            return mask_surface(limbs, search.T_ct_index, where=self._ct.where)
-
+        if not self.source.shown.limbs:
+            return None
         named = [f"{one.name} {one.mesh.digest}" for one in structures]
-        made_from = {"what": "attached limbs", "target": target_ct.tolist(), "structures": named}
-        return self._kept(made_from, lambda: [make()])[0]
+        made_from = {"what": "attached limbs", "structures": named}
+        skin = self.skin and self.skin.mesh.digest
+        known = f"{made_from} {skin} {self.source.box} {self.source.shown}"
+
+        @cache
+        def search() -> LimbSearch:
+            return self.source.surfaces.held(
+                known, lambda: limb_search(self._ct, self._body, structures), lambda made: made.nbytes
+            )
+
+        def choose() -> Arrays:
+            return {"chosen": np.array(search().chosen(target_ct))}
+
+        def make() -> list[TriangleMesh | None]:
+            return [mask_surface(search().limbs(chosen), search().T_ct_index, where=self.source.surfaces.path)]
+
+        chosen = self._kept_arrays({**made_from, "target": target_ct.tolist()}, choose)["chosen"].tolist()
+        return self._kept({**made_from, "chosen": chosen}, make)[0] if any(chosen[1:]) else None
 
     def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
         """Surfaces of what is dense, or gas, inside the body and in no structure.

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -63,27 +63,89 @@ BEYOND_ENDS_MM = 30.0
 FULL = np.ones((3, 3, 3), bool)
 
 
-@dataclass(frozen=True, eq=False)
-class LimbSearch:
-    """The body on a grid of some 4 mm, axes running to the left, back and head.
+class Piece(NamedTuple):
+    """What may be a limb, as blocks; it is none where the target lies in ``near``.
 
     Attributes:
-        body: Shape (nx, ny, nz), the part that holds the target; a block counts where any of its voxels does.
+        near: Alone a limb's where the target lies in ``whole``.
+        whole: All that may be one.
+        ml: Of a part beyond a neck, else 0: no larger than a limb is it or what holds the target, or it is none.
+    """
+
+    near: Bools
+    whole: Bools
+    ml: float
+
+
+class Pieces(NamedTuple):
+    """All pieces of a part of the body; ``core_ml`` of each number in ``core``, beyond necks each another; 0 outside."""
+
+    found: tuple[Piece, ...]
+    core: Ints32
+    core_ml: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class LimbSearch:
+    """The body on a grid of some 4 mm, axes running to the left, back and head; what is found serves every target.
+
+    Attributes:
+        parts: Shape (nx, ny, nz), from 1 the part that holds together; a block counts where any of its voxels does.
         solid: Same shape, body, and what was not scanned: neither is air.
         bone: Same shape, bone that is evidence of a limb; a block counts where an eighth of it is, which noise is not.
         limb_bone: Same shape, a leg's named bone too: such is a limb's beyond a neck, and the trunk's in a hip.
         spacing_mm: Shape (3,).
         T_ct_index: Shape (4, 4), LPS mm.
-        at: The target's block.
     """
+
+    parts: Ints32
+    solid: Bools
+    bone: Bools
+    limb_bone: Bools
+    spacing_mm: Floats
+    T_ct_index: Floats
+    _found: dict[int, Pieces] = field(default_factory=dict, init=False)
+
+    @property
+    def nbytes(self) -> int:
+        """About, with the pieces of one part."""
+        return 20 * self.parts.size
+
+    def chosen(self, target_ct: Floats) -> tuple[int, ...]:
+        """The part that holds a target (3,), LPS mm, and of each of its pieces: no limb (0), near (1) or whole (2)."""
+        index = np.rint(np.linalg.solve(self.T_ct_index, np.append(target_ct, 1.0))[:3]).astype(int)
+        at = tuple(np.clip(index, 0, np.array(self.parts.shape) - 1).tolist())
+        found, core, core_ml = self._pieces(number := int(self.parts[at]))
+        own_ml = core_ml[core[at]]
+        none = (piece.near[at] or min(own_ml, piece.ml) > MOST_ML for piece in found)
+        return number, *(0 if no else 2 - int(piece.whole[at]) for no, piece in zip(none, found, strict=True))
+
+    def limbs(self, chosen: Sequence[int]) -> Bools:
+        """Blocks of the body that belong to a limb without the target, by what was `chosen` for it."""
+        number, *which = chosen
+        limbs = np.zeros(self.parts.shape, bool)
+        for piece, how in zip(self._pieces(number).found, which, strict=True):
+            if how:
+                limbs |= piece[how - 1]
+        return limbs & (self.parts == number)
+
+    def _pieces(self, number: int) -> Pieces:
+        if number not in self._found:
+            part = self.parts == number
+            bone, limb_bone = self.bone & part, self.limb_bone & part
+            self._found[number] = BodyPart(part, self.solid, bone, limb_bone, self.spacing_mm).pieces()
+        return self._found[number]
+
+
+@dataclass(frozen=True, eq=False)
+class BodyPart:
+    """A part of the body that holds together, as ``body``; see `LimbSearch`."""
 
     body: Bools
     solid: Bools
     bone: Bools
     limb_bone: Bools
     spacing_mm: Floats
-    T_ct_index: Floats
-    at: tuple[int, int, int]
 
     def volume_ml(self, mask: Bools) -> float:
         """Of a mask."""
@@ -95,26 +157,19 @@ class LimbSearch:
         padded = np.pad(self.solid, 1, mode="edge")
         return np.asarray(scipy.ndimage.distance_transform_edt(padded, sampling=self.spacing_mm)[1:-1, 1:-1, 1:-1])
 
-    def limbs(self) -> Bools:
-        """Blocks of the body that belong to a limb without the target."""
-        found = np.zeros(self.body.shape, bool)
-        if not self.body[self.at] or self.volume_ml(self.limb_bone) < MIN_BONE_ML:
-            return found
-        for part in self._beyond_necks():
-            found |= part
-        for bones in self._exposed():
-            found |= self._about(bones)
-        return found & self.body
-
-    def _beyond_necks(self) -> Iterator[Bools]:
-        """Parts beyond a narrow neck that hold bone, as large as a limb can be, if the target's part is not."""
-        owner = _nearest_core(self.body, self.spacing_mm)
-        own_ml = self.volume_ml(owner == owner[self.at])
-        for number in range(1, int(owner.max(initial=0)) + 1):
-            part = owner == number
-            small = min(own_ml, self.volume_ml(part)) <= MOST_ML
-            if number != owner[self.at] and small and self.volume_ml(part & self.limb_bone) >= MIN_BONE_ML:
-                yield part
+    def pieces(self) -> Pieces:
+        """What may be a limb: parts beyond a narrow neck that hold bone, and what lies about exposed bones."""
+        if self.volume_ml(self.limb_bone) < MIN_BONE_ML:
+            return Pieces((), self.body.astype(np.int32), np.zeros(2))
+        core = _nearest_core(self.body, self.spacing_mm)
+        parts = [core == number for number in range(int(core.max(initial=0)) + 1)]
+        ml = np.array([self.volume_ml(part) for part in parts])
+        beyond = [
+            Piece(part, part, core_ml)
+            for part, core_ml in zip(parts[1:], ml[1:], strict=True)
+            if self.volume_ml(part & self.limb_bone) >= MIN_BONE_ML
+        ]
+        return Pieces((*beyond, *(self._about(bones) for bones in self._exposed())), core, ml)
 
     def _exposed(self) -> Iterator[Bools]:
         """Bones about which air is on more sides than about a bone of the trunk, of one limb each."""
@@ -154,29 +209,25 @@ class LimbSearch:
             air += ~self.solid[tuple(at.T)]
         return air / DIRECTIONS
 
-    def _about(self, bones: Bools) -> Bools:
-        """What may belong to the limb about some bones, also some way beyond their ends; nothing about the target."""
+    def _about(self, bones: Bools) -> Piece:
+        """What may belong to the limb about some bones, also some way beyond their ends."""
         gap, nearest = scipy.ndimage.distance_transform_edt(~bones, sampling=self.spacing_mm, return_indices=True)
         radius = self.depth_mm[tuple(nearest)]
-        if gap[self.at] < radius[self.at]:
-            return np.zeros_like(bones)
         reach = gap <= FLAT * radius + SLACK_MM
         along = _axis(np.argwhere(bones) * self.spacing_mm)[1] / self.spacing_mm
         steps = np.arange(-BEYOND_ENDS_MM, BEYOND_ENDS_MM + 1e-9, 0.5 * float(self.spacing_mm.min()))
         line = np.rint(steps[:, None] * along).astype(int)
         rod = np.zeros(2 * np.abs(line).max(axis=0) + 1, bool)
         rod[tuple((line + np.array(rod.shape) // 2).T)] = True
-        beyond = scipy.ndimage.binary_dilation(reach, rod)
-        return np.asarray(gap < radius) if beyond[self.at] else beyond
+        return Piece(np.asarray(gap < radius), scipy.ndimage.binary_dilation(reach, rod), 0.0)
 
 
-def limb_search(image: CtImage, body: Bools, target_ct: Floats, structures: Sequence[Named]) -> LimbSearch:
+def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> LimbSearch:
     """Sample a CT and its body.
 
     Args:
         image: The CT.
         body: Its voxels that are body.
-        target_ct: Shape (3,), LPS mm.
         structures: Which explain bones.
     """
     stride = np.maximum(1, (SAMPLING_MM / image.spacing_mm).astype(int))
@@ -184,15 +235,11 @@ def limb_search(image: CtImage, body: Bools, target_ct: Floats, structures: Sequ
     T[:3, 3] += T[:3, :3] @ ((stride - 1) / 2.0)
     T[:3, :3] *= stride
     coarse = _share(body, stride) > 0.0
-    index = np.rint(np.linalg.solve(T, np.append(target_ct, 1.0))[:3]).astype(int)
-    x, y, z = np.clip(index, 0, np.array(coarse.shape) - 1)
-    labels, _ = scipy.ndimage.label(coarse)
-    part = coarse & (labels == labels[x, y, z])
     solid = coarse | (_share(image.unscanned, stride) >= 0.5)
     every_bone = _share(body & (image.hu > BONE_HU), stride) >= 0.125
     legs, others = _explained(every_bone, T, structures)
-    bone, limb_bone = (every_bone & part & ~named for named in (legs | others, others))
-    return LimbSearch(part, solid, bone, limb_bone, image.spacing_mm * stride, T, (int(x), int(y), int(z)))
+    bone, limb_bone = (every_bone & ~named for named in (legs | others, others))
+    return LimbSearch(scipy.ndimage.label(coarse)[0], solid, bone, limb_bone, image.spacing_mm * stride, T)
 
 
 def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[Named]) -> tuple[Bools, Bools]:
