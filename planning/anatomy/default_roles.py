@@ -12,6 +12,7 @@ import re
 import unicodedata
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
+from functools import cache
 from types import MappingProxyType
 from typing import Literal, NamedTuple, get_args
 
@@ -190,6 +191,7 @@ VESSEL_WORDS = frozenset(
 """Words of a vessel's name; ``tumor_artery`` is one, ``hypervascular_lesion`` is none."""
 
 
+@cache
 def default_role(name: str, region: str) -> DefaultRole | None:
     """The line of the table that a name belongs to, or None.
 

@@ -25,6 +25,7 @@ from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import LabelGrid, Role, Structure, label_grids
 from puncture_twin.planning.base.arrays import Floats, widened
+from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.label_surface import mask_surface
@@ -246,7 +247,7 @@ class _Extent:
         return np.stack([low - self.low, self.high - high])
 
 
-def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure]) -> BeyondLabels:
+def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure], memory: Memory = NO_MEMORY) -> BeyondLabels:
     """Find where label maps end inside the body.
 
     An organ that the map would have shown demands its margin of the needle's surface. So the margin of what is beyond
@@ -257,6 +258,7 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure]) -> Be
         case: The case.
         skin: Its skin; where it is open, a map that ends is refused.
         structures: What was read of the maps.
+        memory: Holds the body's box in each map.
 
     Raises:
         InputError: A map that does not hold the target, or one that ends in a body whose skin is open.
@@ -264,7 +266,7 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure]) -> Be
     meshes, margins, warnings = [], [0.0], []
     for grid in label_grids(case):
         margin = _largest_margin(case, grid, structures) + float(grid.voxels.spacing_mm.max()) / 2
-        extent = _extent(case, skin, grid, margin)
+        extent = _extent(case, skin.mesh, grid, margin, memory)
         _refuse_without_target(case, grid)
         if extent.gaps.max() <= VOXELS_OF_SLACK:
             continue
@@ -285,13 +287,18 @@ def _largest_margin(case: Case, grid: LabelGrid, structures: Sequence[Structure]
     return max([case.ct.margin_mm, *named, *(one.margin_mm for one in grid.own(structures))])
 
 
-def _extent(case: Case, skin: Skin, grid: LabelGrid, margin_mm: float) -> _Extent:
+def _extent(case: Case, skin: TriangleMesh, grid: LabelGrid, margin_mm: float, memory: Memory) -> _Extent:
     T_index_ct = np.linalg.inv(grid.voxels.T_ct_index)
-    body = apply(T_index_ct, skin.mesh.vertices)
+
+    def box() -> Floats:
+        body = apply(T_index_ct, skin.vertices)
+        return np.stack([body.min(axis=0), body.max(axis=0)])
+
+    low, high = memory.get((__name__, skin.digest, T_index_ct.tobytes()), box, lambda ends: ends.nbytes)
     target = apply(T_index_ct, case.target_ct[None])[0]
     # |row| is how many voxels an axis advances for a step of 1 mm along its normal
     reach = (case.needle.length_mm + margin_mm) * np.linalg.norm(T_index_ct[:3, :3], axis=1)
-    return _Extent(grid, np.maximum(body.min(axis=0), target - reach), np.minimum(body.max(axis=0), target + reach))
+    return _Extent(grid, np.maximum(low, target - reach), np.minimum(high, target + reach))
 
 
 def _refuse_without_target(case: Case, grid: LabelGrid) -> None:

@@ -51,20 +51,21 @@ def case_paths(case: Case, skin: Skin, outward_ct: Floats, shift_ct: Floats | fl
     return skin_paths(skin, case.target_ct + shift_ct, outward_ct, farthest)
 
 
-def axis_lengths(case: Case, structures: Sequence[Structure], paths: SkinPaths) -> Floats:
+def axis_lengths(case: Case, structures: Sequence[Structure], path_length: Floats, skin_angle: Floats) -> Floats:
     """Lengths to which n needle axes are checked against k structures, shape (n, k), mm.
 
     Against structures of the body: the needle, inserted. Against what is outside of the body (table, gantry): up to the
     waiting flange, for the needle comes from there.
     """
     farthest = farthest_flange(case.needle, case.search.max_skin_angle)
-    waiting = np.fmin(waiting_flange(case.needle, paths.path_length, paths.skin_angle), farthest)  # NaN without skin
+    waiting = np.fmin(waiting_flange(case.needle, path_length, skin_angle), farthest)  # NaN without skin
     return np.where([s.outside for s in structures], waiting[:, None], case.needle.length_mm)
 
 
 def case_axis_lengths(case: Case, anatomy: Anatomy, outward_ct: Floats) -> Floats:
     """`axis_lengths` of n paths to the case's target against everything that is checked; ``outward_ct`` (n, 3)."""
-    return axis_lengths(case, anatomy.checked, case_paths(case, anatomy.skin, outward_ct))
+    paths = case_paths(case, anatomy.skin, outward_ct)
+    return axis_lengths(case, anatomy.checked, paths.path_length, paths.skin_angle)
 
 
 UNEVEN_SKIN_MM = 1.0

@@ -34,7 +34,7 @@ from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, cross_check
 from puncture_twin.planning.collision.workcell import case_checker, with_surroundings
 from puncture_twin.planning.evidence.checks import findings
-from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths, case_paths
+from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
 from puncture_twin.planning.search.bedside import EntryFacts, Landmark, entry_facts
 from puncture_twin.planning.search.bending import check_tissues
@@ -270,9 +270,9 @@ def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) ->
     if not len(rows) or case.ct.beyond_mm == 0.0:
         return 0
     narrow = replace(case, ct=replace(case.ct, beyond_mm=0.0))
-    (solid,), outward = beyond_images(narrow, anatomy.skin, anatomy.scan).structures, candidates.outward_ct[rows]
-    lengths = axis_lengths(case, [solid], case_paths(case, anatomy.skin, outward))
-    axes = FastEngine([solid.mesh]).measure(case.target_ct, outward, lengths, shown=False)
+    (solid,), path = beyond_images(narrow, anatomy.skin, anatomy.scan).structures, candidates.path
+    lengths = axis_lengths(case, [solid], path.length[rows], path.skin_angle[rows])
+    axes = FastEngine([solid.mesh]).measure(case.target_ct, candidates.outward_ct[rows], lengths, shown=False)
     return int((axes.distance >= case.needle.radius_mm + solid.margin_mm).sum())
 
 

@@ -181,7 +181,8 @@ class BreathingBody:
         Up to the farthest place at which the flange waits at any position.
         """
         case, checked, outward = self.case, self.anatomy.checked, self.candidates.outward_ct
-        at = [axis_lengths(case, checked, self.paths(outward, s)) for s in self.breathing.positions.tolist()]
+        paths = [self.paths(outward, s) for s in self.breathing.positions.tolist()]
+        at = [axis_lengths(case, checked, one.path_length, one.skin_angle) for one in paths]
         return np.asarray(np.max(at, axis=0))
 
     def paths(self, outward_ct: Floats, s: float) -> SkinPaths:

@@ -86,7 +86,7 @@ def organ_candidates(
     """
     needle, outward, checked = case.needle, directions.outward_ct, anatomy.checked
     paths = case_paths(case, anatomy.skin, outward)  # where each path crosses the skin, and at which angle
-    lengths = axis_lengths(case, checked, paths)  # how far out each axis is checked
+    lengths = axis_lengths(case, checked, paths.path_length, paths.skin_angle)  # how far out each axis is checked
     clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes)
     demanding, count = np.array([s.demands_margin for s in checked], bool), len(directions)
     candidates = Candidates(  # a straight needle, the patient as the CT shows them

@@ -135,9 +135,7 @@ def test_axes_are_as_long_as_what_they_are_checked_against_demands():
     """
     case = SimpleNamespace(needle=needle(), search=SimpleNamespace(max_skin_angle=45.0 * DEG))
     structures = [SimpleNamespace(outside=outside) for outside in (False, True, False)]
-    paths = SimpleNamespace(
-        path_length=np.array([20.0, 150.0, 170.0, np.nan]), skin_angle=np.radians([0, 45, 0, np.nan])
-    )
-    found = axis_lengths(case, structures, paths)
+    path_length, skin_angle = np.array([20.0, 150.0, 170.0, np.nan]), np.radians([0, 45, 0, np.nan])
+    found = axis_lengths(case, structures, path_length, skin_angle)
     np.testing.assert_allclose(found[:, [0, 2]], 200.0)
     np.testing.assert_allclose(found[:, 1], [230.0, 361.6, 361.6, 361.6])

@@ -13,9 +13,9 @@ nor its organ. All of it is decided on a grid of 4 mm.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,77 +69,25 @@ class Piece(NamedTuple):
     Attributes:
         near: Alone a limb's where the target lies in ``whole``.
         whole: All that may be one.
-        ml: Of a part beyond a neck, else 0: no larger than a limb is it or what holds the target, or it is none.
+        ml: Of a part beyond a neck: if neither it nor what holds the target is as small as a limb, it is none. Else 0.
     """
 
     near: Bools
     whole: Bools
-    ml: float
-
-
-class Pieces(NamedTuple):
-    """All pieces of a part of the body; ``core_ml`` of each number in ``core``, beyond necks each another; 0 outside."""
-
-    found: tuple[Piece, ...]
-    core: Ints32
-    core_ml: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class LimbSearch:
-    """The body on a grid of some 4 mm, axes running to the left, back and head; what is found serves every target.
-
-    Attributes:
-        parts: Shape (nx, ny, nz), from 1 the part that holds together; a block counts where any of its voxels does.
-        solid: Same shape, body, and what was not scanned: neither is air.
-        bone: Same shape, bone that is evidence of a limb; a block counts where an eighth of it is, which noise is not.
-        limb_bone: Same shape, a leg's named bone too: such is a limb's beyond a neck, and the trunk's in a hip.
-        spacing_mm: Shape (3,).
-        T_ct_index: Shape (4, 4), LPS mm.
-    """
-
-    parts: Ints32
-    solid: Bools
-    bone: Bools
-    limb_bone: Bools
-    spacing_mm: Floats
-    T_ct_index: Floats
-    _found: dict[int, Pieces] = field(default_factory=dict, init=False)
-
-    @property
-    def nbytes(self) -> int:
-        """About, with the pieces of one part."""
-        return 20 * self.parts.size
-
-    def chosen(self, target_ct: Floats) -> tuple[int, ...]:
-        """The part that holds a target (3,), LPS mm, and of each of its pieces: no limb (0), near (1) or whole (2)."""
-        index = np.rint(np.linalg.solve(self.T_ct_index, np.append(target_ct, 1.0))[:3]).astype(int)
-        at = tuple(np.clip(index, 0, np.array(self.parts.shape) - 1).tolist())
-        found, core, core_ml = self._pieces(number := int(self.parts[at]))
-        own_ml = core_ml[core[at]]
-        none = (piece.near[at] or min(own_ml, piece.ml) > MOST_ML for piece in found)
-        return number, *(0 if no else 2 - int(piece.whole[at]) for no, piece in zip(none, found, strict=True))
-
-    def limbs(self, chosen: Sequence[int]) -> Bools:
-        """Blocks of the body that belong to a limb without the target, by what was `chosen` for it."""
-        number, *which = chosen
-        limbs = np.zeros(self.parts.shape, bool)
-        for piece, how in zip(self._pieces(number).found, which, strict=True):
-            if how:
-                limbs |= piece[how - 1]
-        return limbs & (self.parts == number)
-
-    def _pieces(self, number: int) -> Pieces:
-        if number not in self._found:
-            part = self.parts == number
-            bone, limb_bone = self.bone & part, self.limb_bone & part
-            self._found[number] = BodyPart(part, self.solid, bone, limb_bone, self.spacing_mm).pieces()
-        return self._found[number]
+    ml: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class BodyPart:
-    """A part of the body that holds together, as ``body``; see `LimbSearch`."""
+    """A part of the body that holds together, on a grid of some 4 mm, axes running to the left, back and head.
+
+    Attributes:
+        body: Shape (nx, ny, nz); a block counts where any of its voxels does.
+        solid: Same shape, the whole body, and what was not scanned: neither is air.
+        bone: Same shape, bone that is evidence of a limb; a block counts where an eighth of it is, which noise is not.
+        limb_bone: Same shape, a leg's named bone too: such is a limb's beyond a neck, and the trunk's in a hip.
+        spacing_mm: Shape (3,).
+    """
 
     body: Bools
     solid: Bools
@@ -157,19 +105,25 @@ class BodyPart:
         padded = np.pad(self.solid, 1, mode="edge")
         return np.asarray(scipy.ndimage.distance_transform_edt(padded, sampling=self.spacing_mm)[1:-1, 1:-1, 1:-1])
 
-    def pieces(self) -> Pieces:
-        """What may be a limb: parts beyond a narrow neck that hold bone, and what lies about exposed bones."""
+    @cached_property
+    def pieces(self) -> tuple[Piece, ...]:
+        """Parts beyond a narrow neck that hold bone, and what lies about exposed bones; the same for every target."""
         if self.volume_ml(self.limb_bone) < MIN_BONE_ML:
-            return Pieces((), self.body.astype(np.int32), np.zeros(2))
-        core = _nearest_core(self.body, self.spacing_mm)
-        parts = [core == number for number in range(int(core.max(initial=0)) + 1)]
-        ml = np.array([self.volume_ml(part) for part in parts])
-        beyond = [
-            Piece(part, part, core_ml)
-            for part, core_ml in zip(parts[1:], ml[1:], strict=True)
-            if self.volume_ml(part & self.limb_bone) >= MIN_BONE_ML
-        ]
-        return Pieces((*beyond, *(self._about(bones) for bones in self._exposed())), core, ml)
+            return ()
+        parts = (self._core == number for number in range(1, int(self._core.max(initial=0)) + 1))
+        bony = (part for part in parts if self.volume_ml(part & self.limb_bone) >= MIN_BONE_ML)
+        return (*(Piece(part, part, self.volume_ml(part)) for part in bony), *map(self._about, self._exposed()))
+
+    def chosen(self, at: tuple[int, ...]) -> Iterator[int]:
+        """Of each piece: no limb (0), near (1) or whole (2), where a block holds the target."""
+        own_ml = self.volume_ml(self._core == self._core[at]) if self.pieces else 0.0
+        for piece in self.pieces:
+            none = piece.near[at] or min(own_ml, piece.ml) > MOST_ML
+            yield 0 if none else 2 - int(piece.whole[at])
+
+    @cached_property
+    def _core(self) -> Ints32:
+        return _nearest_core(self.body, self.spacing_mm)
 
     def _exposed(self) -> Iterator[Bools]:
         """Bones about which air is on more sides than about a bone of the trunk, of one limb each."""
@@ -219,7 +173,39 @@ class BodyPart:
         line = np.rint(steps[:, None] * along).astype(int)
         rod = np.zeros(2 * np.abs(line).max(axis=0) + 1, bool)
         rod[tuple((line + np.array(rod.shape) // 2).T)] = True
-        return Piece(np.asarray(gap < radius), scipy.ndimage.binary_dilation(reach, rod), 0.0)
+        return Piece(np.asarray(gap < radius), scipy.ndimage.binary_dilation(reach, rod))
+
+
+class LimbSearch(NamedTuple):
+    """Limbs of a body: all that takes long is found once, and chosen of for each target.
+
+    Attributes:
+        parts: Shape (nx, ny, nz), from 1 the number of the part that a block belongs to, 0 outside.
+        T_ct_index: Shape (4, 4), LPS mm.
+        part: By its number.
+    """
+
+    parts: Ints32
+    T_ct_index: Floats
+    part: Callable[[int], BodyPart]
+
+    @property
+    def nbytes(self) -> int:
+        """About, with the pieces of one part."""
+        return 32 * self.parts.size
+
+    def chosen(self, target_ct: Floats) -> tuple[int, ...]:
+        """The number of the part that holds a target (3,), LPS mm, and what `BodyPart.chosen` says of its pieces."""
+        index = np.rint(np.linalg.solve(self.T_ct_index, np.append(target_ct, 1.0))[:3]).astype(int)
+        at = tuple(np.clip(index, 0, np.array(self.parts.shape) - 1).tolist())
+        return int(self.parts[at]), *self.part(int(self.parts[at])).chosen(at)
+
+    def limbs(self, chosen: Sequence[int]) -> Bools:
+        """Blocks of the body that belong to a limb without the target, by what was `chosen` for it."""
+        part, limbs = self.part(chosen[0]), np.zeros(self.parts.shape, bool)
+        for piece, how in zip(part.pieces, chosen[1:], strict=True):
+            limbs |= piece[how - 1] if how else False
+        return limbs & part.body
 
 
 def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> LimbSearch:
@@ -235,11 +221,18 @@ def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> Lim
     T[:3, 3] += T[:3, :3] @ ((stride - 1) / 2.0)
     T[:3, :3] *= stride
     coarse = _share(body, stride) > 0.0
+    parts, _ = scipy.ndimage.label(coarse)
     solid = coarse | (_share(image.unscanned, stride) >= 0.5)
     every_bone = _share(body & (image.hu > BONE_HU), stride) >= 0.125
     legs, others = _explained(every_bone, T, structures)
-    bone, limb_bone = (every_bone & ~named for named in (legs | others, others))
-    return LimbSearch(scipy.ndimage.label(coarse)[0], solid, bone, limb_bone, image.spacing_mm * stride, T)
+    spacing_mm = image.spacing_mm * stride
+
+    @cache
+    def part(number: int) -> BodyPart:
+        own = parts == number
+        return BodyPart(own, solid, every_bone & own & ~(legs | others), every_bone & own & ~others, spacing_mm)
+
+    return LimbSearch(parts, T, part)
 
 
 def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[Named]) -> tuple[Bools, Bools]:
