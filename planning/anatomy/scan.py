@@ -139,13 +139,12 @@ class Scan:
             return None
         named = [f"{one.name} {one.mesh.digest}" for one in structures]
         made_from = {"what": "attached limbs", "structures": named}
-        skin = self.skin and self.skin.mesh.digest
-        known = f"{made_from} {skin} {self.source.box} {self.source.shown}"
+        known = f"{made_from} {self.skin and self.skin.mesh.digest} {self.source.box} {self.source.shown}"
 
         @cache
         def search() -> LimbSearch:
             return self.source.surfaces.held(
-                known, lambda: limb_search(self._ct, self._body, structures), lambda made: made.nbytes
+                known, lambda: limb_search(self._ct, self._body, structures), lambda made: 32 * made.parts.size
             )
 
         def choose() -> Arrays:
@@ -180,12 +179,6 @@ class Scan:
         near = (one.vertices for one in unnamed if one is not None)
         within = any(np.all((low <= some) & (some <= high), axis=1).any() for some in near)
         return within or any(one is not None and contains(one, (low + high) / 2.0) for one in unnamed)
-
-    def contains(self, point_ct: NDArray[np.float64]) -> bool:
-        """Whether a point (3,), LPS mm, lies in the image; only the header is read."""
-        grid = self.source.surfaces.source.grid
-        index = np.linalg.solve(grid.T_ct_index, np.append(point_ct, 1.0))[:3]
-        return bool(np.all((index >= -0.5) & (index <= np.array(grid.shape) - 0.5)))
 
     def hu_at(self, points_ct: NDArray[np.float64]) -> NDArray[np.float64]:
         """Hounsfield units of the nearest voxel, NaN outside of the image.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtImage, filled_slices
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, WIDE, Box, FieldOfView, shifted, spacing_of
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.labels.label_surface import (
     box_in,
@@ -59,9 +59,7 @@ class Skin:
     warnings: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        cut_faces = np.array(self.cut_faces, dtype=np.bool_)
-        cut_faces.setflags(write=False)
-        object.__setattr__(self, "cut_faces", cut_faces)
+        object.__setattr__(self, "cut_faces", read_only(self.cut_faces, np.bool_))
 
     @property
     def nbytes(self) -> int:

@@ -165,12 +165,11 @@ class StructureSources:
             return None
         self._progress("CT beside the structures")
         seen = self._seen(name, None, structures, skin_section.cut if own else None)
-        scan = Scan(name, seen, None if own else skin)
-        if not scan.contains(self._case.target_ct):
+        if not seen.surfaces.source.grid.holds(self._case.target_ct):
             what = f"[ct] file '{name}' does not show the target: a slip of file or space?"
             allowed = "a CT that holds the target, in the space of the structures"
             refuse(what, self._case.path, allowed, "target_outside_ct")
-        return scan
+        return Scan(name, seen, None if own else skin)
 
     def _mesh(self, section: StructureSection) -> TriangleMesh:
         where = f"{self._case.path}: structure '{section.name}'"

@@ -267,7 +267,9 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure], memor
     for grid in label_grids(case):
         margin = _largest_margin(case, grid, structures) + float(grid.voxels.spacing_mm.max()) / 2
         extent = _extent(case, skin.mesh, grid, margin, memory)
-        _refuse_without_target(case, grid)
+        if not grid.voxels.holds(case.target_ct):
+            what = f"label map {grid.name} ends before the target, so that all about it is unknown"
+            refuse(what, case.path, "label maps that hold the target", "labels_end")
         if extent.gaps.max() <= VOXELS_OF_SLACK:
             continue
         said = ENDS.format(name=grid.name, voxels=extent.gaps.max())
@@ -299,13 +301,6 @@ def _extent(case: Case, skin: TriangleMesh, grid: LabelGrid, margin_mm: float, m
     # |row| is how many voxels an axis advances for a step of 1 mm along its normal
     reach = (case.needle.length_mm + margin_mm) * np.linalg.norm(T_index_ct[:3, :3], axis=1)
     return _Extent(grid, np.maximum(low, target - reach), np.minimum(high, target + reach))
-
-
-def _refuse_without_target(case: Case, grid: LabelGrid) -> None:
-    index = apply(np.linalg.inv(grid.voxels.T_ct_index), case.target_ct[None])[0]
-    if np.any(index < -0.5) or np.any(index > np.array(grid.voxels.shape) - 0.5):
-        what = f"label map {grid.name} ends before the target, so that all about it is unknown"
-        refuse(what, case.path, "label maps that hold the target", "labels_end")
 
 
 def _slabs(extent: _Extent, skin: TriangleMesh) -> Iterator[TriangleMesh]:

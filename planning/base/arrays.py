@@ -21,9 +21,18 @@ Texts = NDArray[np.object_]
 """Strings of any length: an array of a fixed width would cut a name."""
 
 
-def read_only(array: ArrayLike) -> Floats:
+class Columns:
+    """A dataclass of arrays of one length, row by row; read-only."""
+
+    def __post_init__(self) -> None:
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+
+def read_only(array: ArrayLike, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """A copy, any shape, that nobody can write to."""
-    copy = np.array(array, dtype=np.float64)
+    copy = np.array(array, dtype=dtype)
     copy.setflags(write=False)
     return copy
 

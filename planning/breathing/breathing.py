@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, read_only
 from puncture_twin.planning.formats.labels.naming import ByName
 
 
@@ -43,9 +43,7 @@ class Breathing:
     gate: float | None
 
     def __post_init__(self) -> None:
-        direction = np.array(self.direction_ct, dtype=np.float64)
-        direction.setflags(write=False)
-        object.__setattr__(self, "direction_ct", direction)
+        object.__setattr__(self, "direction_ct", read_only(self.direction_ct))
 
     @property
     def positions(self) -> Floats:

@@ -146,9 +146,7 @@ class Case:
 
 def view_frame(R_ct_entry: Floats, target_ct: Floats) -> Floats:
     """T_ct_entry: the entry frame with its origin on the target, shape (4, 4), read-only."""
-    T = pose(R_ct_entry, target_ct)
-    T.setflags(write=False)
-    return T
+    return read_only(pose(R_ct_entry, target_ct))
 
 
 Vector = tuple[float, float, float]

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
@@ -108,9 +108,7 @@ class ErrorModel:
 
     def __post_init__(self) -> None:
         for name in ("marker_cov_ct", "target_cov_ct"):
-            array = np.array(getattr(self, name), dtype=np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
     def anisotropic(self) -> bool:

@@ -244,9 +244,7 @@ def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
         what = f"robot.mount: position_mm is {far:g} mm from the origin, which would be a base within the patient"
         refuse(what, path, "millimetres (these look like metres)", "wrong_unit")
     T_ct_base = pose(frame_of_axes(z, x), to_lps(np.asarray([mount.position_mm]), space)[0])
-    T_base_ct = np.asarray(np.linalg.inv(T_ct_base), np.float64)
-    T_base_ct.setflags(write=False)
-    return T_base_ct
+    return read_only(np.linalg.inv(T_ct_base))
 
 
 def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:

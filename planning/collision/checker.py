@@ -4,7 +4,7 @@ FCL sees the surfaces of triangle meshes, not their insides. Links, holder, need
 convex shapes here, and two of them never hide in one another. The skin is a triangle mesh, and the arm cannot hide in
 it either: neighbouring bodies of the chain overlap (a test holds this), the base is outside (checked once), so if
 no body touches a closed skin every body is on the base's side of it. For an open skin there is no inside, and only its
-surface counts (``patient_closed``). What is loose (a block of the table) could hide in a link: see `FclSkin`.
+surface counts. What is loose (a block of the table) could hide in a link: see `FclSkin`.
 """
 
 from __future__ import annotations
@@ -102,11 +102,6 @@ class CellChecker:
         if patient is not None and self._surface is not None and self._patient is not None:
             self._bounds[PATIENT] = self._surface.bounds
             refuse_base_in(model, self._bodies[0], self._patient, patient, self._surface)
-
-    @property
-    def patient_closed(self) -> bool:
-        """Whether there is a patient, and its surface has an inside."""
-        return self._surface is not None and self._surface.closed
 
     def points_of(self, body: str) -> Floats:
         """Corners (n, 3) of a body's convex pieces as they are, without padding, in the frame that it moves with."""

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
@@ -17,9 +15,7 @@ from puncture_twin.planning.base.errors import InputListError, refuse
 from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.evidence.target import readings_inside
-from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import Side, side_of
-from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
@@ -236,13 +232,8 @@ def _below(where: str, folder: Path) -> str:
 
 def _holding(cts: Sequence[Ct], point: Floats | None) -> list[Ct]:
     """The CTs that hold a point, or all where none does."""
-    holding = [one for one in cts if point is not None and _contains(one.surfaces.source.grid, point)]
+    holding = [one for one in cts if point is not None and one.surfaces.source.grid.holds(point)]
     return holding or list(cts)
-
-
-def _contains(grid: VolumeGrid, point_ct: Floats) -> bool:
-    index = apply(np.linalg.inv(grid.T_ct_index), point_ct[None])[0]
-    return bool(np.all((index >= -0.5) & (index <= np.array(grid.shape) - 0.5)))
 
 
 def _doubled(segmentations: Sequence[Segmentation]) -> Iterator[str]:
@@ -259,10 +250,10 @@ def _refuse_outside(point: Floats, ct: Ct, skin: Skin, space: Space) -> None:
     grid = ct.surfaces.source.grid
 
     def in_body(one: Floats) -> bool:
-        return _contains(grid, one) and side_of(skin.mesh, one) is not Side.OUTSIDE
+        return grid.holds(one) and side_of(skin.mesh, one) is not Side.OUTSIDE
 
     if not in_body(point):
-        place = "the body in" if _contains(grid, point) else "the CT"
+        place = "the body in" if grid.holds(point) else "the CT"
         hint = readings_inside(point, space, in_body)
         what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
         refuse(what, "--target", OUTSIDE_WAYS, "target_outside_body")
@@ -273,7 +264,7 @@ def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:
     if ct is None:
         return sorted(markers, key=lambda one: one.source)
     grid = ct.surfaces.source.grid
-    return sorted(markers, key=lambda one: (not all(_contains(grid, point) for point in one.points.points), one.source))
+    return sorted(markers, key=lambda one: (not all(grid.holds(point) for point in one.points.points), one.source))
 
 
 def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> Iterator[str]:

@@ -17,7 +17,7 @@ from puncture_twin.planning.arm.insertion import FULL_MARGIN_RAD, MAX_JOINT_STEP
 from puncture_twin.planning.arm.inverse_kinematics import EVERY_BRANCH, N_BRANCHES, TURN, fill_branches, wrapped_angle
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, least_term, link_frames
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.base.reasons import Reason
@@ -45,10 +45,9 @@ class ReachRequest:
 
     def __post_init__(self) -> None:
         for name in ("target_base", "outward_base"):
-            array = np.array(getattr(self, name), dtype=np.float64)
+            array = read_only(getattr(self, name))
             if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
                 refuse(f"{name} = {array}", "reach request", "three finite numbers", "not_finite")
-            array.setflags(write=False)
             object.__setattr__(self, name, array)
         if abs(math.hypot(*self.outward_base.tolist()) - 1.0) > SAME_UNIT:
             refuse(f"outward_base = {self.outward_base}", "reach request", "a unit vector", "not_unit")

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.geometry.gauss_newton import lacking
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_of_points, log_rotation, pose, skew
@@ -109,9 +109,7 @@ def _least_squares(points_ct: Floats, points_base: Floats, *, mirrored: bool) ->
 
 
 def _rigid(R: Floats, t: Floats) -> Floats:
-    T = pose(R, t)
-    T.setflags(write=False)
-    return T
+    return read_only(pose(R, t))
 
 
 def fit_triad(points_ct: Floats, points_base: Floats) -> Floats:

@@ -29,7 +29,7 @@ import numpy as np
 from puncture_twin.planning.arm.inverse_kinematics import branch_of
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
@@ -171,8 +171,7 @@ def aimed(registration: Registration, aim: Aim) -> Registration:
     """A joint registration, corrected for one insertion; its residuals stay those of the fit."""
     fit, markers = registration.uncertainty, registration.markers
     assert fit is not None  # a joint fit weighs by declared errors
-    T = _aimed(registration.T_base_ct, markers.points_ct, markers.points_base, fit.noise, aim)
-    T.setflags(write=False)
+    T = read_only(_aimed(registration.T_base_ct, markers.points_ct, markers.points_base, fit.noise, aim))
     target = apply(registration.T_base_ct, aim.target_ct)
     uncertainty = aimed_uncertainty(fit, markers.points_ct, T, target, aim)
     return replace(registration, T_base_ct=T, uncertainty=uncertainty, aim=aim)

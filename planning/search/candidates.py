@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32, Texts
+from puncture_twin.planning.base.arrays import Bools, Columns, Floats, Ints, Ints32, Texts
 from puncture_twin.planning.base.errors import Finding
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
@@ -30,16 +30,6 @@ NOT_SEEN = "not seen: image or mesh ends"
 
 ANGLE_DIGITS = 9
 """Decimals of an angle in degrees: 59.99999999999999 is 60; 1e-9 degrees move no needle by a nanometre."""
-
-
-class Columns:
-    """Arrays of one length, row by row; read-only."""
-
-    def __post_init__(self) -> None:
-        for field in fields(self):  # type: ignore[arg-type]  # every class below is a dataclass
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False)

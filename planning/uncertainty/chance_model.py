@@ -13,7 +13,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Structure
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.arrays import Bools, Columns, Floats, Ints
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
@@ -198,7 +198,7 @@ def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools
 
 
 @dataclass(frozen=True, eq=False)
-class Chances:
+class Chances(Columns):
     """Chances of n candidates and k structures that demand a margin; NaN where nothing was computed.
 
     Attributes:
@@ -223,12 +223,6 @@ class Chances:
     lateral_mm: Floats
     depth_mm: Floats
     refined: Bools
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
 
     @classmethod
     def unknown(cls, structures: tuple[str, ...], count: int) -> Chances:

@@ -286,15 +286,6 @@ def test_a_base_inside_or_through_the_patient_is_refused() -> None:
             CellChecker(UR3, TOOL, patient=cuboid(low, high))
 
 
-def test_an_open_skin_is_known_as_open() -> None:
-    """Its surface still counts; whether something is inside cannot be known, and the flag says so."""
-    whole = cuboid(np.array([300.0, -100.0, 0.0]), np.array([500.0, 100.0, 200.0]))
-    cut = TriangleMesh(whole.vertices, whole.faces[:-1])
-    assert CellChecker(UR3, TOOL, patient=whole).patient_closed
-    assert not CellChecker(UR3, TOOL, patient=cut).patient_closed
-    assert not CellChecker(UR3, TOOL).patient_closed
-
-
 def test_winding_numbers_are_the_sums_of_solid_angles() -> None:
     """By numpy, of each point by itself: inside, outside and next to a face, of a closed and of an open surface."""
     box = cuboid(np.full(3, -50.0), np.full(3, 50.0))

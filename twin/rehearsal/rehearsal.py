@@ -28,6 +28,7 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.bending import insertion_along
 from puncture_twin.planning.sweep.sweep_planner import SweepPlan
+from puncture_twin.twin.guidance.ct.needle import needle_error
 from puncture_twin.twin.plant.true_needle import StraightPath, TissueForce, TrueTissue
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.result import Rehearsal, RehearsalContact
@@ -38,15 +39,6 @@ from puncture_twin.twin.world.workcell import open_workcell
 
 CLEARANCE_SAMPLES = 48
 """Moments of the insertion at which the needle's clearance is measured, the last one included."""
-
-
-@dataclass(frozen=True)
-class TipError:
-    """Error of a needle's tip from the target; mm. total^2 = lateral^2 + depth^2."""
-
-    total_mm: float
-    lateral_mm: float
-    depth_mm: float
 
 
 def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsal:
@@ -72,7 +64,7 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
     tip_ct = T_ct_flange[:, :3, 3] + plan.needle_length_mm * forward_ct
     samples = _clearance_samples(phase)
     target_ct = case.target_ct if truth.target_ct is None else truth.target_ct
-    error = split_error(tip_ct[-1], forward_ct[-1], target_ct)
+    error = needle_error(tip_ct[-1], forward_ct[-1], target_ct)
     return Rehearsal(
         seed=truth.seed,
         truth_source=truth.source,
@@ -88,7 +80,7 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
         contacts=_contacts(case, anatomy, truth, done, times, phase),
         max_joint_speed=done.max_speed,
         speed_limits=model.max_speeds.copy(),
-        tip_error_mm=error.total_mm,
+        tip_error_mm=error.tip_to_target_mm,
         lateral_mm=error.lateral_mm,
         depth_mm=error.depth_mm,
         predicted_error_mm=plan.expected_target_error_mm,
@@ -98,19 +90,6 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
         off_path_mm=measured.off_path_mm,
         tissue_force=measured.tissue_force,
     )
-
-
-def split_error(tip: Floats, forward: Floats, target: Floats) -> TipError:
-    """Tip minus target, split along and across the needle.
-
-    Args:
-        tip: Shape (3,), mm, any frame.
-        forward: Shape (3,), unit vector from the needle's top to its tip, same frame.
-        target: Shape (3,), mm, same frame.
-    """
-    error = tip - target
-    depth = float(error @ forward)
-    return TipError(float(np.linalg.norm(error)), float(np.linalg.norm(error - depth * forward)), depth)
 
 
 def _clearance_samples(phase: NDArray[np.str_]) -> NDArray[np.int64]:

@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, read_only
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.parts import slice_counts
 
@@ -75,9 +75,7 @@ class FieldOfView:
 
     def __post_init__(self) -> None:
         for name, dtype in (("T_ct_box", np.float64), ("size_mm", np.float64), ("cut", np.bool_)):
-            array = np.array(getattr(self, name), dtype=dtype)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, read_only(getattr(self, name), dtype))
 
     def to_box(self, points_ct: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (n, 3) from LPS mm to mm from the box's low corner along its axes."""

@@ -189,11 +189,6 @@ class LimbSearch(NamedTuple):
     T_ct_index: Floats
     part: Callable[[int], BodyPart]
 
-    @property
-    def nbytes(self) -> int:
-        """About, with the pieces of one part."""
-        return 32 * self.parts.size
-
     def chosen(self, target_ct: Floats) -> tuple[int, ...]:
         """The number of the part that holds a target (3,), LPS mm, and what `BodyPart.chosen` says of its pieces."""
         index = np.rint(np.linalg.solve(self.T_ct_index, np.append(target_ct, 1.0))[:3]).astype(int)

@@ -70,6 +70,11 @@ class VolumeGrid:
         """Distance of neighbouring voxels along i, j and k, shape (3,)."""
         return np.asarray(np.linalg.norm(self.T_ct_index[:3, :3], axis=0))
 
+    def holds(self, point_ct: NDArray[np.float64]) -> bool:
+        """Whether a point (3,), LPS mm, lies in a voxel."""
+        index = np.linalg.solve(self.T_ct_index, np.append(point_ct, 1.0))[:3]
+        return bool(np.all((index >= -0.5) & (index <= np.array(self.shape) - 0.5)))
+
 
 @dataclass(frozen=True, eq=False)
 class VolumeHeader(VolumeGrid):

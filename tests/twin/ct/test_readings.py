@@ -145,3 +145,13 @@ def test_a_tip_at_a_bolt_is_refused_and_its_axis_said(spacing, gap_mm):
         find_needle(volume, np.zeros(3), 2.0)
     said = float(re.search(r"passes the target by ([0-9.]+) mm", str(caught.value))[1])
     assert said == pytest.approx(beside, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("error", "lateral", "depth"), [((0, 0, 2), 0, 2), ((3, 4, 0), 5, 0), ((3, 4, -12), 5, -12), ((0, 0, 0), 0, 0)]
+)
+def test_a_needles_error_is_split(error, lateral, depth):
+    """Along the needle is depth with its sign, across it is lateral."""
+    split = needle_error(np.array(error) + 40.0, np.array([0.0, 0.0, 1.0]), np.full(3, 40.0))
+    assert (split.lateral_mm, split.depth_mm) == pytest.approx((lateral, depth))
+    assert split.tip_to_target_mm == pytest.approx(np.hypot(lateral, depth))

@@ -33,7 +33,7 @@ from puncture_twin.planning.registration.fit_uncertainty import reading_noise, t
 from puncture_twin.twin.plant.truth import Truth
 from puncture_twin.twin.rehearsal.distribution import bend_along
 from puncture_twin.twin.rehearsal.plan_truth import drawn_truth, plan_truth, spread_rows
-from puncture_twin.twin.rehearsal.rehearsal import rehearse, split_error
+from puncture_twin.twin.rehearsal.rehearsal import rehearse
 from puncture_twin.twin.rehearsal.result import ErrorRank, ordinal
 from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
@@ -378,16 +378,6 @@ def test_numbers_are_read_only(exact):
     for array in (exact.q, exact.tip_true_ct, exact.clearance_mm["vessel"]):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
-
-
-@pytest.mark.parametrize(
-    ("error", "lateral", "depth"), [((0, 0, 2), 0, 2), ((3, 4, 0), 5, 0), ((3, 4, -12), 5, -12), ((0, 0, 0), 0, 0)]
-)
-def test_split_error(error, lateral, depth):
-    """Along the needle is depth with its sign, across it is lateral."""
-    split = split_error(np.array(error) + TARGET, np.array([0.0, 0.0, 1.0]), TARGET)
-    assert (split.lateral_mm, split.depth_mm) == pytest.approx((lateral, depth))
-    assert split.total_mm == pytest.approx(np.hypot(lateral, depth))
 
 
 @pytest.mark.parametrize(
