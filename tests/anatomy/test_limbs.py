@@ -125,6 +125,19 @@ def test_nothing_about_the_target_is_a_limb():
     assert not limbs[tuple(np.rint(target / SPACING).astype(int))]
 
 
+def test_one_search_serves_every_target_as_one_of_its_own_does():
+    """Targets in the trunk, near the arm, in it, in a piece that lies apart and in the air, in either order."""
+    hu, body = image(ACROSS)
+    apart = np.hypot(POINTS[..., 0] - 12.0, POINTS[..., 2] - 20.0) < 12.0
+    hu[apart], body = 30.0, body | apart
+    middle = (np.array(ACROSS[0]) + ACROSS[1]) / 2.0
+    targets = [TARGET, [160.0, 108.0, 90.0], middle, [12.0, 100.0, 20.0], [310.0, 10.0, 90.0]]
+    shared, alone = search(hu, body), [limbs_of(hu, body, np.array(target)) for target in targets]
+    assert alone[0].sum() > alone[1].sum() > 0
+    for target, expected in [*zip(targets, alone, strict=True)][::-1] * 2:
+        np.testing.assert_array_equal(shared.limbs(shared.chosen(np.array(target))), expected)
+
+
 def test_a_limb_alone_is_no_limb_of_a_trunk():
     """An image of an arm only: its bone is as deep as half of the body is thick."""
     hu, body = image(ACROSS, radius=35.0, trunk=np.zeros(SHAPE, bool))
