@@ -61,7 +61,7 @@ class Distances:
 
     def __init__(self, mesh):
         one = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        count = int(np.clip(PER_MM2 * one.areas.sum(), 1000, 400_000))
+        count = int(np.clip(PER_MM2 * one.area, 1000, 400_000))
         self.tree = cKDTree(np.concatenate([trimesh.sample.sample_surface(one, count, seed=0)[0], mesh.vertices]))
 
     def __call__(self, points):

@@ -281,7 +281,12 @@ def test_the_libraries_of_every_maker_are_in_the_key(maker):
     imports = [found for file in files for found in IMPORTED.findall(Path(file).read_bytes())]
     modules = {name for module, _, listed in imports for name in ([module] if module else NAME.findall(listed))}
     tops = {module.decode().split(".")[0] for module in modules}
-    packages = {"skimage": "scikit-image", "fcl": "python-fcl", "fast_simplification": "fast-simplification", "PIL": "pillow"}
+    packages = {
+        "skimage": "scikit-image",
+        "fcl": "python-fcl",
+        "fast_simplification": "fast-simplification",
+        "PIL": "pillow",
+    }
     foreign = tops - set(sys.stdlib_module_names) - {"puncture_twin"}
     assert {packages.get(name, name) for name in foreign} <= set(LIBRARIES)
     assert len(source_stamp(maker)) == 64

@@ -18,8 +18,8 @@ from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.touch.pivot_planner import plan_pivot, spread_poses
 from puncture_twin.run_twin import app
-from puncture_twin.twin.jobs.experiment import pivot_job as module
 from puncture_twin.twin.jobs.experiment.pivot_job import calibrated, pivot_case, pivot_tour, pivot_tour_text
+from puncture_twin.twin.plant import true_needle
 from puncture_twin.twin.plant.true_needle import draw_pivot_truth
 
 CASE = ROOT / "meshes" / "carton" / "case_m.toml"
@@ -106,7 +106,7 @@ def test_the_twin_finds_the_tip_of_its_arm(context, tmp_path, monkeypatch):
         still = dict.fromkeys(names, np.zeros(6))
         return dataclasses.replace(truth, eta=eta, aim_ct=dict.fromkeys(names, place[:3]), arrival=still)
 
-    monkeypatch.setattr(module, "draw_pivot_truth", without_noise)
+    monkeypatch.setattr(true_needle, "draw_pivot_truth", without_noise)
     run = pivot_tour(context, tmp_path, 5, None, 0)
     np.testing.assert_allclose(run.found.pivot.tip_flange, off + [0.0, 0.0, 401.0], atol=0.06)
     assert run.found.pivot.residual_mm < 0.05
