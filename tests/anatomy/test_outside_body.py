@@ -119,7 +119,7 @@ def table() -> TriangleMesh:
     """Beyond a curved section behind the body, of a bed that runs at an angle to the slices' axis."""
     section = 20.0 + 0.01 * (np.arange(40.0) - 20.0) ** 2
     line = section[:, None] - 0.05 * np.arange(SHAPE[2])
-    side = TableSide((1, -1), line, np.ones(40, bool), -0.05 * SPACING[1] / SPACING[2], 60.0)
+    side = TableSide((1, -1), line, np.ones(40, bool), -0.05 * SPACING[1] / SPACING[2], 60.0, firm=True)
     surface = outside_surface(in_air((0.0, side.slope)), side.beyond(SHAPE), where="table")
     assert surface is not None
     return surface

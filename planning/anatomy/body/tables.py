@@ -29,9 +29,9 @@ DRAWN_FRACTION = 0.8
 DRAWN_WIDTH_MM, RUN_MM = 100.0, 20.0
 """Over so much of its width together, of runs of so much: single lines of sight may be drawn by chance. Of a real
 abdomen in air no side keeps to a line over more than 63 mm."""
-ONE_PIECE_MM, ONE_PIECE = 0.25, 0.9
-"""Ends of a table keep so near to one another from slice to slice, or thrice their noise, .99 of them and more in drawn
-CTs. Of a trunk's straight back it is .80: nothing beyond it is free, but it has no edge."""
+ONE_PIECE_MM, ONE_PIECE = 0.25, 0.945
+"""Ends of a table keep so near to one another from slice to slice, or thrice their noise, .955 of them and more in
+drawn CTs. Of a trunk's straight back it is .80, of flanks .93: a back has no edge, flanks are none beside a table."""
 SMOOTH_ALONG_MM = 12.0
 """Ends are averaged so far along the bed: a table is constant there, noise is not."""
 THICKEST_MM, ALIKE_MM = 80.0, 5.0
@@ -114,6 +114,7 @@ class TableSide(NamedTuple):
         lines: Shape (n,), which lines of sight are those of the table.
         slope: How it moves along the face's axis, mm per mm along the bed.
         width_mm: How much of them is drawn.
+        firm: Whether the ends keep to one another, as those of a table do and those of a straight flank do less.
     """
 
     face: Face
@@ -121,6 +122,7 @@ class TableSide(NamedTuple):
     lines: Bools
     slope: float
     width_mm: float
+    firm: bool
 
     def beyond(self, shape: tuple[int, ...]) -> Bools:
         """The voxels of an image beyond the line."""
@@ -173,6 +175,8 @@ def touching_tables(
         said.append(PRISM)
     if (len(drawn) == len(FACES) or shown.phantom) and shown.table != "present":
         left = []
+    if any(side.firm for side in drawn):  # what a body lies on is seen: its straight flanks are no tables
+        left = [side for side in left if side.firm]
     said += [TOUCHES.format(name=NAMES[side.face], width=side.width_mm) for side in left]
     if (length_mm := trunk.shape[2] * float(spacing_mm[2])) < LEAST_LENGTH_MM:
         said.append(TOO_SHORT.format(length=length_mm))
@@ -285,8 +289,8 @@ class _View(NamedTuple):
         edge_mm = EDGE_MM if self.touching else -np.inf
         if self.touching and drawn.sum() * across_mm < DRAWN_WIDTH_MM:
             return max(filter(None, self._parts(middle)), key=lambda side: side.width_mm, default=None)
-        if self.touching and not self._one_piece(off_mm[drawn]):
-            edge_mm = 0.0
+        firm = not self.touching or self._one_piece(off_mm[drawn])
+        edge_mm = edge_mm if firm else 0.0
         sink = slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
         drawn &= outward * (at + slope * middle[2] * self.spacing_mm[2]) > outward * middle[axis] * along_mm
         width_mm = drawn.sum() * across_mm
@@ -304,7 +308,7 @@ class _View(NamedTuple):
         line[(across < first) | (across > last)] -= outward * edge_mm
         steady = np.interp(across, across[drawn], slope[drawn])[:, None] * np.arange(sink.shape[1]) * self.spacing_mm[2]
         of_bed, lines = float(np.median(slope[drawn])), runs | (known & drawn)
-        return TableSide(self.face, (line[:, None] + steady) / along_mm, lines, of_bed, float(width_mm))
+        return TableSide(self.face, (line[:, None] + steady) / along_mm, lines, of_bed, float(width_mm), firm)
 
     def _slope(self, ends_mm: Floats) -> Floats:
         """How the ends of each line of sight move along the bed, shape (n,), mm per mm: that of a bed at an angle.
