@@ -45,12 +45,11 @@ STAGES = {
     "planning.base.provenance": {"InputFiles.read": "reading", "InputFiles.content": "reading"},
     "planning.formats.dicom.ct_series": {"CtSeries.volume": "reading"},
     "planning.init.finder": {"volume_kind": "kind of file"},
-    "planning.anatomy.body.body_mask": {"ct_image": "CT in order", "body_mask": "body"},
+    "planning.anatomy.body.body_mask": {"ct_image": "CT in order", "find_unscanned": "unscanned", "body_mask": "body"},
     "planning.anatomy.body.cut_ends": {"content_of": "ends", "cut_ends": "ends"},
     "planning.anatomy.skin": {"skin_of_image": "skin", "skin_from_label": "skin"},
     "planning.formats.labels.label_surface": {"label_mesh": "label surfaces"},
     "planning.init.outlines": {"carved_notes": "what goes round"},
-    "planning.anatomy.body.unscanned": {"find_unscanned": "unscanned"},
     "planning.anatomy.scan": {
         "Scan.outside": "outside",
         "Scan.attached_limbs": "limbs",

@@ -10,8 +10,13 @@ from case_world import whole
 from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN, ball
-from puncture_twin.planning.anatomy.body.body_mask import body_mask, filled_slices
-from puncture_twin.planning.anatomy.body.unscanned import BLANK_HU, find_unscanned, measured_hu
+from puncture_twin.planning.anatomy.body.body_mask import (
+    BLANK_HU,
+    body_mask,
+    filled_slices,
+    find_unscanned,
+    measured_hu,
+)
 from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.read_case import load_case

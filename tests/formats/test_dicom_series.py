@@ -12,7 +12,7 @@ from pydicom.encaps import encapsulate
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless
 from refusals import refused
 
-from puncture_twin.planning.anatomy.body.unscanned import UNSCANNED_HU
+from puncture_twin.planning.anatomy.body.body_mask import UNSCANNED_HU
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.dicom.ct_series import UNMEASURED_HU, parse_series, read_series
 from puncture_twin.planning.formats.dicom.recognise import choose_series

@@ -180,9 +180,15 @@ TARGET = (
     Field("corrections", "steps"),
     Field("ended", lambda row: row["stop"].replace("_", " ")),
 )
+
+
+def _sessions(ours: Facts) -> str:
+    seeds = f"{ours['seeds']} seed" + "s" * (ours["seeds"] != 1)
+    return seeds + f"; {ours['refused']} sessions could not be held" * bool(ours["refused"])
+
+
 STATISTICS = (
-    Field("sessions", lambda ours: f"{ours['seeds']} seeds" + f"; {ours['refused']} sessions could not be held" * bool(
-        ours["refused"])),
+    Field("sessions", _sessions),
     Field("targets", "targets"),
     Field("stereo, mean and maximum", lambda ours: _mean_and_most(ours, "stereo")),
     Field("mapping, mean", "mapping_mean", 3, "mm"),
