@@ -90,9 +90,32 @@ def ends_of(mask: Bools) -> tuple[Ints32, Ints32, Ints32, Ints32]:
     return ends[0], ends[1], ends[2], ends[3]
 
 
+def in_blocks(mask: Bools, edge: NDArray[np.int_]) -> Ints32:
+    """How many voxels of a mask each block of ``edge`` voxels (3,) holds; the last ones may be cut."""
+    counts = np.zeros([-(-n // size) for n, size in zip(mask.shape, edge.tolist(), strict=True)], np.int32)
+    _count_in_blocks(_plain(mask), edge, counts)
+    return counts
+
+
 def _plain(mask: Bools) -> Bools:
     """The array as kernels take it: contiguous and writable."""
     return np.require(mask, requirements=["C", "W"])
+
+
+@nb.njit(cache=True)
+def _count_in_blocks(mask: Any, edge: Any, counts: Any) -> None:
+    a, b, c = edge
+    nx, ny, nz = mask.shape
+    row = np.empty(nz, np.int32)
+    for i in range(counts.shape[0]):
+        for j in range(counts.shape[1]):
+            row[:] = 0
+            for x in range(i * a, min((i + 1) * a, nx)):
+                for y in range(j * b, min((j + 1) * b, ny)):
+                    for k in range(nz):  # along memory, so that the compiler adds many at once
+                        row[k] += mask[x, y, k]
+            for k in range(nz):
+                counts[i, j, k // c] += row[k]
 
 
 @nb.njit(cache=True)

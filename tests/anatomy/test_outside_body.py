@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import scipy
 
 from puncture_twin.planning.anatomy.body.outside_body import (
     BEYOND_MM,
+    BLOCK_MM,
     BULKY_ML,
     CUT_AT_MM,
     OutsideImage,
@@ -144,3 +148,26 @@ def test_no_triangle_near_the_image_is_long(name, request):
             crossing = (z[:, 0] < high - 1e-9) & (z[:, 2] > low + 1e-9)
             assert crossing.any()
             assert np.all((z[crossing, 0] >= low - 1e-9) & (z[crossing, 2] <= high + 1e-9))
+
+
+@pytest.mark.parametrize("shape", [(61, 48, 37), (60, 47, 38)])
+def test_of_fine_voxels_it_is_drawn_about_blocks(shape):
+    """Never nearer than all voxels that are dense, but at their edges; never farther from them than a block."""
+    rng, spacing_mm = np.random.default_rng(5), np.array([0.8, 0.6, 1.0])
+    mask = np.zeros(shape, bool)
+    for low in rng.integers(0, np.array(shape) - 12, (6, 3)):
+        mask[tuple(slice(a, a + 12) for a in low)] = True
+    mask[:10, :, -9:] = True  # at two faces of the image and in a corner
+    nothing = np.zeros(shape, bool)
+    image = OutsideImage(mask, nothing, nothing, np.diag([*spacing_mm, 1.0]), spacing_mm, beyond_mm=(5.0, 5.0, 500.0))
+    surface = outside_surface(image, mask, where="fine")
+    assert surface is not None and surface.closed
+    index = rng.integers(0, shape, (600, 3))
+    gap_mm = scipy.ndimage.distance_transform_edt(~mask, sampling=spacing_mm)[tuple(index.T)]
+    deep_mm = scipy.ndimage.distance_transform_edt(mask, sampling=spacing_mm)[tuple(index.T)]
+    inside = inside_each(surface, index * spacing_mm)
+    assert inside[deep_mm > BLOCK_MM].all() and (deep_mm > BLOCK_MM).any()
+    assert inside[deep_mm > 0.0].mean() > 0.97
+    assert not inside[gap_mm > 3.0**0.5 * BLOCK_MM].any()
+    finest = outside_surface(replace(image, spacing_mm=np.full(3, BLOCK_MM)), mask, where="coarse")
+    assert finest is not None and len(surface.faces) < 0.4 * len(finest.faces)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy
 
-from puncture_twin.planning.geometry.parts import ends_of, largest_part, middle_of, parts_of
+from puncture_twin.planning.geometry.parts import ends_of, in_blocks, largest_part, middle_of, parts_of
 
 MASKS = [
     np.random.default_rng(seed).random(shape) < dense
@@ -38,3 +38,14 @@ def test_ends_and_middle(mask):
         assert np.array_equal(first, np.where(none, -1, mask.argmax(axis=axis)))
         assert np.array_equal(last, np.where(none, -1, mask.shape[axis] - 1 - np.flip(mask, axis).argmax(axis=axis)))
     assert np.allclose(middle_of(mask), np.argwhere(mask).mean(axis=0))
+
+
+@pytest.mark.parametrize("mask", MASKS)
+@pytest.mark.parametrize("edge", [(1, 1, 1), (2, 3, 4), (5, 1, 2)])
+def test_blocks_hold_what_their_voxels_are(mask, edge):
+    """The last blocks are cut."""
+    pads = [(0, -n % size) for n, size in zip(mask.shape, edge, strict=True)]
+    whole = np.pad(mask, pads)
+    a, b, c = (n // size for n, size in zip(whole.shape, edge, strict=True))
+    plain = whole.reshape(a, edge[0], b, edge[1], c, edge[2]).sum(axis=(1, 3, 5))
+    assert np.array_equal(in_blocks(mask, np.array(edge)), plain)

@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -26,6 +26,7 @@ from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, 
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
 from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
+from puncture_twin.planning.geometry.parts import in_blocks
 from puncture_twin.planning.geometry.voxelize import voxels_inside
 
 SAMPLING_MM = 4.0
@@ -215,10 +216,10 @@ def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> Lim
     T = image.T_ct_index.copy()
     T[:3, 3] += T[:3, :3] @ ((stride - 1) / 2.0)
     T[:3, :3] *= stride
-    coarse = _share(body, stride) > 0.0
+    coarse = in_blocks(body, stride) > 0
     parts, _ = scipy.ndimage.label(coarse)
-    solid = coarse | (_share(image.unscanned, stride) >= 0.5)
-    every_bone = _share(body & (image.hu > BONE_HU), stride) >= 0.125
+    solid = coarse | (2 * in_blocks(image.unscanned, stride) >= np.prod(stride))
+    every_bone = 8 * in_blocks(body & (image.hu > BONE_HU), stride) >= np.prod(stride)
     legs, others = _explained(every_bone, T, structures)
     spacing_mm = image.spacing_mm * stride
 
@@ -248,14 +249,6 @@ def _axis(points: Floats) -> tuple[Floats, Floats]:
     """Middle (3,) of points (n, 3), and the direction in which they reach farthest."""
     middle = points.mean(axis=0)
     return middle, np.linalg.svd(points - middle, full_matrices=False)[2][0]
-
-
-def _share(mask: Bools, stride: NDArray[np.int_]) -> Floats:
-    """How much of each block a mask fills; 0..1."""
-    counts: NDArray[Any] = mask.view(np.uint8)
-    for axis, times in enumerate(stride):
-        counts = np.add.reduceat(counts, np.arange(0, mask.shape[axis], times), axis=axis, dtype=np.uint16)
-    return counts / np.prod(stride)
 
 
 def _nearest_core(body: Bools, spacing_mm: Floats) -> Ints32:

@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.tables import FACES, Face
 from puncture_twin.planning.base.arrays import Bools, Floats, widened
+from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.parts import parts_of
+from puncture_twin.planning.geometry.parts import in_blocks, parts_of
 from puncture_twin.planning.geometry.rigid import apply, pose
 
 SMOOTH_MM = 3.0
@@ -45,6 +45,9 @@ BEYOND_LONG_MM = (*BEYOND_MM[:2], 1000.0)
 CUT_AT_MM = (30.0, 120.0, 480.0)
 """What goes on along the bed is cut across so far beyond the image: a triangle as long as all of it would lie near
 every needle, and the search would measure most axes from most of them."""
+BLOCK_MM = 2.0
+"""The surface is drawn about blocks of voxels of at most this edge that hold any of it: what is found by means over
+``SMOOTH_MM`` has no finer shape, and a table of .8 mm voxels has a million triangles."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
@@ -84,8 +87,8 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     """
     hu, body, unscanned = image.hu, image.body, image.unscanned
     size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(int)
-    mean = scipy.ndimage.uniform_filter(np.maximum(hu, LEAST_HU), size, output=np.float32, mode="nearest")
-    dense = (mean > air_hu) | (hu > max(DENSE_HU, air_hu))
+    dense = hu > max(DENSE_HU, air_hu)
+    _mark_means(np.require(hu, requirements=["C", "W"]), size, float(air_hu), dense)
     dense &= ~widened(body, size // 2 + 1)
     dense |= (hu > BODY_HU) & ~body
     if not unscanned.any():
@@ -98,6 +101,27 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
         dense |= padded
     dense &= ~body
     return dense
+
+
+@nb.njit(cache=True)
+def _mark_means(hu: Any, size: Any, above: Any, found: Any) -> None:
+    """Set where the mean over a cube of ``size`` voxels is above a value; beyond the border the image goes on."""
+    ni, nj, nk = hu.shape
+    before, after = size // 2, (size - 1) // 2
+    least, most, sums = np.float32(LEAST_HU), np.float32(above * size.prod()), np.empty(nk, np.float32)
+    for i in range(ni):
+        for j in range(nj):
+            sums[:] = 0.0
+            for x in range(i - before[0], i + after[0] + 1):
+                for y in range(j - before[1], j + after[1] + 1):
+                    line = hu[min(max(x, 0), ni - 1), min(max(y, 0), nj - 1)]
+                    for k in range(nk):  # along memory, so that the compiler adds many at once
+                        sums[k] += max(np.float32(line[k]), least)
+            for k in range(nk):
+                total = np.float32(0.0)
+                for z in range(k - before[2], k + after[2] + 1):
+                    total += sums[min(max(z, 0), nk - 1)]
+                found[i, j, k] |= total > most
 
 
 def outside_surface(
@@ -114,9 +138,11 @@ def outside_surface(
         open_faces: Beyond which nothing is known.
         where: The file, for messages.
     """
-    pads = [(len(layers), len(layers)) for layers in _layers_mm(image)]
-    layered = np.pad(mask, pads, mode="edge")
-    bulky = _bulky(mask & ~image.unscanned, image.spacing_mm)
+    edge = np.maximum(1, (BLOCK_MM / image.spacing_mm).astype(int))
+    blocks, pads = in_blocks(mask, edge) > 0, [(len(layers), len(layers)) for layers in _layers_mm(image)]
+    layered = np.pad(blocks, pads, mode="edge")
+    seen = in_blocks(mask & ~image.unscanned, edge) > 0 if image.unscanned.any() else blocks
+    bulky = _bulky(seen, edge * image.spacing_mm)
     for axis, end in FACES:
         cut: Bools = np.asarray(bulky.take(end, axis=axis))
         between = np.maximum.accumulate(cut) & np.maximum.accumulate(cut[::-1])[::-1]
@@ -125,12 +151,12 @@ def outside_surface(
         beyond |= np.pad(between, others, mode="edge") | ((axis, end) in open_faces)
     if not layered.any():
         return None
-    T_ct_layered = image.T_ct_index @ pose(np.eye(3), [-float(count) for count, _ in pads])
-    return _drawn_out(mask_surface(layered, T_ct_layered, where=where), image)
+    T_blocks_layered = pose(np.eye(3), [-float(count) for count, _ in pads])
+    return _drawn_out(mask_surface(layered, T_blocks_layered, where=where), edge, image)
 
 
 def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
-    """How far beyond its border voxels' centres an image is continued by layers of voxels, along each axis.
+    """How far beyond its border voxels' centres an image is continued by layers of blocks, along each axis.
 
     The last layer is where what is drawn out ends: up to there it keeps its width.
     """
@@ -138,25 +164,30 @@ def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
     return (float(image.spacing_mm[0]), to_side), (float(image.spacing_mm[1]), to_back), (*CUT_AT_MM, along)
 
 
-def _drawn_out(surface: TriangleMesh, image: OutsideImage) -> TriangleMesh:
-    """The surface with the layers beyond its border voxels' centres, and its caps half a voxel after, moved outward.
+def _drawn_out(surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImage) -> TriangleMesh:
+    """A surface that counts blocks of ``edge`` voxels, in LPS mm; the layers beyond the image's border moved outward.
 
-    Beyond the ends of the bed it runs on as the bed does.
+    Of blocks within, every vertex lies on a face between two of them. The caps lie half a voxel after the last layer's
+    centre. Beyond the ends of the bed it runs on as the bed does.
     """
-    T = image.T_ct_index
-    index = np.linalg.solve(T[:3, :3], (surface.vertices - T[:3, 3]).T).T
+    index = surface.vertices.copy()
     for axis, layers_mm in enumerate(_layers_mm(image)):
-        last, count = image.hu.shape[axis] - 1.0, len(layers_mm)
-        beyond = np.array([*range(1, count + 1), count + 0.5])
+        size = image.hu.shape[axis]
+        at = np.arange(0, size, edge[axis])  # first voxels of blocks
+        beyond = np.array([*range(1, len(layers_mm) + 1), len(layers_mm) + 0.5])
         moved = np.array([*layers_mm, layers_mm[-1] + 0.5 * image.spacing_mm[axis]]) / image.spacing_mm[axis]
+        last, ends = (
+            len(at) - 1.0,
+            [(min(edge[axis], size) - 1) / 2.0, (at[-1] + size - 1) / 2.0],
+        )  # centres at the border
         index[:, axis] = np.interp(
             index[:, axis],
-            np.concatenate([-beyond[::-1], [0.0, last], last + beyond]),
-            np.concatenate([-moved[::-1], [0.0, last], last + moved]),
+            np.concatenate([-beyond[::-1], [0.0], np.arange(last) + 0.5, [last], last + beyond]),
+            np.concatenate([-moved[::-1], ends[:1], at[1:] - 0.5, ends[1:], size - 1.0 + moved]),
         )
     beyond = index[:, 2] - np.clip(index[:, 2], 0.0, image.hu.shape[2] - 1.0)
     index[:, :2] += beyond[:, None] * image.slopes * image.spacing_mm[2] / image.spacing_mm[:2]
-    return TriangleMesh(apply(T, index), surface.faces)
+    return TriangleMesh(apply(image.T_ct_index, index), surface.faces)
 
 
 def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
