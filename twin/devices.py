@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Pixels
 
 
 class GreyImage(NamedTuple):
@@ -55,3 +55,27 @@ class Operator(Protocol):
 
     def pointed_cp(self, marker: str) -> Floats:
         """Where the marker is, roughly, shape (3,), mm, in the measuring arm's frame."""
+
+
+class Probe(Protocol):
+    """An ultrasound probe."""
+
+    def measured_image(self) -> Pixels:
+        """A new B-mode image, grey levels, shape (rows, columns)."""
+
+
+class JogOperator(Protocol):
+    """A person who jogs the needle's arm until the needle shows in the image, or a servo that does."""
+
+    def jogged_jp(self, tip_mm: Floats, direction: Floats, roll: float, q: Floats) -> Floats:
+        """Joints at which the needle shows as wished.
+
+        Args:
+            tip_mm: Shape (2,), where its tip is wished in the image.
+            direction: Shape (2,), unit, along it toward the tip, in the image.
+            roll: Of the needle about itself, rad.
+            q: Shape (6,), rad, from where it is jogged.
+
+        Returns:
+            Shape (6,), rad, not moved to yet; NaN out of reach.
+        """
