@@ -40,6 +40,19 @@ def broken(inside, forbidden, but=frozenset()):
     ]
 
 
+def names_in(path):
+    """Every name that a file uses or gives."""
+    for node in ast.walk(tree(path)):
+        yield from (
+            getattr(node, key) for key in ("id", "attr", "arg", "name") if isinstance(getattr(node, key, 0), str)
+        )
+
+
+def of_truth(name):
+    """Whether a name speaks of the truth, in either way of joining words."""
+    return bool({"true", "truth"} & set(re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().split("_")))
+
+
 def test_planning_never_imports_the_twin_or_the_physics():
     """It decides by what it is given."""
     assert broken(f"{NAME}.planning", [f"{NAME}.twin", f"{NAME}.run_twin", "pybullet", "matplotlib"]) == []
@@ -56,8 +69,13 @@ def test_nobody_imports_the_command_line():
 
 
 def test_guidance_never_sees_the_plant():
-    """It speaks to devices."""
-    assert broken(f"{NAME}.twin.guidance", [f"{NAME}.twin.plant"]) == []
+    """It speaks to devices, and nothing in it is named after the truth but what a case file says of the plant."""
+    guidance = f"{NAME}.twin.guidance"
+    assert broken(guidance, [f"{NAME}.twin.plant", f"{NAME}.twin.rehearsal", f"{NAME}.twin.world"]) == []
+    inside = {name: path for name, path in modules().items() if within(name, guidance)}
+    files = [path for name, path in inside.items() if not name.endswith("_case")]
+    assert len(files) < len(inside)
+    assert [f"{path.name}: {name}" for path in files for name in names_in(path) if of_truth(name)] == []
 
 
 def test_the_ways_of_guidance_do_not_meet():
