@@ -16,13 +16,14 @@ from time import process_time
 import numpy as np
 
 from benchmarks.shared import versions
-from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, render as render_ball
 from puncture_twin.twin.guidance.stereo.ball.tracker import DetectedBall, LostBall, find_ball
 from puncture_twin.twin.guidance.stereo.cameras.calibration import calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import stereo_pair
 from puncture_twin.twin.guidance.stereo.cameras.triangulation import triangulate
+from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEcho
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, DetectorSettings, detect
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho, NeedleInImage, render
+from puncture_twin.twin.plant.ball_image import BallScene, render as render_ball
+from puncture_twin.twin.plant.bmode_image import NeedleInImage, render
 
 SIZE, FOCAL, RADIUS_MM, SEARCH_PX = (1280, 960), 2560.0, 4.0, 12.0
 LENS = (-0.2, 0.05, 5e-4, -5e-4)

@@ -23,16 +23,16 @@ from scipy.stats import chi2
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.acquisition import WorkcellTruth, acquire, choose, jog_into_slice
+from puncture_twin.twin.guidance.ultrasound.acquisition import ProbeDevices, acquire, choose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, find_candidates
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
-from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
+from puncture_twin.twin.plant.bmode_image import NeedleInImage
+from puncture_twin.twin.plant.ultrasound_workcell import UltrasoundPlant, WorkcellTruth, draw_workcell, jog_into_slice
 
 CASE = Path(__file__).resolve().parents[1] / "meshes" / "selfcal"
 IMAGE_MM, DIRECTION_RAD = 0.1, float(np.radians(0.3))
@@ -135,7 +135,9 @@ def outcome(kind: Kind, seed: int) -> Outcome:
     rng = UniformErrors(bits) if kind.uniform else np.random.Generator(bits)
     truth = with_play(draw_workcell(case, rng), kind.true_play)
     if kind.rendered:
-        taken = acquire(case, room, candidates, truth, rng)
+        plant = UltrasoundPlant(case, truth, rng)
+        devices = ProbeDevices(plant.probe_arm, plant.needle_arm, plant, plant)
+        taken = acquire(case, room, candidates, devices, rng)
         recording, others = taken.recording, taken.left
     else:
         recording, _ = recorded(case, candidates, truth, chosen, rng, noise=True)

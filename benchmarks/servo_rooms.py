@@ -29,19 +29,15 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.twin.guidance.stereo.detection import Detection, Detector, LocatedPair, Search
-from puncture_twin.twin.guidance.stereo.experiment import needle_statistics
+from puncture_twin.twin.guidance.stereo.detection import Detection, Detector, Search
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, adjust
-from puncture_twin.twin.guidance.stereo.joint.needle_error import (
-    NeedleOutcome,
-    needle_outcome,
-    open_loop_error,
-    servoed_error,
-)
-from puncture_twin.twin.guidance.stereo.robot_calibration import calibrating_rod, carried_rod, grid_points
+from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_error, servoed_error
+from puncture_twin.twin.guidance.stereo.planned import calibrating_rod, carried_rod, grid_points, planned_cameras
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, ball_jacobian, flange_poses
-from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, draw_workcell, planned_cameras
+from puncture_twin.twin.plant.stereo_workcell import StereoPlant, StereoWorkcell, draw_workcell
+from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome, needle_outcome
+from puncture_twin.twin.rehearsal.stereo_trials import needle_statistics
 
 PIXEL_PX = 0.03
 """Of a centre by edges, per axis; declared here, since there are no pictures of which a tracker could tell it."""
@@ -63,12 +59,12 @@ class RoomOutcome(NamedTuple):
     freedom: int
 
 
-def pixel_detector(room: StereoWorkcell, sigma_px: float, rng: np.random.Generator) -> Detector:
+def pixel_detector(plant: StereoPlant, sigma_px: float) -> Detector:
     """True pixels with normal errors of a standard deviation per axis."""
 
-    def see(number: int, ball: LocatedPair, search: Search) -> Detection:
-        del search
-        pixel = room.cameras[number].project(ball.center_c) + rng.normal(0.0, sigma_px, 2)
+    def see(number: int, search: Search) -> Detection:
+        ball = plant.nearest(number, search.camera.project(search.predicted_c))
+        pixel = plant.workcell.cameras[number].project(ball.center_c) + plant.pictures.normal(0.0, sigma_px, 2)
         return Detection(pixel, max(sigma_px, 1e-6) ** 2 * np.eye(2))
 
     return see
@@ -90,7 +86,7 @@ def varied(case: ServoCase, **sections: dict[str, Any]) -> ServoCase:
 @cache
 def commands(case: ServoCase, branch: int) -> Floats:
     """Joints for the calibration's points, shape (12, 6), rad."""
-    rod = calibrating_rod(case, draw_workcell(case, np.random.default_rng(0)))
+    rod = calibrating_rod(case)
     return reached(rod, grid_points(case), branch)
 
 
@@ -109,7 +105,7 @@ class Room:
         self.case, self.branch = case, branch
         self.rng = np.random.default_rng(seed)
         self.workcell: StereoWorkcell = draw_workcell(case, self.rng)
-        self.rod = carried_rod(case, self.workcell)
+        self.rod = carried_rod(case)
         self.q = list(commands(case, branch))
         self.q_true = [self.arrived(q) for q in self.q]
         self.pixels = [self.seen(self.workcell.ball_c(q)) for q in self.q_true]
@@ -119,7 +115,7 @@ class Room:
         )
         self.markers = np.array([self.seen(point) for point in self.workcell.markers_c])
         self.markers_m = case.markers.points + self.rng.normal(0.0, truth.marker_mm, case.markers.points.shape)
-        self.T_base_c = fit_rigid(self.measured_c, ball_base(calibrating_rod(case, self.workcell), np.array(self.q)))
+        self.T_base_c = fit_rigid(self.measured_c, ball_base(calibrating_rod(case), np.array(self.q)))
         self.found: Adjusted | None = None
 
     def arrived(self, q: Floats) -> Floats:

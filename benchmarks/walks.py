@@ -26,8 +26,8 @@ import numpy as np
 
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME, write_recording
-from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
 from puncture_twin.twin.jobs.selfcal.selfcal import selfcal_recording
+from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 ROOT = Path(__file__).parents[1]
 KNOWN = "planning/base/"

@@ -4,13 +4,13 @@ import numpy as np
 
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate
-from puncture_twin.twin.guidance.ultrasound.simulate import (
+from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_orientations
+from puncture_twin.twin.plant.simulated_recording import (
     ImagePose,
     draw_image_poses,
     draw_probe_poses,
     draw_truth,
     exact_recording,
-    needle_orientations,
 )
 
 DEGENERATE = {

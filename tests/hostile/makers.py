@@ -12,7 +12,7 @@ from puncture_twin.planning.certify.question import Question
 from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.recording_file import write_recording
-from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
+from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 SKIN, ORGAN, RIB = (
     structure(name, role, {"mesh": f"{name}.ply", "unit": "mm"})

@@ -10,9 +10,7 @@ from servo_world import NoContacts
 from benchmarks.servo_rooms import pixel_detector, varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, TargetRow, run_trial, statistics, trial
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
-from puncture_twin.twin.guidance.stereo.session import run_session
 from puncture_twin.twin.jobs.servo.liu2007 import (
     TABLE_1,
     TABLE_2,
@@ -24,6 +22,8 @@ from puncture_twin.twin.jobs.servo.liu2007 import (
     straightened,
 )
 from puncture_twin.twin.jobs.servo.report import reproduction_facts, servo_facts, servo_text
+from puncture_twin.twin.rehearsal.stereo_session import run_session
+from puncture_twin.twin.rehearsal.stereo_trials import ServoTrial, TargetRow, run_trial, statistics, trial
 
 SEED = 5
 DRAW = (-0.05, 0.05, -0.02, 0.02)
@@ -115,8 +115,7 @@ def test_a_seed_repeats_itself_and_another_does_not():
     """Every number is a function of case and seed."""
     case = load_servo_case(folder() / "head")
     first, again, other = (
-        short(case, seed, ("T1",), detector_of=lambda workcell, rng: pixel_detector(workcell, 0.03, rng))
-        for seed in (1, 1, 2)
+        short(case, seed, ("T1",), detector_of=lambda plant: pixel_detector(plant, 0.03)) for seed in (1, 1, 2)
     )
     assert first == again
     assert first.rows != other.rows

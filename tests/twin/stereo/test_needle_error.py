@@ -11,7 +11,7 @@ from benchmarks.servo_rooms import DOUBTED, drawn_from, pixel_detector, room_out
 from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.stereo.joint.joint_model import N_ROD, adjust, rod_poses
 from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_error, servoed_error
-from puncture_twin.twin.guidance.stereo.session import run_session
+from puncture_twin.twin.rehearsal.stereo_session import run_session
 
 ROOMS, FEW_ROOMS = 120, 16
 HERE = told_of_pixels(CASE)
@@ -149,7 +149,7 @@ def test_a_session_predicts_every_needle_that_it_saw():
         1,
         targets=("T1", "T6"),
         empty=NoContacts(),
-        detector_of=lambda workcell, rng: pixel_detector(workcell, 0.03, rng),
+        detector_of=lambda plant: pixel_detector(plant, 0.03),
     )
     for one in session.reached:
         assert one.seen.predicted_rms_mm < one.unseen.predicted_rms_mm

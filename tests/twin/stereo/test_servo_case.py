@@ -8,16 +8,11 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.geometry.containment import winding_number
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.stereo.robot_calibration import carried_rod, grid_points
+from puncture_twin.twin.guidance.stereo.planned import carried_rod, grid_points, head_pose, workcell_checker
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import configurations, path_upward
 from puncture_twin.twin.guidance.stereo.servo_loop import path_contact
-from puncture_twin.twin.guidance.stereo.stereo_workcell import (
-    StereoWorkcell,
-    draw_workcell,
-    head_pose,
-    workcell_checker,
-)
+from puncture_twin.twin.plant.stereo_workcell import StereoWorkcell, draw_workcell
 from tools.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM, head_field, head_targets
 
 HEAD = folder() / "head"
@@ -106,7 +101,7 @@ def test_a_ball_behind_the_head_is_hidden(case):
 def test_the_arm_reaches_everything_without_a_contact(case):
     """Calibration grid, every target from its hovering pose with the head there; no link before the ball."""
     workcell = draw_workcell(case, np.random.default_rng(0))
-    rod, T = carried_rod(case, workcell), head_pose(case)
+    rod, T = carried_rod(case), head_pose(case)
     calibrated = configurations(rod, grid_points(case), workcell_checker(case, None)).branch
     targets, checker = apply(T, case.targets.points), workcell_checker(case, T)
     q = configurations(

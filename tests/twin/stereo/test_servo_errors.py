@@ -9,8 +9,9 @@ from benchmarks.servo_rooms import varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.geometry.rigid import log_rotation
 from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrorsSection, declared_errors
+from puncture_twin.twin.guidance.stereo.planned import planned_cameras
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
-from puncture_twin.twin.guidance.stereo.stereo_workcell import draw_workcell, planned_cameras
+from puncture_twin.twin.plant.stereo_workcell import draw_workcell
 
 HEAD = folder() / "head"
 TEXT = (HEAD / "servo.toml").read_text(encoding="utf-8")

@@ -40,16 +40,15 @@ class Twin:
         flange = self.arm.flange_pose(q_true)
         return (flange[:3, 3] + HELD.rod_mm * flange[:3, 2] - self.T[:3, 3]) @ self.T[:3, :3]
 
-    def look(self, q_command, q_true):
+    def look(self, q_command):
         """The ball with noise."""
         self.looks += 1
-        return Seen(self.ball(q_true) + self.rng.normal(0.0, self.noise, 3), TARGET_C, self.noise**2 * np.eye(3))
+        return Seen(self.ball(self.q) + self.rng.normal(0.0, self.noise, 3), TARGET_C, self.noise**2 * np.eye(3))
 
-    def drive(self, q_command):
+    def move_jp(self, q_command):
         """The play operator and the repeatability."""
         self.drives += 1
         self.q = self.arm.settle(q_command, self.q, self.rng)
-        return self.q
 
 
 def task(**changes):
@@ -68,7 +67,7 @@ def task(**changes):
 
 def run(twin, **changes):
     """The servo from the start pose."""
-    return servo(task(**changes), Q_START, Q_START, twin.look, twin.drive)
+    return servo(task(**changes), Q_START, twin.look, twin)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -76,7 +75,7 @@ def test_it_takes_the_arms_own_error_out(seed):
     """An arm that is millimetres off ends within the tolerance, play and all; the target is never told to the arm."""
     twin = Twin(ArmErrors(0.3, 3e-4, 9e-4, np.radians(0.02), np.radians(0.003)), noise_mm=0.01, seed=seed)
     done = run(twin)
-    before, after = (np.linalg.norm(twin.ball(q) - TARGET_C) for q in (Q_START, done.q_true))
+    before, after = (np.linalg.norm(twin.ball(q) - TARGET_C) for q in (Q_START, twin.q))
     assert done.stop is ServoStop.CONVERGED
     assert after < 0.1 + 4 * 0.01 < before
     assert done.steps <= 4
@@ -95,11 +94,11 @@ def test_a_ball_that_is_not_seen_is_lost_and_the_arm_does_not_move():
     """So many looks as asked for, no drive, the reason kept."""
     twin, looks = Twin(ArmErrors(0.3)), []
 
-    def blind(q_command, q_true):
-        looks.append(q_true)
+    def blind(q_command):
+        looks.append(q_command)
         return Lost("camera 2: too few edges")
 
-    done = servo(task(looks=4), Q_START, Q_START, blind, twin.drive)
+    done = servo(task(looks=4), Q_START, blind, twin)
     assert (done.stop, twin.drives, len(looks)) == (ServoStop.LOST_BALL, 0, 4)
     assert done.detail == "camera 2: too few edges"
     assert np.array_equal(done.q_command, Q_START)
@@ -110,10 +109,10 @@ def test_one_missed_look_is_tried_again():
     twin = Twin(ArmErrors(0.3))
     outcomes = iter([Lost("a fly")])
 
-    def now_and_then(q_command, q_true):
-        return next(outcomes, None) or twin.look(q_command, q_true)
+    def now_and_then(q_command):
+        return next(outcomes, None) or twin.look(q_command)
 
-    assert servo(task(), Q_START, Q_START, now_and_then, twin.drive).stop is ServoStop.CONVERGED
+    assert servo(task(), Q_START, now_and_then, twin).stop is ServoStop.CONVERGED
 
 
 def test_a_wrong_calibration_diverges():
@@ -122,7 +121,7 @@ def test_a_wrong_calibration_diverges():
     wrong[:3, :3] = wrong[:3, :3] @ Rotation.from_euler("z", 150, degrees=True).as_matrix()
     twin = Twin(ArmErrors(), T_base_c=wrong)
     target = twin.ball(Q_START) + np.array([1.0, 0.5, 0.0])
-    done = servo(task(), Q_START, Q_START, lambda command, true: Seen(twin.ball(true), target, np.eye(3)), twin.drive)
+    done = servo(task(), Q_START, lambda command: Seen(twin.ball(twin.q), target, np.eye(3)), twin)
     assert done.stop is ServoStop.DIVERGING
     assert done.steps == 2
 
@@ -148,7 +147,7 @@ def test_a_singular_start_says_so():
     q[4] = np.radians(0.3)
     rod = HELD._replace(R_base_flange=HELD.R_base_flange)
     far = Task(rod, T_BASE_C, 0.1, 10, 3, StepLimits(), NoContacts())
-    done = servo(far, q, q, lambda command, true: Seen(np.zeros(3), np.full(3, 30.0), np.eye(3)), twin.drive)
+    done = servo(far, q, lambda command: Seen(np.zeros(3), np.full(3, 30.0), np.eye(3)), twin)
     assert (done.stop, twin.drives) == (ServoStop.SINGULAR, 0)
 
 
@@ -161,17 +160,13 @@ def test_joint_limit_is_a_reason_of_its_own():
     for sign in (1.0, -1.0):
         across = sign * 2.0 * np.array([-np.sin(q[0]), np.cos(q[0]), 0.0])
         goal = (ball_base(rod, q) + across - T_BASE_C[:3, 3]) @ T_BASE_C[:3, :3]
-        drives = []
+        twin = Twin(ArmErrors())
 
-        def look(q_command, q_true, goal=goal):
+        def look(q_command, goal=goal):
             return Seen((ball_base(rod, q_command) - T_BASE_C[:3, 3]) @ T_BASE_C[:3, :3], goal, np.eye(3))
 
-        def drive(q_command, drives=drives):
-            drives.append(q_command)
-            return q_command
-
-        stop = servo(task(rod=rod), q, q, look, drive).stop
-        ends[stop] = len(drives)
+        stop = servo(task(rod=rod), q, look, twin).stop
+        ends[stop] = twin.drives
     assert ends == {ServoStop.JOINT_LIMIT: 0, ServoStop.CONVERGED: 1}
 
 

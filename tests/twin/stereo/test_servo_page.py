@@ -11,16 +11,16 @@ from servo_world import CASE
 
 from benchmarks.servo_rooms import varied
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.twin.guidance.stereo.experiment import (
+from puncture_twin.twin.jobs.servo.liu2007 import Liu2007Tables, ServoSessions
+from puncture_twin.twin.jobs.servo.report import Pictures, reproduction_facts, servo_facts, servo_text, write_servo_page
+from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome
+from puncture_twin.twin.rehearsal.stereo_trials import (
     DeclarationTest,
     ServoTrial,
     TargetRow,
     needle_statistics,
     statistics,
 )
-from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleOutcome
-from puncture_twin.twin.jobs.servo.liu2007 import Liu2007Tables, ServoSessions
-from puncture_twin.twin.jobs.servo.report import Pictures, reproduction_facts, servo_facts, servo_text, write_servo_page
 
 
 def needle(predicted, realised, square, hit):

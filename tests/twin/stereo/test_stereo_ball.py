@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from puncture_twin.twin.devices import GreyImage
 from puncture_twin.twin.guidance.stereo.ball.ball_edges import Circle, cone, consensus, refit
-from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, GreyImage, _paint, render
 from puncture_twin.twin.guidance.stereo.ball.tracker import DetectedBall, LostBall, find_ball
 from puncture_twin.twin.guidance.stereo.cameras.camera import stereo_pair, tangent_axes
+from puncture_twin.twin.plant.ball_image import BallScene, _paint, render
 
 LENS = (-0.2, 0.05, 5e-4, -5e-4)
 CAMERA = stereo_pair(1280, 960, 2560, 500, 1000, LENS)[0]

@@ -25,9 +25,9 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
     tip_residuals,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, covariances
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import refine
-from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, PoseRanges, simulate_recording, with_noise
+from puncture_twin.twin.plant.simulated_recording import PoseRanges, simulate_recording, with_noise
 
 ALL = active_columns(tip=True, scale=False, direction=False)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
-from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
 from puncture_twin.twin.jobs.papers.axp_ybq import (
     COMPARED_WITH,
     AxpYbqRow,
@@ -19,6 +19,7 @@ from puncture_twin.twin.jobs.papers.axp_ybq import (
     widened,
 )
 from puncture_twin.twin.jobs.papers.papers import PAPERS
+from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 
 @pytest.fixture(scope="module")

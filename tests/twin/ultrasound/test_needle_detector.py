@@ -7,6 +7,7 @@ import pytest
 from refusals import refused
 from scipy.ndimage import map_coordinates
 
+from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
     Detection,
     DetectorSettings,
@@ -14,7 +15,7 @@ from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
     brightest_segment,
     detect,
 )
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleInImage, render
+from puncture_twin.twin.plant.bmode_image import NeedleInImage, render
 
 IMAGER = Imager()
 

@@ -22,13 +22,13 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import found_spreads
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, flange_slopes, linear_model
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import Whitening, weighed
 from puncture_twin.twin.guidance.ultrasound.pose_choice import drawing
 from puncture_twin.twin.guidance.ultrasound.puncture import aim
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
-from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
-from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
+from puncture_twin.twin.plant.simulated_recording import simulate_recording
+from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell
 
 ROOMS = 30
 PICTURED = 12
@@ -286,7 +286,7 @@ def test_the_aim_counts_the_needle_arms_errors(room):
         gaps = []
         for row in others:
             target = candidates.poses.P[row]
-            q = aim(candidates, int(row), target, calibration, truth)
+            q = aim(candidates, int(row), target, calibration, case.models)
             ended = truth.needle_in_image(candidates.q_probe[row], q).tip_image
             gaps.append(np.linalg.norm(ended - np.append(target, 0.0)))
         missed[name] = np.sqrt(np.nanmean(np.square(gaps)))

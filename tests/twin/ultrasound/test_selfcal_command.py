@@ -10,9 +10,9 @@ from scipy.stats import chi2, f
 from puncture_twin.run_twin import main
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
-from puncture_twin.twin.guidance.ultrasound.simulate import PoseRanges, simulate_recording
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, OK
-from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
+from puncture_twin.twin.plant.simulated_recording import PoseRanges, simulate_recording
+from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell
 
 CASE = """
 schema = 1

@@ -15,14 +15,8 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import (
     observe,
     scaled_jacobian,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.simulate import (
-    SPEC_NOISE,
-    PoseRanges,
-    exact_recording,
-    simulate_recording,
-    with_noise,
-)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
+from puncture_twin.twin.plant.simulated_recording import PoseRanges, exact_recording, simulate_recording, with_noise
 
 ALL = active_columns(tip=True, scale=False, direction=False)
 

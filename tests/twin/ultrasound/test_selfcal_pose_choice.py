@@ -10,16 +10,10 @@ from selfcal_world import as_estimate
 from benchmarks.selfcal_rooms import DIRECTION_RAD, IMAGE_MM, compared, recorded, room_of
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import N_PARAMETERS
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise
 from puncture_twin.twin.guidance.ultrasound.pose_choice import choose_poses, drawing as belief_of, expected_tre_mm
-from puncture_twin.twin.guidance.ultrasound.simulate import (
-    SPEC_NOISE,
-    PoseRanges,
-    draw_truth,
-    simulate_recording,
-    with_noise,
-)
-from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
+from puncture_twin.twin.plant.simulated_recording import PoseRanges, draw_truth, simulate_recording, with_noise
+from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from refusals import refused
 
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording, write_recording
-from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
+from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import pytest
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
+from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 
 def with_outliers(rng, recording, count, size_mm=5.0):

@@ -9,9 +9,9 @@ from refusals import refused
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.simulate import PoseRanges, simulate_recording
 from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
 from puncture_twin.twin.guidance.ultrasound.summaries import predicted_tre
+from puncture_twin.twin.plant.simulated_recording import PoseRanges, simulate_recording
 
 FILE = Path("recording.csv")
 POSES = 28

@@ -8,8 +8,8 @@ from selfcal_world import as_estimate
 
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import SHAFT_BIAS, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import tip_residuals
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, simulate_recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
+from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 RUNS = 30
 

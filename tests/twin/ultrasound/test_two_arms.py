@@ -13,8 +13,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.bodies import surface, touch
 from puncture_twin.planning.geometry.containment import winding_number
 from puncture_twin.planning.geometry.mesh import box
-from puncture_twin.twin.guidance.ultrasound.acquisition import jog_into_slice
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.pose_choice import (
     choose_poses,
     configurations,
@@ -24,7 +23,6 @@ from puncture_twin.twin.guidance.ultrasound.pose_choice import (
     find_candidates,
 )
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
-from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.two_arms import (
     BetweenArms,
     TwoArms,
@@ -34,7 +32,8 @@ from puncture_twin.twin.guidance.ultrasound.two_arms import (
     phantom_mesh,
     probe_tool,
 )
-from puncture_twin.twin.jobs.selfcal.selfcal import draw_workcell
+from puncture_twin.twin.plant.bmode_image import NeedleInImage
+from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell, jog_into_slice
 from puncture_twin.twin.report.scene.shapes import bar
 
 

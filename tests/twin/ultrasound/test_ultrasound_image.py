@@ -5,13 +5,11 @@ import pytest
 from refusals import refused
 from scipy import stats
 
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import (
+from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEcho, PointSpread
+from puncture_twin.twin.plant.bmode_image import (
     RAYLEIGH_SNR,
-    Imager,
     Lesion,
-    NeedleEcho,
     NeedleInImage,
-    PointSpread,
     blurred_speckle,
     needle_signal,
     render,

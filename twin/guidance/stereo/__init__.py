@@ -1,4 +1,4 @@
 """The camera guidance: two calibrated cameras, a ball on the tool, and a servo on what they see (Liu 2007).
 
-The session draws its own workcell with ground truth, an exception from `guidance` never importing `plant`.
+It speaks to devices (`twin.devices`); what is true of them only the plant knows.
 """

@@ -1,43 +1,23 @@
-"""Detections of the stereo guidance: a ball's centre in each camera, from images of the true workcell.
+"""Detections of the stereo guidance: a ball's centre in each camera.
 
-``image_detector`` renders an image with the true camera and measures it with the believed one. Another `Detector` may
-leave the image out: for studies of everything behind it.
+``image_detector`` takes an image and measures it with the believed camera. Another `Detector` may leave the image out:
+for studies of everything behind it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.stereo.ball.ball_image import BallScene, render
+from puncture_twin.twin.devices import Cameras
 from puncture_twin.twin.guidance.stereo.ball.tracker import LostBall, find_ball
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.cameras.triangulation import Points, triangulate
-from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost
-from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell
-
-DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
-"""Fraction of diffuse light; the rest is from one direction."""
-
-WINDOW_MARGIN_PX = 24
-"""An image, and the rod in it, are drawn this far beyond the region that is searched: the rest is never looked at."""
-
-
-class LocatedPair(NamedTuple):
-    """The true ball, C, mm."""
-
-    center_c: Floats
-    """Shape (3,)."""
-    radius_mm: float
-    rod_c: Floats | None
-    """Shape (3,): along the rod; None for a marker, which has none."""
-    head_there: bool = True
-    """Whether the head is in the workcell and may hide the ball; it is not during the calibration."""
 
 
 class Detection(NamedTuple):
@@ -56,11 +36,13 @@ class Search(NamedTuple):
     """As it is believed."""
     predicted_c: Floats
     """Shape (3,), mm."""
+    radius_mm: float
+    """Of the ball."""
     search_px: float
 
 
-Detector = Callable[[int, LocatedPair, Search], Detection | Lost]
-"""Takes the camera's number, the true ball, and the search region."""
+Detector = Callable[[int, Search], Detection | Lost]
+"""Takes the camera's number and the search region."""
 
 
 class Detections(NamedTuple):
@@ -72,46 +54,24 @@ class Detections(NamedTuple):
     """Shape (c, 2, 2), px^2."""
 
 
-def image_detector(workcell: StereoWorkcell, rng: np.random.Generator) -> Detector:
-    """Pictures of the true workcell, each drawn anew with noise; what the head hides is hidden."""
-    plan = workcell.case.file.cameras
+def image_detector(cameras: Cameras, *, hough_only: bool = False) -> Detector:
+    """A new image, and the ball measured in it with the believed camera.
 
-    def see(number: int, ball: LocatedPair, search: Search) -> Detection | Lost:
-        true = workcell.cameras[number]
-        hidden = workcell.hidden_fraction(true, ball.center_c, ball.radius_mm) if ball.head_there else 0.0
-        away = np.abs(true.project(ball.center_c) - search.camera.project(search.predicted_c)).max()
-        radius = true.ball_radius_px(ball.center_c, ball.radius_mm)
-        half = int(np.ceil(np.nan_to_num(away, nan=0.0) + search.search_px + 2 * radius)) + WINDOW_MARGIN_PX
-        scene = replace(ball_scene(plan, ball, hidden, rng), rod_length_mm=half * ball.radius_mm / radius)
-        image = render(true, scene, rng=rng, noise=plan.noise_grey, blur_px=plan.blur_px, half_px=half)
-        found = find_ball(
-            image,
-            search.camera,
-            search.predicted_c,
-            ball.radius_mm,
-            search_px=search.search_px,
-            hough_only=plan.centre == "hough",
-        )
+    Args:
+        cameras: The devices.
+        hough_only: The paper's method; see `find_ball`.
+    """
+
+    def see(number: int, search: Search) -> Detection | Lost:
+        camera, predicted, radius_mm, reach_px = search
+        image = cameras.measured_image(number, camera.project(predicted), reach_px)
+        found = find_ball(image, camera, predicted, radius_mm, search_px=reach_px, hough_only=hough_only)
         return Lost(found.reason) if isinstance(found, LostBall) else Detection(found.pixel, found.covariance)
 
     return see
 
 
-def ball_scene(plan: CamerasSection, ball: LocatedPair, hidden: float, rng: np.random.Generator) -> BallScene:
-    """The scene of a ball; an occluder that the case demands comes from any side."""
-    fraction = min(max(plan.occlusion if ball.rod_c is not None else 0.0, hidden), 0.99)
-    return BallScene(
-        ball.center_c,
-        radius_mm=ball.radius_mm,
-        rod_c=(0.0, -1.0, 0.0) if ball.rod_c is None else ball.rod_c,
-        rod=ball.rod_c is not None,
-        diffuse=DIFFUSE[plan.light],
-        hidden_fraction=fraction,
-        hidden_from=float(rng.uniform(-np.pi, np.pi)),
-    )
-
-
-def look_at(detector: Detector, ball: LocatedPair, searches: tuple[Search, ...], frames: int = 1) -> Detections | Lost:
+def look_at(detector: Detector, searches: tuple[Search, ...], frames: int = 1) -> Detections | Lost:
     """Detect one ball in every camera, several images each; all must show it.
 
     Pictures of one camera are averaged by their inverse covariances.
@@ -120,7 +80,7 @@ def look_at(detector: Detector, ball: LocatedPair, searches: tuple[Search, ...],
     for number, search in enumerate(searches):
         detections = []
         for _ in range(frames):
-            spot = detector(number, ball, search)
+            spot = detector(number, search)
             if isinstance(spot, Lost):
                 return Lost(f"camera {number + 1}: {spot.reason}")
             detections.append(spot)
@@ -129,6 +89,12 @@ def look_at(detector: Detector, ball: LocatedPair, searches: tuple[Search, ...],
         pixels.append(covariance @ np.einsum("fij,fj->i", weights, [spot.pixel for spot in detections]))
         covariances.append(covariance)
     return Detections(np.array(pixels), np.array(covariances))
+
+
+def searches_of(case: ServoCase, cameras: tuple[Camera, ...], predicted_c: Floats) -> tuple[Search, ...]:
+    """Where the tool's ball is looked for in each camera, predicted at (3,), mm."""
+    radius_mm, reach_px = case.file.tool.ball_diameter_mm / 2, case.file.servo.search_px
+    return tuple(Search(camera, predicted_c, radius_mm, reach_px) for camera in cameras)
 
 
 def in_space(cameras: tuple[Camera, ...], detections: Detections) -> Points:

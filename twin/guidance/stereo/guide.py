@@ -10,20 +10,20 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.stereo.detection import Detections, Detector, LocatedPair, Search, in_space, look_at
+from puncture_twin.twin.guidance.stereo.detection import Detections, Detector, in_space, look_at, searches_of
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, Unknowns, adjust
 from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, open_loop_error, servoed_error
-from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, carried_rod
+from puncture_twin.twin.guidance.stereo.planned import carried_rod, planned_cameras
+from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
-from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, planned_cameras
 
 
 class Known(NamedTuple):
-    """Knowledge of a session when the servo begins, and the workcell for its images."""
+    """Knowledge of a session when the servo begins."""
 
-    workcell: StereoWorkcell
-    """The workcell, of which only the images are used."""
+    case: ServoCase
     calibration: RobotCalibration
     mapping: Mapping
     markers: list[Detections]
@@ -37,11 +37,11 @@ class Guide:
     """The paper's chain: calibrated cameras triangulate the ball; the mapping gives the target."""
 
     def __init__(self, known: Known) -> None:
-        workcell, calibration, mapping, markers, markers_m, detector = known
-        self._room, self._case, self._detector = workcell, workcell.case, detector
+        case, calibration, mapping, markers, markers_m, detector = known
+        self._case, self._detector = case, detector
         self._calibration, self._mapping = calibration, mapping
         self._markers, self._markers_m = markers, markers_m
-        self._held = carried_rod(workcell.case, workcell)
+        self._held = carried_rod(case)
         self._T_c_base = np.asarray(np.linalg.inv(calibration.T_base_c))
         self._q = [*calibration.q_command]
         self._pixels = [*calibration.pixels.transpose(1, 0, 2)]
@@ -56,18 +56,15 @@ class Guide:
         self.target_m = target_m
         self.target_c = self._mapping.to_c(target_m)
 
-    def look(self, q_command: Floats, q_true: Floats) -> Seen | Lost:
+    def look(self, q_command: Floats) -> Seen | Lost:
         """Measure the ball in new images; returns ball and target.
 
         Args:
             q_command: Shape (6,), rad: where the arm was sent; predicts where to search.
-            q_true: Shape (6,), rad: true joints, for the images alone.
         """
-        tool, limits = self._case.file.tool, self._case.file.servo
-        ball = LocatedPair(self._room.ball_c(q_true), tool.ball_diameter_mm / 2, self._room.rod_c(q_true))
-        predicted = apply(self._T_c_base, ball_base(self._held, q_command))
-        searches = tuple(Search(camera, predicted, limits.search_px) for camera in self._calibration.cameras)
-        detections = look_at(self._detector, ball, searches, limits.frames)
+        predicted, limits = apply(self._T_c_base, ball_base(self._held, q_command)), self._case.file.servo
+        searches = searches_of(self._case, self._calibration.cameras, predicted)
+        detections = look_at(self._detector, searches, limits.frames)
         if isinstance(detections, Lost):
             return detections
         self._q.append(q_command)

@@ -7,7 +7,7 @@ ball's images against those points; r_T_c is the rigid fit of where the robot be
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,16 +16,14 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.twin.devices import Arm, MeasuringArm
 from puncture_twin.twin.guidance.stereo.cameras.calibration import CameraCalibration, calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.detection import Detector, LocatedPair, Search, look_at
+from puncture_twin.twin.guidance.stereo.detection import Detector, Search, look_at
+from puncture_twin.twin.guidance.stereo.planned import calibrating_rod, grid_points, planned_cameras
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, configurations, rod_orientation
+from puncture_twin.twin.guidance.stereo.servo_law import ball_base, configurations
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, path_contact
-from puncture_twin.twin.guidance.stereo.stereo_workcell import StereoWorkcell, planned_cameras
-
-GRID = (3, 2, 2)
-"""Points along the base's x, y and z."""
 
 FIRST_SEARCH_PX = 80.0
 """Before the calibration the cameras stand only about where they were planned."""
@@ -44,7 +42,6 @@ class RobotCalibration:
         covariances: Shape (c, k, 2, 2), px^2.
         rms_px: Residual of each camera.
         robot_residual_mm: Shape (k,): what the rigid fit leaves; mostly the robot's own error.
-        q_true: Shape (k, 6), rad: true joints; for the twin alone.
         branch: Of the inverse kinematics; the arm's errors are known on this one.
     """
 
@@ -56,64 +53,38 @@ class RobotCalibration:
     covariances: Floats
     rms_px: tuple[float, ...]
     robot_residual_mm: Floats
-    q_true: Floats
     branch: int
 
 
-def carried_rod(case: ServoCase, workcell: StereoWorkcell) -> CarriedRod:
-    """The nominal arm with the case's rod, in the orientation of the targets."""
-    tool = case.file.tool
-    return CarriedRod(workcell.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
-
-
-def calibrating_rod(case: ServoCase, workcell: StereoWorkcell) -> CarriedRod:
-    """The nominal arm with the case's rod, in the orientation of the calibration."""
-    tilt = case.file.calibration.tilt_deg
-    rod = carried_rod(case, workcell)
-    return rod if tilt is None else rod._replace(R_base_flange=rod_orientation(float(np.radians(tilt))))
-
-
-def grid_points(case: ServoCase) -> Floats:
-    """The calibration's points, base frame, shape (12, 3), mm: neighbours in the order of the arm's path."""
-    cal = case.file.calibration
-    steps = np.array(list(product(*(np.linspace(-0.5, 0.5, count) for count in GRID))))
-    return np.asarray(cal.center_mm + steps * cal.size_mm)
-
-
 def calibrate_by_robot(
-    workcell: StereoWorkcell, detector: Detector, checker: StateChecker, rng: np.random.Generator
+    case: ServoCase, arm: Arm, touch: MeasuringArm, detector: Detector, checker: StateChecker
 ) -> RobotCalibration:
     """Move to the points, detect, measure, and fit.
 
     Args:
-        workcell: The true workcell.
+        case: The case.
+        arm: Carries the ball to the points.
+        touch: Measures each.
         detector: Takes the images.
         checker: Checks contacts; the head is not there yet.
-        rng: For the arm's repeatability and the measuring arm.
 
     Raises:
         NoAnswerError: The arm cannot go there, or a ball is not found.
         InputError: The points do not determine a camera.
     """
-    case, rod = workcell.case, calibrating_rod(workcell.case, workcell)
-    points = grid_points(case)
-    q_command, branch = configurations(rod, points, checker)
+    rod = calibrating_rod(case)
+    q_command, branch = configurations(rod, grid_points(case), checker)
     for number, (start, end) in enumerate(pairwise(q_command), start=2):
         contact = path_contact(checker, np.stack([start, end]))
         if contact is not None:
             what = f"calibration: {contact.body} would touch {contact.other} on the way to point {number}"
             raise NoAnswerError(what, code="motion_touches")
-    sigma, q_true = case.truth_errors.measuring_mm, q_command[0]
-    measured, detections, stood = [], [], []
+    measured, detections, radius_mm = [], [], case.file.tool.ball_diameter_mm / 2
     for number, q in enumerate(q_command, start=1):
-        q_true = workcell.arm.settle(q, q_true, rng)
-        stood.append(q_true)
-        ball = LocatedPair(
-            workcell.ball_c(q_true), case.file.tool.ball_diameter_mm / 2, workcell.rod_c(q_true), head_there=False
-        )
-        measured.append(ball.center_c + rng.normal(0.0, sigma, 3))
-        searches = tuple(Search(camera, measured[-1], FIRST_SEARCH_PX) for camera in planned_cameras(case))
-        seen = look_at(detector, ball, searches, case.file.servo.frames)
+        arm.move_jp(q)
+        measured.append(touch.measured_cp())
+        searches = tuple(Search(one, measured[-1], radius_mm, FIRST_SEARCH_PX) for one in planned_cameras(case))
+        seen = look_at(detector, searches, case.file.servo.frames)
         if isinstance(seen, Lost):
             raise NoAnswerError(f"calibration, point {number}: {seen.reason}", code="ball_not_found")
         detections.append(seen)
@@ -132,7 +103,6 @@ def calibrate_by_robot(
         covariances,
         tuple(found.rms_px for found in cameras),
         np.asarray(residual),
-        np.array(stood),
         branch,
     )
 

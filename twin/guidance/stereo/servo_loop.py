@@ -16,6 +16,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
+from puncture_twin.twin.devices import Arm
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ServoStop, StepLimits, servo_step
 
 DIVERGING_RATIO = 1.5
@@ -45,11 +46,8 @@ class Lost(NamedTuple):
     reason: str
 
 
-Look = Callable[[Floats, Floats], Seen | Lost]
-"""Function of commanded and true joints, each (6,), rad: a measurement; only the images depend on the true ones."""
-
-Move = Callable[[Floats], Floats]
-"""Function of the commanded configuration (6,): moves the arm, and returns the true configuration, rad."""
+Look = Callable[[Floats], Seen | Lost]
+"""Function of the commanded joints (6,), rad: a measurement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +74,9 @@ class Task:
 
 
 class Visit(NamedTuple):
-    """One stop of the arm: commanded joints, true joints, and what was seen."""
+    """One stop of the arm: commanded joints, and what was seen."""
 
     q_command: Floats
-    q_true: Floats
     seen: Seen
     error_mm: float
     """From the ball seen to the target believed."""
@@ -93,7 +90,6 @@ class Servoed:
         stop: Why it ended.
         visits: Every stop at which the ball was seen, in order.
         q_command: Shape (6,), rad: the last command.
-        q_true: Shape (6,), rad: true joints.
         detail: What was touched or missing, for people.
         position_only: Whether some step gave the orientation up.
     """
@@ -101,9 +97,13 @@ class Servoed:
     stop: ServoStop
     visits: tuple[Visit, ...]
     q_command: Floats
-    q_true: Floats
     detail: str = ""
     position_only: bool = False
+
+    @property
+    def ended_in_sight(self) -> bool:
+        """Whether the ball was seen where the arm ended."""
+        return bool(self.visits) and self.visits[-1].q_command is self.q_command
 
     @property
     def steps(self) -> int:
@@ -116,28 +116,27 @@ class Servoed:
         return np.array([visit.error_mm for visit in self.visits])
 
 
-def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, move: Move) -> Servoed:
+def servo(task: Task, q_command: Floats, look: Look, arm: Arm) -> Servoed:
     """Move the ball onto the target: look, measure the error, move a step; until it converges or must stop.
 
     Args:
         task: Target, limits and devices.
         q_command: Shape (6,), rad: where the arm was sent.
-        q_true: Shape (6,), rad: true joints; only handed on to ``look``.
         look: Takes images and measures.
-        move: Moves the arm.
+        arm: Moves the ball.
     """
     visits: list[Visit] = []
     position_only = False
 
     def ended(stop: ServoStop, detail: str = "") -> Servoed:
-        return Servoed(stop, tuple(visits), q_command, q_true, detail, position_only)
+        return Servoed(stop, tuple(visits), q_command, detail, position_only)
 
     while True:
-        seen = _look(task, q_command, q_true, look)
+        seen = _look(task, q_command, look)
         if isinstance(seen, Lost):
             return ended(ServoStop.LOST_BALL, seen.reason)
         error_c = seen.target_c - seen.ball_c
-        visits.append(Visit(q_command, q_true, seen, float(np.linalg.norm(error_c))))
+        visits.append(Visit(q_command, seen, float(np.linalg.norm(error_c))))
         stop = _stop_reason(task, visits)
         if stop is not None:
             return ended(stop)
@@ -149,7 +148,7 @@ def servo(task: Task, q_command: Floats, q_true: Floats, look: Look, move: Move)
         if contact is not None:
             return ended(ServoStop.CONTACT, f"{contact.body} and {contact.other}")
         q_command = step.q_path[-1]
-        q_true = move(q_command)
+        arm.move_jp(q_command)
 
 
 def path_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
@@ -157,13 +156,13 @@ def path_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
     return first_contact(checker, dense_states(checker, q_path, RESOLUTION_RAD / FINER))
 
 
-def _look(task: Task, q_command: Floats, q_true: Floats, look: Look) -> Seen | Lost:
+def _look(task: Task, q_command: Floats, look: Look) -> Seen | Lost:
     """Look, and look again where the ball was not found, without moving the arm."""
-    found = look(q_command, q_true)
+    found = look(q_command)
     for _ in range(task.looks - 1):
         if isinstance(found, Seen):
             break
-        found = look(q_command, q_true)
+        found = look(q_command)
     return found
 
 

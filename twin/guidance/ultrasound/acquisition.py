@@ -1,38 +1,43 @@
-"""Recordings made in the twin: go to a pose, jog the needle into the slice, take an image, detect, record.
-
-`WorkcellTruth` is the workcell in which a recording is made: two arms as they move, the mounts, the needle.
-"""
+"""A recording made by its devices: go to a pose, let the needle be jogged into the slice, take an image, detect."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count, uncounted
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.devices import Arm, JogOperator, Probe
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, Missed, detect
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import NeedleInImage, render
-from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, choose_poses, drawing, needle_flange
+from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, choose_poses, drawing
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE
-from puncture_twin.twin.guidance.ultrasound.two_arms import BetweenArms, TwoArms
+from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 
 JOG_FAILED = "jog out of reach"
 JOG_TOUCHES = "jog would touch"
 
 
+class ProbeDevices(NamedTuple):
+    """What a recording is made with."""
+
+    probe_arm: Arm
+    needle_arm: Arm
+    operator: JogOperator
+    probe: Probe
+
+
 class ProbeShot(NamedTuple):
     """One image with all that belongs to it."""
 
+    number: int
+    """Of the image, from 0."""
     candidate: int
     q_probe: Floats
     """Commanded joints of the probe's arm, shape (6,), rad."""
@@ -44,15 +49,11 @@ class ProbeShot(NamedTuple):
     """Directions of the needle arm's joints, shape (6,)."""
     image: Pixels
     found: Detection | Missed
-    true_needle: NeedleInImage
-    """The true needle in the true image."""
-    touched: bool
-    """Whether the true arms touched each other."""
 
 
 @dataclass(frozen=True, eq=False)
 class Acquisition:
-    """A recording with its ground truth.
+    """A recording, and how it was made.
 
     Attributes:
         recording: Poses as the controllers print them, tips and directions as detected.
@@ -68,36 +69,27 @@ class Acquisition:
     missed_shots: tuple[ProbeShot, ...]
     left: NDArray[np.int_]
 
-    def detection_errors(self) -> Floats:
-        """Detected minus true tip, along and across the true shaft, mm, and the angle's error, rad; shape (n, 3)."""
-        return np.array([_detection_error(shot) for shot in self.shots])
 
+class _SentArm:
+    """An arm, and where it was sent last: from there its joints rotate."""
 
-class _Motion:
-    """The true motion of both arms, with the play of their last arrivals, and whether they touch."""
+    def __init__(self, arm: Arm) -> None:
+        self._arm = arm
+        self._q: Floats | None = None
 
-    def __init__(self, case: SelfcalCase, truth: WorkcellTruth, rng: np.random.Generator) -> None:
-        self._truth, self._rng = truth, rng
-        self.between = BetweenArms(case, truth.X, truth.Y, 0.0)
-        self._before: list[Floats | None] = [None, None]
-        self.turns = [np.zeros(6), np.zeros(6)]
-
-    def settle(self, which: int, q: Floats) -> Floats:
-        """Joints of arm 0 (probe) or 1 (needle) at rest, shape (6,), rad."""
-        arm = (self._truth.probe_arm, self._truth.needle_arm)[which]
-        before = self._before[which]
-        before = q if before is None else before
-        rest = arm.settle(q, before, self._rng)
-        self.turns[which] = np.sign(q - before)
-        self._before[which] = rest
-        return rest
+    def move(self, q: Floats) -> Floats:
+        """Move to joints (6,), rad; returns in which direction each rotated, shape (6,): 1, -1, or 0."""
+        turn = np.zeros(6) if self._q is None else np.sign(q - self._q)
+        self._arm.move_jp(q)
+        self._q = q
+        return turn
 
 
 def acquire(
     case: SelfcalCase,
     workcell: TwoArms,
     candidates: CandidatePoses,
-    truth: WorkcellTruth,
+    devices: ProbeDevices,
     rng: np.random.Generator,
     count: Count = uncounted,
 ) -> Acquisition:
@@ -107,14 +99,14 @@ def acquire(
         case: The self-calibration case.
         workcell: Its collision checker: the jog is checked too.
         candidates: Poses that can be taken.
-        truth: The ground truth.
-        rng: For the choice, if random, the arms' repeatability, what the jog leaves, and the images.
+        devices: Both arms, the probe, and who jogs.
+        rng: For the choice, if it is random.
         count: Called after every image.
 
     Raises:
         NoAnswerError: The candidates are used up before enough images show the needle.
     """
-    motion, wanted = _Motion(case, truth, rng), case.content.poses.count
+    wanted, arms = case.content.poses.count, (_SentArm(devices.probe_arm), _SentArm(devices.needle_arm))
     shots: list[ProbeShot] = []
     missed: list[ProbeShot] = []
     given_up: Counter[str] = Counter()
@@ -126,7 +118,7 @@ def acquire(
         chosen = choose(case, candidates, left, wanted - len(shots), rng, shots)
         left = np.setdiff1d(left, chosen)
         for row in chosen:
-            taken = _shot(case, workcell, candidates, truth, motion, int(row), rng)
+            taken = _shot(case, workcell, candidates, devices, arms, int(row), len(shots) + len(missed))
             if isinstance(taken, str):
                 given_up[taken] += 1
             elif isinstance(taken.found, Missed):
@@ -135,7 +127,7 @@ def acquire(
                 shots.append(taken)
             tried = len(missed) + given_up.total()
             count(len(shots) + tried, wanted + tried)
-    play = any(arm.backlash_rad > 0.0 for arm in (truth.probe_arm, truth.needle_arm))
+    play = any(arm.errors.backlash_deg > 0.0 for arm in (case.content.probe_arm, case.content.needle_arm))
     reasons = Counter(shot.found.value for shot in missed if isinstance(shot.found, Missed)) + given_up
     return Acquisition(_recording(workcell, shots, play=play), tuple(shots), dict(reasons), tuple(missed), left)
 
@@ -166,37 +158,25 @@ def _shot(
     case: SelfcalCase,
     workcell: TwoArms,
     candidates: CandidatePoses,
-    truth: WorkcellTruth,
-    motion: _Motion,
+    devices: ProbeDevices,
+    arms: tuple[_SentArm, _SentArm],
     row: int,
-    rng: np.random.Generator,
+    number: int,
 ) -> ProbeShot | str:
-    """Go to one candidate and take its image, or return why it was given up."""
-    q_probe = candidates.q_probe[row]
-    rest_probe = motion.settle(0, q_probe)
-    wanted = _after_jog(case, candidates.poses, row, rng)
-    q_needle = jog_into_slice(truth, rest_probe, candidates.q_needle[row], wanted, float(candidates.roll[row]))
+    """Go to one candidate and take its image, the one of this number, or return why it was given up."""
+    q_probe, poses = candidates.q_probe[row], candidates.poses
+    assert poses.v is not None  # candidates are made with directions
+    turn_probe = arms[0].move(q_probe)
+    roll = float(candidates.roll[row])
+    q_needle = devices.operator.jogged_jp(poses.P[row], poses.v[row], roll, candidates.q_needle[row])
     if np.isnan(q_needle).any():
         return JOG_FAILED
     if workcell.verdict(q_probe, q_needle) is not None:
         return JOG_TOUCHES
-    rest_needle = motion.settle(1, q_needle)
-    needle = truth.needle_in_image(rest_probe, rest_needle)
-    imager = case.content.image.imager()
-    image = render(imager, needle, rng, echo=case.content.image.echo())
-    touched = not motion.between.apart(rest_probe, rest_needle)
-    return ProbeShot(
-        row, q_probe, q_needle, motion.turns[0], motion.turns[1], image, detect(image, imager), needle, touched
-    )
-
-
-def _after_jog(case: SelfcalCase, poses: Recording, row: int, rng: np.random.Generator) -> NeedleInImage:
-    """Intended needle in the image, with what the operator leaves: off the plane, and leaning."""
-    off = case.content.truth
-    assert poses.v is not None  # candidates are made with directions
-    lean = rng.normal(0.0, np.radians(off.lean_deg))
-    tip = np.array([*poses.P[row], rng.normal(0.0, off.off_plane_mm)])
-    return NeedleInImage(tip, np.array([*(np.cos(lean) * poses.v[row]), np.sin(lean)]))
+    turn_needle = arms[1].move(q_needle)
+    image = devices.probe.measured_image()
+    found = detect(image, case.content.image.imager())
+    return ProbeShot(number, row, q_probe, q_needle, turn_probe, turn_needle, image, found)
 
 
 def _recording(workcell: TwoArms, shots: list[ProbeShot], *, play: bool) -> Recording:
@@ -218,14 +198,6 @@ def _recording(workcell: TwoArms, shots: list[ProbeShot], *, play: bool) -> Reco
     )
 
 
-def _detection_error(shot: ProbeShot) -> tuple[float, float, float]:
-    assert isinstance(shot.found, Detection)  # only those are kept as shots
-    d = shot.true_needle.direction_image[:2] / np.linalg.norm(shot.true_needle.direction_image[:2])
-    e = shot.found.tip_image - shot.true_needle.tip_image[:2]
-    v = shot.found.direction_image
-    return float(e @ d), float(d[0] * e[1] - d[1] * e[0]), float(np.arctan2(d[0] * v[1] - d[1] * v[0], d @ v))
-
-
 def _too_few(
     case: SelfcalCase,
     candidates: CandidatePoses,
@@ -237,88 +209,3 @@ def _too_few(
         f"{len(shots)} of {case.content.poses.count} poses show the needle; of {len(candidates.q_probe)} candidates "
         f"{len(missed)} showed none and {given_up.total()} were given up. More [poses] samples would help"
     )
-
-
-JOG_STEPS = 4
-"""Steps of the operator's correction: each leaves about the arms' relative error, 1e-3, of what was left before."""
-
-
-class MovingArm(Protocol):
-    """An arm commanded by its nominal model that moves as the plant drew it."""
-
-    @property
-    def nominal(self) -> UrModel:
-        """The nominal model."""
-
-    @property
-    def backlash_rad(self) -> float:
-        """Full width of the play of every joint."""
-
-    def flange_pose(self, q_true: Floats) -> Floats:
-        """T_base_flange, shape (..., 4, 4), mm, of true configurations (..., 6), rad."""
-
-    def settle(self, q_command: Floats, q_before: Floats, rng: np.random.Generator) -> Floats:
-        """Joints at rest, shape (6,), rad, after those of the arrival before."""
-
-
-class WorkcellTruth(NamedTuple):
-    """The ground truth of one workcell: whoever calibrates must not look in here."""
-
-    probe_arm: MovingArm
-    needle_arm: MovingArm
-    X: Floats
-    """T_end1_image, shape (4, 4), mm."""
-    Y: Floats
-    """T_base1_base2, shape (4, 4), mm."""
-    tip_end2: Floats
-    """Shape (3,), mm."""
-    V: Floats
-    """The needle's direction in end2, shape (3,), unit."""
-
-    def image_pose(self, q_probe: Floats) -> Floats:
-        """The true T_base1_image, shape (4, 4), mm, of the probe's arm at rest at ``q_probe`` (6,), rad."""
-        return np.asarray(self.probe_arm.flange_pose(q_probe) @ self.X)
-
-    def needle_in_image(self, q_probe: Floats, q_needle: Floats) -> NeedleInImage:
-        """The true needle in the true image, both arms at rest."""
-        T = np.linalg.inv(self.image_pose(q_probe)) @ self.Y @ self.needle_arm.flange_pose(q_needle)
-        direction = T[:3, :3] @ self.V
-        return NeedleInImage(T[:3, :3] @ self.tip_end2 + T[:3, 3], direction / np.linalg.norm(direction))
-
-
-def jog_into_slice(
-    truth: WorkcellTruth, q_probe: Floats, q_needle: Floats, wanted: NeedleInImage, roll: float
-) -> Floats:
-    """Move the needle's arm until the true needle is in the true image as wanted.
-
-    It stands for the operator, or a servo on the image, that jogs until the needle shows: what is left is in
-    ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
-
-    Args:
-        truth: The ground truth.
-        q_probe: Where the probe's joints rest, shape (6,), rad.
-        q_needle: Where the needle's arm begins, shape (6,), rad.
-        wanted: The needle in the image, after the jog.
-        roll: About the needle, rad.
-
-    Returns:
-        What the arm is commanded, shape (6,), rad; NaN where no configuration reaches it.
-    """
-    nominal = truth.needle_arm.nominal
-    T_base2_image = (np.linalg.inv(truth.Y) @ truth.image_pose(q_probe))[None]
-    tip, along = wanted.tip_image[None], wanted.direction_image[None]
-    goal = needle_flange(T_base2_image, tip, along, np.array([roll]), truth.tip_end2, truth.V)[0]
-    command, q = goal, np.array(q_needle)
-    for _ in range(JOG_STEPS):
-        q = nearest_configuration(truth.needle_arm, command, q)
-        if np.isnan(q).any():
-            return q
-        command = flange_pose(nominal, q) @ np.linalg.inv(truth.needle_arm.flange_pose(q)) @ goal
-    return q
-
-
-def nearest_configuration(arm: MovingArm, T_base_flange: Floats, q_near: Floats) -> Floats:
-    """The nominal arm's configuration for a flange pose that is nearest to another, shape (6,), rad; NaN for none."""
-    q = nearest_within_limits(arm.nominal, inverse(arm.nominal, T_base_flange)[0], q_near)
-    away = np.linalg.norm(q - q_near, axis=1)
-    return np.array(q[int(np.argmin(np.where(np.isnan(away), np.inf, away)))])

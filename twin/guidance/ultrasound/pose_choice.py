@@ -22,6 +22,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about, frame_yz
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate, active_columns, parameter_units
@@ -29,7 +30,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, line
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import whitener
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.simulate import needle_orientations
 from puncture_twin.twin.guidance.ultrasound.two_arms import Touching, TwoArms, inside_phantom
 
 EDGE_MM = 6.0
@@ -182,6 +182,16 @@ def needle_flange(
     tip = np.einsum("nij,nj->ni", T_base2_image[:, :3, :3], tip_image) + T_base2_image[:, :3, 3]
     T[:, :3, 3] = tip - T[:, :3, :3] @ tip_end2
     return T
+
+
+def needle_orientations(along_image: Floats, direction_end2: Floats, roll: Floats) -> Floats:
+    """M, from end2 to image, that lays V along given unit vectors and turns the needle about itself; (n, 3, 3)."""
+    across = np.cross(along_image, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    image = frame_yz(across, along_image)
+    end2 = frame_about(direction_end2)
+    turn = exp_rotation(np.column_stack([np.zeros((len(roll), 2)), roll]))
+    return np.asarray(image @ turn @ end2.T)
 
 
 def configurations(model: UrModel, T_base_flange: Floats, q_home: Floats) -> list[Floats]:

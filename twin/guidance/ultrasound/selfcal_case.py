@@ -19,7 +19,7 @@ from puncture_twin.planning.case.toml_types import Length, Name, Number, Section
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleEcho
+from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEcho
 
 CASE_NAME = "selfcal.toml"
 """What a folder is searched for."""

@@ -8,31 +8,9 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, WorkcellTruth
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, expected_error_mm
-
-
-@dataclass(frozen=True, eq=False)
-class SelfcalTrial:
-    """One seed in the twin: workcell, recording, calibration, and the errors at targets.
-
-    Attributes:
-        seed: Of this trial.
-        truth: The ground truth.
-        acquisition: What was recorded.
-        calibration: What was found.
-        unseen_mm: Predicted minus true tip at poses that were not recorded, shape (k,).
-        punctures: One per target.
-    """
-
-    seed: int
-    truth: WorkcellTruth
-    acquisition: Acquisition
-    calibration: Calibration
-    unseen_mm: Floats
-    punctures: tuple[Puncture, ...]
+from puncture_twin.twin.guidance.ultrasound.puncture import expected_error_mm
 
 
 @dataclass(frozen=True)
@@ -103,7 +81,7 @@ def arms_summary(found: Calibration) -> dict[str, Any] | None:
 
 def predicted_tre(found: Calibration, recording: Recording) -> float:
     """Expected (rms) error at the recorded tips, mm: from the calibration, the declared arms, an image that errs."""
-    known = _rms(found.predicted_tre_mm(recording.P, recording.A)) if found.arms is None else None
+    known = rms(found.predicted_tre_mm(recording.P, recording.A)) if found.arms is None else None
     image_mm = found.image.rms_mm if found.image is not None and found.image.significant else 0.0
     return float(np.hypot(expected_error_mm(found, recording) if known is None else known, image_mm))
 
@@ -118,49 +96,6 @@ def choice_summary(choice: Choice) -> dict[str, Any]:
     }
 
 
-def trial_summary(trial: SelfcalTrial) -> dict[str, Any]:
-    """One seed as plain values, mm and degrees."""
-    found, truth, errors = trial.calibration, trial.truth, trial.acquisition.detection_errors()
-    return {
-        "seed": trial.seed,
-        "residual_rms_mm": found.rms_mm,
-        "predicted_tre_mm": predicted_tre(found, trial.acquisition.recording),
-        "held_out_error_rms_mm": _rms(trial.unseen_mm),
-        "X_error_mm": float(np.linalg.norm(found.X[:3, 3] - truth.X[:3, 3])),
-        "Y_error_mm": float(np.linalg.norm(found.Y[:3, 3] - truth.Y[:3, 3])),
-        "tip_error_mm": float(np.linalg.norm(found.tip_end2 - truth.tip_end2)),
-        "needle_direction_error_deg": _angle_deg(found.needle_direction_end2, truth.V),
-        "detected_tip_along_mm": [float(np.mean(errors[:, 0])), float(np.std(errors[:, 0]))],
-        "detected_tip_across_mm": [float(np.mean(errors[:, 1])), float(np.std(errors[:, 1]))],
-        "detected_angle_deg": np.degrees([np.mean(errors[:, 2]), np.std(errors[:, 2])]).tolist(),
-        "missed": trial.acquisition.missed,
-        "set_aside": list(found.outliers),
-        "true_contacts": sum(shot.touched for shot in (*trial.acquisition.shots, *trial.acquisition.missed_shots)),
-        "punctures": puncture_summary(trial.punctures),
-    }
-
-
-def puncture_summary(reached: tuple[Puncture, ...]) -> dict[str, Any] | None:
-    """Errors at the targets, mm; None without any."""
-    if not reached:
-        return None
-    errors = np.array([one.error_mm for one in reached])
-    return {
-        "targets": len(reached),
-        "error_rms_mm": _rms(errors),
-        "error_median_mm": float(np.median(errors)),
-        "error_worst_mm": float(errors.max()),
-        "lateral_rms_mm": _rms(np.array([one.lateral_mm for one in reached])),
-        "depth_mean_mm": float(np.mean([one.depth_mm for one in reached])),
-        "depth_rms_mm": _rms(np.array([one.depth_mm for one in reached])),
-        "predicted_rms_mm": _rms(np.array([one.predicted_mm for one in reached])),
-        "predicted_with_reading_rms_mm": _rms(np.array([one.expected_mm for one in reached])),
-    }
-
-
-def _rms(values: Floats) -> float:
+def rms(values: Floats) -> float:
+    """Root mean square of any shape; NaN of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
-
-
-def _angle_deg(a: Floats, b: Floats) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

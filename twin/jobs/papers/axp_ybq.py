@@ -23,9 +23,9 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate,
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import mean_direction, tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
-from puncture_twin.twin.guidance.ultrasound.simulate import SPEC_NOISE, SimulatedTruth, simulate_recording
+from puncture_twin.twin.plant.simulated_recording import SimulatedTruth, simulate_recording
 from puncture_twin.twin.report.present import Field, Section, grid, text
 
 SEED = 20230816

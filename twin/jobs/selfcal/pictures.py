@@ -19,13 +19,12 @@ from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeShot
+from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager, NeedleInImage
-from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, puncture_image
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.summaries import SelfcalTrial
 from puncture_twin.twin.guidance.ultrasound.two_arms import head_pose, needle_tool, phantom_mesh, probe_tool, table_box
+from puncture_twin.twin.plant.bmode_image import NeedleInImage
+from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, SelfcalTrial, puncture_image
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.annotate import write, write_image
 from puncture_twin.twin.report.figures import cross, figure_of, ring, write_png
@@ -94,22 +93,23 @@ def detection_sheet(case: SelfcalCase, trial: SelfcalTrial, path: Path) -> Path:
 
 def _recorded_panels(trial: SelfcalTrial) -> list[Panel]:
     taken = trial.acquisition
-    errors = np.linalg.norm(taken.detection_errors()[:, :2], axis=1)
+    errors = np.linalg.norm(trial.detection_errors()[:, :2], axis=1)
     order = np.argsort(errors)
     chosen = [(order[0], "best detection"), (order[len(order) // 2], "median"), (order[-1], "worst")]
-    panels = [_shot_panel(taken, int(i), f"{what}: tip {errors[i]:.2f} mm off") for i, what in chosen]
+    panels = [_shot_panel(trial, int(i), f"{what}: tip {errors[i]:.2f} mm off") for i, what in chosen]
     if taken.missed_shots:
         shot = taken.missed_shots[0]
-        panels.append(Panel(shot.image, "not used", str(shot.found), None, shot.true_needle))
+        panels.append(Panel(shot.image, "not used", str(shot.found), None, trial.shown[shot.number].needle))
     return panels
 
 
-def _shot_panel(taken: Acquisition, index: int, title: str) -> Panel:
-    shot: ProbeShot = taken.shots[index]
+def _shot_panel(trial: SelfcalTrial, index: int, title: str) -> Panel:
+    shot = trial.acquisition.shots[index]
+    needle = trial.shown[shot.number].needle
     assert isinstance(shot.found, Detection)  # only those are kept as shots
-    steep = np.degrees(np.arcsin(abs(shot.true_needle.direction_image[1])))
-    text = f"insertion {steep:.0f}°, off the plane {shot.true_needle.tip_image[2]:+.2f} mm"
-    return Panel(shot.image, title, text.replace("-", "−"), shot.found, shot.true_needle)
+    steep = np.degrees(np.arcsin(abs(needle.direction_image[1])))
+    text = f"insertion {steep:.0f}°, off the plane {needle.tip_image[2]:+.2f} mm"
+    return Panel(shot.image, title, text.replace("-", "−"), shot.found, needle)
 
 
 def _puncture_panels(case: SelfcalCase, trial: SelfcalTrial, rng: np.random.Generator) -> list[Panel]:

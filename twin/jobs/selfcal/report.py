@@ -14,14 +14,9 @@ from matplotlib.figure import Figure
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.puncture import Puncture
-from puncture_twin.twin.guidance.ultrasound.summaries import (
-    calibration_summary,
-    choice_summary,
-    puncture_summary,
-    trial_summary,
-)
+from puncture_twin.twin.guidance.ultrasound.summaries import calibration_summary, choice_summary
 from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
+from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, puncture_summary, trial_summary
 from puncture_twin.twin.report.figures import png
 from puncture_twin.twin.report.page.template import Card
 from puncture_twin.twin.report.present import (

@@ -8,29 +8,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import read_input, unfinished_warnings
 from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.planning.base.provenance import Input, content_input
-from puncture_twin.planning.geometry.rigid import exp_rotation
-from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, WorkcellTruth, acquire, choice_noise
+from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, choice_noise
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, drawing, expected_tre_mm, find_candidates
-from puncture_twin.twin.guidance.ultrasound.puncture import Puncture, punctures, unseen_errors_mm
 from puncture_twin.twin.guidance.ultrasound.recording_file import MAX_BYTES, parse_recording, recording_file
-from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.slips import calibrate_case, checked_calibration
-from puncture_twin.twin.guidance.ultrasound.summaries import Choice, SelfcalTrial
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
+from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
+from puncture_twin.twin.guidance.ultrasound.summaries import Choice
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
-from puncture_twin.twin.plant.truth import ArmErrors, draw_true_arm
-
-TARGETS = 6
-"""Punctures per seed."""
-
-UNSEEN = 60
-"""Candidates per seed at which prediction and truth are compared."""
+from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, SelfcalTrial, run_trial
 
 NO_JOINTS = "{file}: no joints (columns A_q1_deg to B_q6_deg): the arms' errors that the case declares are not counted"
 
@@ -92,7 +82,7 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
         candidates = find_candidates(case, workcell, np.random.default_rng(case.content.seed))
     trials = []
     for seed in range(case.content.seed, case.content.seed + seeds):
-        trials.append(_trial(case, workcell, candidates, seed, stages, watcher))
+        trials.append(run_trial(case, workcell, candidates, seed, stages, watcher))
     with stages.time("comparison with random choice"):
         choice = compare_choice(case, candidates, trials[0].acquisition)
     first = trials[0]
@@ -131,29 +121,6 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings)
 
 
-def _trial(
-    case: SelfcalCase, workcell: TwoArms, candidates: CandidatePoses, seed: int, stages: Stages, watcher: Watcher
-) -> SelfcalTrial:
-    rng = np.random.default_rng(seed)
-    truth = draw_workcell(case, rng)
-    with stages.time("recording"):
-        taken = acquire(
-            case,
-            workcell,
-            candidates,
-            truth,
-            rng,
-            lambda done, total: watcher.count(f"seed {seed}: pictures", done, total),
-        )
-    with stages.time("calibrate"):
-        calibration = calibrate_case(taken.recording, case)
-    others = rng.permutation(taken.left)
-    with stages.time("puncture"):
-        unseen = unseen_errors_mm(candidates, others[:UNSEEN], truth, calibration, rng)
-        reached = punctures(case, workcell, candidates, others[:TARGETS], truth, calibration, rng)
-    return SelfcalTrial(seed, truth, taken, calibration, unseen, reached)
-
-
 def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisition) -> Choice:
     """The expected error of the poses that were recorded, and of random choices of as many."""
     noise, belief, poses = choice_noise(case), drawing(case), candidates.poses
@@ -165,29 +132,3 @@ def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisi
 
     sets = [rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS)]
     return Choice(expected(rows), tuple(expected(some) for some in sets))
-
-
-def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
-    """A room whose differences from the drawing are drawn from the case's standard deviations."""
-    content, off = case.content, case.content.truth
-    arms = [
-        draw_true_arm(model, _spread(arm.errors), rng)
-        for model, arm in zip(case.models, (content.probe_arm, content.needle_arm), strict=True)
-    ]
-    X, Y = (_shifted(T, off.mount_mm, np.radians(off.mount_deg), rng) for T in (case.T_end1_image, case.T_base1_base2))
-    V = np.array([0.0, 0.0, 1.0])
-    tip = case.tip_end2 + [*rng.normal(0.0, off.tip_mm, 2), rng.normal(0.0, off.length_mm)]
-    bent = V + tangent_basis(V) @ rng.normal(0.0, np.radians(off.needle_deg), 2)
-    return WorkcellTruth(arms[0], arms[1], X, Y, tip, bent / np.linalg.norm(bent))
-
-
-def _spread(stated: ErrorsSection) -> ArmErrors:
-    angles = np.radians([stated.twist_deg, stated.joint_deg, stated.backlash_deg, stated.repeatability_deg])
-    return ArmErrors(stated.link_mm, *(float(angle) for angle in angles))
-
-
-def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floats:
-    moved = np.array(T)
-    moved[:3, 3] += rng.normal(0.0, mm, 3)
-    moved[:3, :3] = T[:3, :3] @ exp_rotation(rng.normal(0.0, rad, 3))
-    return moved

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
-from puncture_twin.twin.guidance.stereo.session import Session
 from puncture_twin.twin.jobs.servo import liu2007
 from puncture_twin.twin.jobs.servo.liu2007 import finished_sessions
 from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence
@@ -21,6 +20,7 @@ from puncture_twin.twin.jobs.servo.report import (
     servo_text,
     write_servo_page,
 )
+from puncture_twin.twin.rehearsal.stereo_session import Session
 
 NAMES = ("servo.html", "convergence.png", "camera_1.png", "camera_2.png")
 

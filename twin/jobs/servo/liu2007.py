@@ -17,9 +17,9 @@ import numpy as np
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.twin.guidance.stereo.experiment import ServoTrial, Statistics, run_trials, statistics, trial
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
-from puncture_twin.twin.guidance.stereo.session import Session, run_session
+from puncture_twin.twin.rehearsal.stereo_session import Session, run_session
+from puncture_twin.twin.rehearsal.stereo_trials import ServoTrial, Statistics, run_trials, statistics, trial
 
 TABLE_1 = (0.33, 0.31, 0.19, 0.27, 0.21, 0.26, 0.34, 0.33, 0.38, 0.35)
 """Error of the stereo at ten points."""

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.twin.guidance.stereo.ball.ball_image import render
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.detection import LocatedPair, ball_scene
-from puncture_twin.twin.guidance.stereo.session import Reached, Session
+from puncture_twin.twin.plant.ball_image import render
+from puncture_twin.twin.plant.stereo_workcell import ShownBall, ball_scene
+from puncture_twin.twin.rehearsal.stereo_session import Reached, Session
 from puncture_twin.twin.report.annotate import INK
 from puncture_twin.twin.report.figures import cross, figure_of, halo, picture_axes, ring, write_png
 from puncture_twin.twin.world.workcell import load_ball, open_workcell, pinhole_picture
@@ -59,7 +59,7 @@ def _workcell_picture(session: Session, reached: Reached, camera: Camera) -> NDA
     with open_workcell(
         workcell.model, tool, workcell.case.skin, T_base_c @ workcell.T_c_m, boxes, down_ct=DOWN
     ) as simulated:
-        simulated.arm.place(reached.servoed.q_true)
+        simulated.arm.place(reached.q_true)
         flange = simulated.arm.flange_pose()
         load_ball(simulated.client, flange[:3, 3] + file.tool.rod_mm * flange[:3, 2], file.tool.ball_diameter_mm / 2,
                   (0.95, 0.5, 0.1, 1.0))  # fmt: skip
@@ -100,8 +100,8 @@ def _inset(axes: Axes, session: Session, reached: Reached, number: int) -> None:
     workcell, tool = session.workcell, session.workcell.case.file.tool
     camera, believed = workcell.cameras[number], session.calibration.cameras[number]
     seen, plan = reached.servoed.visits[-1].seen.ball_c, workcell.case.file.cameras
-    q_true, rng = reached.servoed.q_true, np.random.default_rng(session.seed)
-    ball = LocatedPair(workcell.ball_c(q_true), tool.ball_diameter_mm / 2, workcell.rod_c(q_true))
+    q_true, rng = reached.q_true, np.random.default_rng(session.seed)
+    ball = ShownBall(workcell.ball_c(q_true), tool.ball_diameter_mm / 2, workcell.rod_c(q_true))
     half = round(INSET_HALF_PX * camera.width / WIDTH_PX)
     grey = render(
         camera, ball_scene(plan, ball, 0.0, rng), rng=rng, noise=plan.noise_grey, blur_px=plan.blur_px, half_px=half
@@ -127,7 +127,10 @@ def draw_convergence(session: Session, path: Path) -> None:
         visits = one.servoed.visits
         if not visits:
             continue
-        true = [np.linalg.norm(session.workcell.ball_c(v.q_true) - v.seen.target_c) for v in visits]
+        true = [
+            np.linalg.norm(session.workcell.ball_c(q) - visit.seen.target_c)
+            for q, visit in zip(one.rests, visits, strict=True)
+        ]
         looks = np.arange(len(visits))
         longest = max(longest, len(visits) - 1)
         (line,) = axes.plot(looks, true, "-", linewidth=1.2, label=one.target)

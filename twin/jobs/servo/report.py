@@ -12,14 +12,6 @@ from typing import Any, NamedTuple
 
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
-from puncture_twin.twin.guidance.stereo.experiment import (
-    ServoTrial,
-    Statistics,
-    TargetRow,
-    declaration_test,
-    needle_statistics,
-)
-from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleOutcome
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.jobs.servo.liu2007 import (
     TABLE_1,
@@ -28,6 +20,14 @@ from puncture_twin.twin.jobs.servo.liu2007 import (
     paper_columns,
     paper_gain_mm,
     paper_servo_only_at_least,
+)
+from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome
+from puncture_twin.twin.rehearsal.stereo_trials import (
+    ServoTrial,
+    Statistics,
+    TargetRow,
+    declaration_test,
+    needle_statistics,
 )
 from puncture_twin.twin.report.page.template import Card
 from puncture_twin.twin.report.present import (

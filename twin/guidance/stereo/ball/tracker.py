@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.twin.devices import GreyImage
 from puncture_twin.twin.guidance.stereo.ball.ball_edges import (
     Circle,
     Edges,
@@ -27,7 +28,6 @@ from puncture_twin.twin.guidance.stereo.ball.ball_edges import (
     refit,
     visible_fraction,
 )
-from puncture_twin.twin.guidance.stereo.ball.ball_image import GreyImage
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
 
 Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low_contrast"]

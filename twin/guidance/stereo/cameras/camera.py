@@ -270,8 +270,8 @@ def undistort(points: Floats, coefficients: Floats) -> Floats:
             break
     r2 = np.sum(found**2, axis=-1)
     with np.errstate(invalid="ignore"):
-        true = (np.max(np.abs(step), axis=-1) <= 100 * CONVERGED) & (r2 < fold(coefficients) ** 2)
-    return np.where(true[..., None], found, np.nan)
+        unique = (np.max(np.abs(step), axis=-1) <= 100 * CONVERGED) & (r2 < fold(coefficients) ** 2)
+    return np.where(unique[..., None], found, np.nan)
 
 
 def fold(coefficients: Floats) -> float:

@@ -214,17 +214,17 @@ class Calibration:
         tip, V = self.tip_end2, self.needle_direction_end2
         return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], tip, self.scale, V)
 
-    def parameter_error(self, truth: Estimate) -> Floats:
-        """Truth minus estimate in the order of ``parameters``, shape (p,): the step that leads to the truth."""
+    def parameter_error(self, other: Estimate) -> Floats:
+        """Another estimate minus this one in the order of ``parameters``, shape (p,): the step that leads there."""
         own = self.estimate
         parts = [
-            log_rotation(own.R_X.T @ truth.R_X),
-            truth.t_X - own.t_X,
-            log_rotation(own.R_Y.T @ truth.R_Y),
-            truth.t_Y - own.t_Y,
-            truth.t_Q - own.t_Q,
-            truth.scale - own.scale,
-            tangent_basis(own.V).T @ truth.V,
+            log_rotation(own.R_X.T @ other.R_X),
+            other.t_X - own.t_X,
+            log_rotation(own.R_Y.T @ other.R_Y),
+            other.t_Y - own.t_Y,
+            other.t_Q - own.t_Q,
+            other.scale - own.scale,
+            tangent_basis(own.V).T @ other.V,
         ]
         return np.concatenate(parts)[[PARAMETERS.index(name) for name in self.parameters]]
 

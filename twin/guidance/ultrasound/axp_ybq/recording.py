@@ -47,6 +47,10 @@ class Noise(NamedTuple):
     """How far the tip lies off the slice and still shows."""
 
 
+SPEC_NOISE = Noise(robot_mm=0.1, robot_rad=np.radians(0.03), image_mm=0.3, direction_rad=np.radians(0.5))
+"""The noise of spec 3, section 4; it gives none for the direction: half a degree, ten times its detector's spread."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """Poses of both arms with the needle seen in the image. Checked when made; the arrays are read-only.

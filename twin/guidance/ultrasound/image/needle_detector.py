@@ -27,7 +27,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.twin.guidance.ultrasound.image.probe_image import Imager
+from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
 
 
 class Segment(NamedTuple):

@@ -19,6 +19,7 @@ from scipy.optimize import brentq
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.twin.devices import GreyImage
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, distortion_slope, tangent_axes, undistort
 
 CELLS = 4
@@ -70,15 +71,6 @@ class BallScene:
     occluder_grey: float = 100.0
     ball: bool = True
     rod: bool = True
-
-
-class GreyImage(NamedTuple):
-    """A grey image, or a part of one."""
-
-    grey: NDArray[np.uint8]
-    """Shape (h, w)."""
-    offset: tuple[int, int] = (0, 0)
-    """Column and row, in the camera's image, of the part's first pixel."""
 
 
 class _Layer(NamedTuple):

@@ -7,11 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about, frame_yz, pose
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-
-SPEC_NOISE = Noise(robot_mm=0.1, robot_rad=np.radians(0.03), image_mm=0.3, direction_rad=np.radians(0.5))
-"""The noise of spec 3, section 4; it gives none for the direction: half a degree, ten times its detector's spread."""
+from puncture_twin.planning.geometry.rigid import exp_rotation, pose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_orientations
 
 
 class PoseRanges(NamedTuple):
@@ -121,16 +119,6 @@ def exact_recording(truth: SimulatedTruth, A: Floats, seen: ImagePose) -> Record
     B[:, :3, :3] = truth.Y[:3, :3].T @ R_AX @ M
     B[:, :3, 3] = (tip_base1 - truth.Y[:3, 3]) @ truth.Y[:3, :3] - B[:, :3, :3] @ truth.tip_end2
     return Recording(A, B, seen.tip_mm, shown)
-
-
-def needle_orientations(along_image: Floats, direction_end2: Floats, roll: Floats) -> Floats:
-    """M, from end2 to image, that lays V along given unit vectors and turns the needle about itself; (n, 3, 3)."""
-    across = np.cross(along_image, [0.0, 0.0, 1.0])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    image = frame_yz(across, along_image)
-    end2 = frame_about(direction_end2)
-    turn = exp_rotation(np.column_stack([np.zeros((len(roll), 2)), roll]))
-    return np.asarray(image @ turn @ end2.T)
 
 
 def with_noise(rng: np.random.Generator, exact: Recording, noise: Noise) -> Recording:

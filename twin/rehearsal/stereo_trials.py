@@ -13,11 +13,10 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.collision.state_checker import StateChecker
-from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleOutcome
+from puncture_twin.twin.guidance.stereo.planned import workcell_checker
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop
-from puncture_twin.twin.guidance.stereo.session import Session, run_session
-from puncture_twin.twin.guidance.stereo.stereo_workcell import workcell_checker
+from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome, Session, run_session
 
 BATCH = 5
 """Seeds that a process takes at a time; they share the checker of the empty workcell."""

@@ -1,7 +1,6 @@
 """The ground truth of a stereo workcell: an arm off its nominal model, two cameras, a head; drawn once for each seed.
 
-Two frames matter to the guidance: the base's, in which the arm is commanded, and C, which the measuring arm defines at
-the calibration and in which the cameras are known. How C lies in the base is not given to the guidance.
+`StereoPlant` answers as its devices do; frames are those of `twin.guidance.stereo.planned`.
 """
 
 from __future__ import annotations
@@ -11,23 +10,51 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply, exp_rotation, frame_yz, pose, rotated_about
-from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, stereo_pair, tangent_axes
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotated_about
+from puncture_twin.twin.devices import GreyImage
+from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
 from puncture_twin.twin.guidance.stereo.declared_errors import CameraErrors
-from puncture_twin.twin.guidance.stereo.joint.needle_error import TrueNeedle
-from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, ToolSection
+from puncture_twin.twin.guidance.stereo.planned import calibration_frame, head_pose, planned_cameras
+from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection, ServoCase
+from puncture_twin.twin.plant.ball_image import BallScene, render
 from puncture_twin.twin.plant.truth import ArmErrors, TrueArm, draw_true_arm
 
 LINE_OF_SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
 """Where on the ball's disc a line of sight ends: fraction of the radius, and how many around."""
+
+
+DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
+"""Fraction of diffuse light; the rest is from one direction."""
+
+WINDOW_MARGIN_PX = 24
+"""An image, and the rod in it, are drawn this far beyond the region that is queried: the rest is never looked at."""
+
+POINTED_MM = 3.0
+"""Deviation of an operator's pointing at a marker in the images, per axis."""
+
+
+class TrueNeedle(NamedTuple):
+    """The true needle against the anatomy, image axes."""
+
+    error_m: Floats
+    """Shape (3,), mm: true tip minus true target."""
+    R_m_needle: Floats
+    """Shape (3, 3): its axes as columns, z to the tip."""
+
+
+class ShownBall(NamedTuple):
+    """A true ball or marker, C, mm."""
+
+    center_c: Floats
+    """Shape (3,)."""
+    radius_mm: float
+    rod_c: Floats | None
+    """Shape (3,): along the rod; None for a marker, which has none."""
 
 
 class TrueTool(NamedTuple):
@@ -43,7 +70,7 @@ class TrueTool(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StereoWorkcell:
-    """The ground truth of one workcell. Guidance must not look in here.
+    """The ground truth of one workcell.
 
     Attributes:
         case: What it was drawn from.
@@ -142,6 +169,97 @@ class StereoWorkcell:
         return TriangleMesh(self.head_c.vertices, self.head_c.faces[near]) if near.any() else None
 
 
+class StereoPlant:
+    """A workcell in time: where the arm is, whether the head is there; it answers as arm, cameras and touch do.
+
+    Args:
+        workcell: The ground truth.
+        pictures: Draws what differs from image to image.
+        arm: Draws the arm's repeatability, and the measuring arm's readings.
+        operator: Draws where the operator points.
+    """
+
+    def __init__(
+        self,
+        workcell: StereoWorkcell,
+        pictures: np.random.Generator,
+        arm: np.random.Generator,
+        operator: np.random.Generator,
+    ) -> None:
+        self.workcell = workcell
+        self.rests: list[Floats] = []
+        """True joints after each move, (6,), rad."""
+        self.pictures = pictures
+        self._arm, self._operator = arm, operator
+        self._head_there = False
+        self._shown: ShownBall | None = None
+
+    def bring_head(self) -> None:
+        """From here on the head is in the workcell."""
+        self._head_there = True
+
+    def show(self, ball: ShownBall | None) -> None:
+        """Show a ball in place of the arm's; None shows the arm's again."""
+        self._shown = ball
+
+    def move_jp(self, q: Floats) -> None:
+        """Move the arm to joints (6,), rad: its gears stop short, its joints miss."""
+        before = self.rests[-1] if self.rests else q
+        self.rests.append(self.workcell.arm.settle(q, before, self._arm))
+
+    @property
+    def ball(self) -> ShownBall:
+        """The ball on the arm, or what is shown in its place."""
+        if self._shown is not None:
+            return self._shown
+        q, radius_mm = self.rests[-1], self.workcell.case.file.tool.ball_diameter_mm / 2
+        return ShownBall(self.workcell.ball_c(q), radius_mm, self.workcell.rod_c(q))
+
+    def nearest(self, number: int, about_px: Floats) -> ShownBall:
+        """Of all that a camera may see, the ball or marker that is nearest to a pixel (2,)."""
+        head, balls = self.workcell.case.file.head, [self.ball]
+        if self._head_there:
+            balls += [ShownBall(one, head.marker_diameter_mm / 2, None) for one in self.workcell.markers_c]
+        away = [np.linalg.norm(self.workcell.cameras[number].project(one.center_c) - about_px) for one in balls]
+        return balls[int(np.argmin(np.nan_to_num(away, nan=np.inf)))]
+
+    def measured_image(self, number: int, about_px: Floats, reach_px: float) -> GreyImage:
+        """An image with noise, of the part that holds what is queried and the ball; what the head hides is hidden."""
+        camera, plan = self.workcell.cameras[number], self.workcell.case.file.cameras
+        ball = self.nearest(number, about_px)
+        hidden = self.workcell.hidden_fraction(camera, ball.center_c, ball.radius_mm) if self._head_there else 0.0
+        away = np.abs(camera.project(ball.center_c) - about_px).max()
+        radius = camera.ball_radius_px(ball.center_c, ball.radius_mm)
+        half = int(np.ceil(np.nan_to_num(away, nan=0.0) + reach_px + 2 * radius)) + WINDOW_MARGIN_PX
+        rng = self.pictures
+        scene = replace(ball_scene(plan, ball, hidden, rng), rod_length_mm=half * ball.radius_mm / radius)
+        return render(camera, scene, rng=rng, noise=plan.noise_grey, blur_px=plan.blur_px, half_px=half)
+
+    def measured_cp(self) -> Floats:
+        """The measuring arm's reading of the ball's centre, shape (3,), mm, C."""
+        sigma = self.workcell.case.truth_errors.measuring_mm
+        return np.asarray(self.ball.center_c + self._arm.normal(0.0, sigma, 3))
+
+    def pointed_cp(self, marker: str) -> Floats:
+        """Where an operator points for a marker, shape (3,), mm, C."""
+        point = self.workcell.markers_c[self.workcell.case.markers.names.index(marker)]
+        return np.asarray(point + self._operator.normal(0.0, POINTED_MM, 3))
+
+
+def ball_scene(plan: CamerasSection, ball: ShownBall, hidden: float, rng: np.random.Generator) -> BallScene:
+    """The scene of a ball; an occluder that the case demands comes from any side."""
+    fraction = min(max(plan.occlusion if ball.rod_c is not None else 0.0, hidden), 0.99)
+    return BallScene(
+        ball.center_c,
+        radius_mm=ball.radius_mm,
+        rod_c=(0.0, -1.0, 0.0) if ball.rod_c is None else ball.rod_c,
+        rod=ball.rod_c is not None,
+        diffuse=DIFFUSE[plan.light],
+        hidden_fraction=fraction,
+        hidden_from=float(rng.uniform(-np.pi, np.pi)),
+    )
+
+
 def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
     """A workcell with its errors drawn from what the case declares, or from what it states as its truth.
 
@@ -166,12 +284,6 @@ def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
     return StereoWorkcell(case, arm, T_c_base, cameras, T_c_m, after, tool)
 
 
-def planned_cameras(case: ServoCase) -> tuple[Camera, ...]:
-    """The cameras as the case plans them; only a calibration tells where they are."""
-    plan = case.file.cameras
-    return stereo_pair(*plan.size_px, plan.focal_px, plan.baseline_mm, plan.distance_mm, plan.distortion)
-
-
 def _misplaced(camera: Camera, errors: CameraErrors, rng: np.random.Generator) -> Camera:
     """A camera as it is in truth: rotated, shifted, its lens off its focal length and axis."""
     T = pose(exp_rotation(rng.normal(0.0, errors.turn, 3)), rng.normal(0.0, errors.shift_mm, 3))
@@ -182,40 +294,3 @@ def _misplaced(camera: Camera, errors: CameraErrors, rng: np.random.Generator) -
 
 def _with_other_lens(camera: Camera, errors: CameraErrors, rng: np.random.Generator) -> Camera:
     return replace(camera, distortion=camera.distortion + rng.normal(0.0, errors.lens))
-
-
-def calibration_frame(case: ServoCase) -> Floats:
-    """T_base_c, shape (4, 4), mm: C at the calibrated volume's middle, z along the cameras' view, y down.
-
-    The cameras stand on the far side of the head, seen from the arm, and look back and down at it.
-    """
-    down = np.radians(case.file.cameras.elevation_deg)
-    z, y = np.array([-np.cos(down), 0.0, -np.sin(down)]), np.array([np.sin(down), 0.0, -np.cos(down)])
-    return pose(frame_yz(y, z), case.file.calibration.center_mm)
-
-
-def head_pose(case: ServoCase) -> Floats:
-    """T_base_m, shape (4, 4), mm: the head's z up, its face (-y) along the base's x at yaw 0."""
-    head = case.file.head
-    return pose(Rotation.from_euler("z", 90.0 + head.yaw_deg, degrees=True).as_matrix(), head.position_mm)
-
-
-def rod_tool(tool: ToolSection) -> Tool:
-    """Rod and holder for the collision checker; the rod as thick as its ball, and up to the ball's far side."""
-    length = tool.rod_mm + tool.ball_diameter_mm / 2
-    return Tool(length, length - tool.holder_mm, tool.ball_diameter_mm, tool.holder_diameter_mm)
-
-
-def workcell_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
-    """The planner's collision checker of the workcell.
-
-    Args:
-        case: The case.
-        T_base_m: Where the head is believed to stand, shape (4, 4), mm; None for a workcell without it.
-    """
-    boxes = []
-    for box in case.file.box:
-        boxes.append(Box(box.name, pose(np.eye(3), box.center_mm), box.size_mm))
-    skin = None if T_base_m is None else case.skin.transformed(T_base_m)
-    model, padding = case.model, case.file.servo.padding_mm
-    return FastChecker(model, rod_tool(case.file.tool), boxes, skin, padding_mm=padding)

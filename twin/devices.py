@@ -1,0 +1,81 @@
+"""The devices that guidance speaks to: commands in, readings out, named as the CRTK convention names them.
+
+``jp`` are joint positions, ``cp`` is a place in space; `measured` is what a device reads, `move` ends at rest. Nothing
+here holds a true pose or an error that was drawn: the simulated plant answers like this, and so can real devices.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.arrays import Floats, Pixels
+
+
+class GreyImage(NamedTuple):
+    """A grey image, or a part of one."""
+
+    grey: NDArray[np.uint8]
+    """Shape (h, w)."""
+    offset: tuple[int, int] = (0, 0)
+    """Column and row, in the camera's image, of the part's first pixel."""
+
+
+class Arm(Protocol):
+    """An arm under position control."""
+
+    def move_jp(self, q: Floats) -> None:
+        """Move to joints (6,), rad, and return when they are at rest."""
+
+
+class Cameras(Protocol):
+    """Cameras that are read one at a time."""
+
+    def measured_image(self, number: int, about_px: Floats, reach_px: float) -> GreyImage:
+        """A new image.
+
+        Args:
+            number: Of the camera, from 0.
+            about_px: Shape (2,), a pixel; the image shows at least what is within reach of it.
+            reach_px: How far.
+        """
+
+
+class MeasuringArm(Protocol):
+    """A coordinate measuring arm that touches the ball on the tool."""
+
+    def measured_cp(self) -> Floats:
+        """The ball's centre, shape (3,), mm, in the measuring arm's own frame."""
+
+
+class Operator(Protocol):
+    """A person who points at a marker in the images of both cameras."""
+
+    def pointed_cp(self, marker: str) -> Floats:
+        """Where the marker is, roughly, shape (3,), mm, in the measuring arm's frame."""
+
+
+class Probe(Protocol):
+    """An ultrasound probe."""
+
+    def measured_image(self) -> Pixels:
+        """A new B-mode image, grey levels, shape (rows, columns)."""
+
+
+class JogOperator(Protocol):
+    """A person who jogs the needle's arm until the needle shows in the image, or a servo that does."""
+
+    def jogged_jp(self, tip_mm: Floats, direction: Floats, roll: float, q: Floats) -> Floats:
+        """Joints at which the needle shows as wished.
+
+        Args:
+            tip_mm: Shape (2,), where its tip is wished in the image.
+            direction: Shape (2,), unit, along it toward the tip, in the image.
+            roll: Of the needle about itself, rad.
+            q: Shape (6,), rad, from where it is jogged.
+
+        Returns:
+            Shape (6,), rad, not moved to yet; NaN out of reach.
+        """

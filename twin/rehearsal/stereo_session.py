@@ -1,0 +1,270 @@
+"""A whole stereo session in the twin: guidance by its devices, and beside each step what is true of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.geometry.rigid import apply, log_rotation
+from puncture_twin.twin.guidance.stereo.detection import Detector, image_detector, in_space, look_at, searches_of
+from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide, Known
+from puncture_twin.twin.guidance.stereo.joint.needle_error import REGION, NeedleError
+from puncture_twin.twin.guidance.stereo.planned import carried_rod, grid_points, workcell_checker
+from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, calibrate_by_robot
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
+from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ServoStop
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed
+from puncture_twin.twin.guidance.stereo.session import Aims, ImageReading, aims_of, map_markers, see_markers
+from puncture_twin.twin.plant.stereo_workcell import ShownBall, StereoPlant, StereoWorkcell, TrueNeedle, draw_workcell
+
+TEST_POINTS = 10
+"""Points at which the stereo is tried, as in the paper's Table 1."""
+
+DetectorOf = Callable[[StereoPlant], Detector]
+"""Makes the detector of a plant."""
+
+
+LEAST_VARIANCE = 1e-12
+"""mm^2 and rad^2, added to every axis where a covariance is inverted: what cannot err must not divide by zero."""
+
+
+class NeedleOutcome(NamedTuple):
+    """Prediction and truth of one needle; mm and degrees."""
+
+    predicted_rms_mm: float
+    """Expected (rms) distance of tip and target."""
+    offset_mm: float
+    """The part of it that is known: the tip believed, to the target."""
+    half_axes_mm: tuple[float, float, float]
+    """Half axes of the 95 % ellipsoid about the tip believed, longest first."""
+    lateral_mm: float
+    """Deviation across the needle."""
+    depth_mm: float
+    """Deviation along it."""
+    predicted_direction_deg: float
+    """Expected (rms) angle of the needle and where it is believed to point."""
+    p_hit: float | None
+    """Chance that the tip is within the case's radius; None where it states none."""
+    realised_mm: float
+    """True tip to true target."""
+    realised_direction_deg: float
+    square: float
+    """Squared size of the tip's error about what is believed, in deviations: chi-squared of 3."""
+    square_of_pose: float
+    """Squared size of the error of tip and rotation together: chi-squared of 6."""
+    hit: bool | None
+    """Whether the tip is within the radius."""
+
+    @property
+    def in_region(self) -> bool:
+        """Whether the 95 % ellipsoid holds the tip."""
+        return bool(self.square <= chdtri(3, 1 - REGION))
+
+
+def needle_outcome(believed: NeedleError, true: TrueNeedle, radius_mm: float | None) -> NeedleOutcome:
+    """Compare a predicted needle with the true one.
+
+    Args:
+        believed: As predicted.
+        true: As it came.
+        radius_mm: Within which of the target the tip hits, where a case states one.
+    """
+    realised = float(np.linalg.norm(true.error_m))
+    turn = log_rotation(true.R_m_needle @ believed.R_m_needle.T)
+    error = np.concatenate([true.error_m - believed.offset_m, turn])
+    covariance = believed.covariance + np.pad(believed.target_covariance, (0, 3))
+    cosine = true.R_m_needle[:, 2] @ believed.R_m_needle[:, 2]
+    longest, middle, shortest = (float(mm) for mm in believed.half_axes_mm)
+    return NeedleOutcome(
+        predicted_rms_mm=believed.rms_mm,
+        offset_mm=float(np.linalg.norm(believed.offset_m)),
+        half_axes_mm=(longest, middle, shortest),
+        lateral_mm=believed.lateral_mm,
+        depth_mm=believed.depth_mm,
+        predicted_direction_deg=float(np.degrees(believed.direction_rms)),
+        p_hit=None if radius_mm is None else believed.p_hit(radius_mm),
+        realised_mm=realised,
+        realised_direction_deg=float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
+        square=_square(error[:3], believed.tip_covariance),
+        square_of_pose=_square(error, covariance),
+        hit=None if radius_mm is None else realised < radius_mm,
+    )
+
+
+def _square(error: Floats, covariance: Floats) -> float:
+    return float(error @ np.linalg.solve(covariance + LEAST_VARIANCE * np.eye(len(error)), error))
+
+
+class Reached(NamedTuple):
+    """Errors at one target, measured in truth; mm."""
+
+    target: str
+    servoed: Servoed
+    mapping_mm: float
+    """Estimated target to true target."""
+    expected_tre_mm: float
+    """What the mapping expects of itself (rms)."""
+    before_mm: float
+    """True ball to true target where the robot alone brought it; the whole distance if it could not start."""
+    after_mm: float
+    """True ball to true target at the end."""
+    servo_only_mm: float
+    """True ball to estimated target at the end: what the servo answers for."""
+    rests: tuple[Floats, ...]
+    """True joints, (6,), rad, at each of the servo's visits."""
+    q_true: Floats
+    """Shape (6,), rad: true joints at the end."""
+    unseen: NeedleOutcome | None = None
+    """The needle where the robot alone brought it; None where it could not start, or nothing can be predicted."""
+    seen: NeedleOutcome | None = None
+    """The needle at the last look, if there was one."""
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the last look saw the ball within the tolerance."""
+        return self.servoed.stop is ServoStop.CONVERGED
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """Result of a session.
+
+    Attributes:
+        seed: What it was drawn from.
+        workcell: The truth.
+        calibration: Result of the robot's points.
+        mapping: What the markers gave.
+        stereo_mm: Shape (10,): error of the stereo at points of the calibrated volume.
+        reached: One for each target.
+        guide: The estimates of ball and target for the servo; knows everything that was measured.
+    """
+
+    seed: int
+    workcell: StereoWorkcell
+    calibration: RobotCalibration
+    mapping: Mapping
+    stereo_mm: Floats
+    reached: tuple[Reached, ...]
+    guide: Guide
+
+
+class _Parts(NamedTuple):
+    """Random generators, one for each part, so that one part's draws do not shift another's."""
+
+    workcell: np.random.Generator
+    pictures: np.random.Generator
+    arm: np.random.Generator
+    image: np.random.Generator
+    tests: np.random.Generator
+
+
+def run_session(
+    case: ServoCase,
+    seed: int,
+    *,
+    targets: tuple[str, ...] | None = None,
+    detector_of: DetectorOf | None = None,
+    empty: StateChecker | None = None,
+) -> Session:
+    """Run a whole session in a workcell drawn from a seed.
+
+    Args:
+        case: The case.
+        seed: Of all that is drawn.
+        targets: Only these; all when None.
+        detector_of: Makes the detector in place of images; for studies of what is behind them.
+        empty: Checker of the workcell without the head, where one is at hand.
+
+    Raises:
+        NoAnswerError: The calibration, the mapping or a start pose could not be done; says what blocked it.
+        InputError: The case contradicts itself.
+    """
+    parts = _Parts(*(np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(len(_Parts._fields))))
+    workcell = draw_workcell(case, parts.workcell)
+    plant = StereoPlant(workcell, parts.pictures, parts.arm, parts.tests)
+    hough_only = case.file.cameras.centre == "hough"
+    detector = image_detector(plant, hough_only=hough_only) if detector_of is None else detector_of(plant)
+    calibration = calibrate_by_robot(case, plant, plant, detector, empty or workcell_checker(case, None))
+    stereo_mm = _try_stereo(plant, calibration, detector, parts.tests)
+    reading = _read(case, parts.image)
+    plant.bring_head()
+    seen = see_markers(case, calibration, detector, plant)
+    mapping = map_markers(case, calibration, seen, reading)
+    joint = case.file.servo.estimate == "joint"
+    guide = (JointGuide if joint else Guide)(Known(case, calibration, mapping, seen, reading.markers_m, detector))
+    aims, reached = aims_of(case, calibration, mapping, reading.targets_m, targets), []
+    for row, number in enumerate(aims.numbers):
+        plant.move_jp(aims.q_hover[row])
+        guide.aim_at(reading.targets_m[number])
+        reached.append(_reach(plant, guide, aims, row))
+        plant.move_jp(aims.q_hover[row])
+    return Session(seed, workcell, calibration, mapping, stereo_mm, tuple(reached), guide)
+
+
+def _read(case: ServoCase, rng: np.random.Generator) -> ImageReading:
+    """Markers and targets as somebody reads them in the CT."""
+    truth = case.truth_errors
+    markers = case.markers.points + rng.normal(0.0, truth.marker_mm, case.markers.points.shape)
+    return ImageReading(markers, case.targets.points + rng.normal(0.0, truth.target_mm, case.targets.points.shape))
+
+
+def _try_stereo(
+    plant: StereoPlant, calibration: RobotCalibration, detector: Detector, rng: np.random.Generator
+) -> Floats:
+    """Error of the stereo at points anywhere in the calibrated volume, shape (10,), mm."""
+    case, errors = plant.workcell.case, []
+    T_c_base = np.asarray(np.linalg.inv(calibration.T_base_c), dtype=np.float64)
+    grid = grid_points(case)
+    rod_c = -T_c_base[:3, :3] @ carried_rod(case).R_base_flange[:, 2]
+    for point in rng.uniform(grid.min(axis=0), grid.max(axis=0), (TEST_POINTS, 3)):
+        ball = ShownBall(apply(plant.workcell.T_c_base, point), case.file.tool.ball_diameter_mm / 2, rod_c)
+        plant.show(ball)
+        searches = searches_of(case, calibration.cameras, apply(T_c_base, point))
+        detections = look_at(detector, searches, case.file.servo.frames)
+        if isinstance(detections, Lost):
+            raise NoAnswerError(f"stereo test: {detections.reason}", code="marker_not_seen")
+        errors.append(np.linalg.norm(in_space(calibration.cameras, detections).points_c[0] - ball.center_c))
+    plant.show(None)
+    return np.array(errors)
+
+
+def _reach(plant: StereoPlant, guide: Guide, aims: Aims, row: int) -> Reached:
+    """Move from the hovering point onto the target by the robot alone, then by the servo."""
+    workcell, number = plant.workcell, aims.numbers[row]
+    true_target, unseen, seen = workcell.targets_c[number], None, None
+    done = aims.bring(row, plant)
+    first = len(plant.rests) - 1
+    if done is None:
+        unseen = _outcome(plant, guide.needle_unseen(aims.q_aim[row]), number)
+    before = float(np.linalg.norm(workcell.ball_c(plant.rests[-1]) - true_target))
+    if done is None:
+        done = aims.correct(row, guide, plant)
+        seen = _outcome(plant, guide.needle_seen(), number) if done.ended_in_sight else None
+    ball, estimated = workcell.ball_c(plant.rests[-1]), guide.target_c
+    return Reached(
+        workcell.case.targets.names[number],
+        done,
+        float(np.linalg.norm(estimated - true_target)),
+        float(aims.expected_tre_mm[row]),
+        before,
+        float(np.linalg.norm(ball - true_target)),
+        float(np.linalg.norm(ball - estimated)),
+        tuple(plant.rests[first : first + len(done.visits)]),
+        plant.rests[-1],
+        unseen,
+        seen,
+    )
+
+
+def _outcome(plant: StereoPlant, believed: NeedleError | None, target: int) -> NeedleOutcome | None:
+    if believed is None:
+        return None
+    radius_mm = plant.workcell.case.file.target.hit_radius_mm
+    return needle_outcome(believed, plant.workcell.needle_m(plant.rests[-1], target), radius_mm)
