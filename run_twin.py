@@ -484,16 +484,27 @@ def servo(
     case: Annotated[Path, typer.Argument(metavar="CASE", help="Servo case, or the folder that holds servo.toml.")],
     out_dir: OutOfCaseOption = None,
     seeds: Annotated[int, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="How many rooms to draw.")] = 1,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", metavar="FOLDER", help="Read this recorded session instead.")
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", metavar="FOLDER", help="Keep the first session there, to be read again.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Servo the tool onto every target by two cameras, in rooms whose truth is drawn; pictures, plot and page."""
     require_extra("twin", "servo")
-    from puncture_twin.twin.jobs.servo.job import run_servo
+    from puncture_twin.twin.jobs.servo.job import follow_recording, refuse_with_recording, run_servo
+
+    if recording is not None:
+        refuse_with_recording(out_dir, record, seeds)
+        job = follow_recording(case, recording)
+        finish("servo", job, job.summary, job.text, as_json)
+        return
 
     with progress_display() as progress:
-        job = run_servo(
-            case, out_folder(out_dir, case, "servo"), seeds, partial(progress.count, "seeds"), progress.note
-        )
+        out = out_folder(out_dir, case, "servo")
+        job = run_servo(case, out, seeds, partial(progress.count, "seeds"), progress.note, record)
     finish("servo", job, job.summary, job.text, as_json)
 
 

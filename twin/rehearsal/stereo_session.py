@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +14,17 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
+from puncture_twin.twin.devices import Arm
 from puncture_twin.twin.guidance.stereo.detection import Detector, image_detector, in_space, look_at, searches_of
-from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide, Known
+from puncture_twin.twin.guidance.stereo.guide import Guide, Known, guide_of
 from puncture_twin.twin.guidance.stereo.joint.needle_error import REGION, NeedleError
 from puncture_twin.twin.guidance.stereo.planned import carried_rod, grid_points, workcell_checker
-from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration, calibrate_by_robot
+from puncture_twin.twin.guidance.stereo.recording import Recorder, StereoDevices
+from puncture_twin.twin.guidance.stereo.robot_calibration import (
+    RobotCalibration,
+    calibrate_by_robot,
+    calibration_commands,
+)
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ServoStop
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed
@@ -172,6 +179,7 @@ def run_session(
     targets: tuple[str, ...] | None = None,
     detector_of: DetectorOf | None = None,
     empty: StateChecker | None = None,
+    record: Path | None = None,
 ) -> Session:
     """Run a whole session in a workcell drawn from a seed.
 
@@ -181,6 +189,7 @@ def run_session(
         targets: Only these; all when None.
         detector_of: Makes the detector in place of images; for studies of what is behind them.
         empty: Checker of the workcell without the head, where one is at hand.
+        record: An empty folder in which all that the devices say is kept.
 
     Raises:
         NoAnswerError: The calibration, the mapping or a start pose could not be done; says what blocked it.
@@ -189,22 +198,28 @@ def run_session(
     parts = _Parts(*(np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(len(_Parts._fields))))
     workcell = draw_workcell(case, parts.workcell)
     plant = StereoPlant(workcell, parts.pictures, parts.arm, parts.tests)
-    hough_only = case.file.cameras.centre == "hough"
-    detector = image_detector(plant, hough_only=hough_only) if detector_of is None else detector_of(plant)
-    calibration = calibrate_by_robot(case, plant, plant, detector, empty or workcell_checker(case, None))
-    stereo_mm = _try_stereo(plant, calibration, detector, parts.tests)
+    recorder = None if record is None else Recorder(plant, record)
+    devices: StereoDevices = recorder or plant
+    detector = image_detector(devices, hough_only=case.hough_only) if detector_of is None else detector_of(plant)
+    commands = calibration_commands(case, empty or workcell_checker(case, None))
+    calibration = calibrate_by_robot(case, commands, devices, devices, detector)
+    plain = detector if recorder is None else image_detector(plant, hough_only=case.hough_only)
+    stereo_mm = _try_stereo(plant, calibration, plain, parts.tests)
     reading = _read(case, parts.image)
     plant.bring_head()
-    seen = see_markers(case, calibration, detector, plant)
+    seen = see_markers(case, calibration, detector, devices)
     mapping = map_markers(case, calibration, seen, reading)
-    joint = case.file.servo.estimate == "joint"
-    guide = (JointGuide if joint else Guide)(Known(case, calibration, mapping, seen, reading.markers_m, detector))
+    guide = guide_of(Known(case, calibration, mapping, seen, reading.markers_m, detector))
     aims, reached = aims_of(case, calibration, mapping, reading.targets_m, targets), []
     for row, number in enumerate(aims.numbers):
-        plant.move_jp(aims.q_hover[row])
+        devices.move_jp(aims.q_hover[row])
         guide.aim_at(reading.targets_m[number])
-        reached.append(_reach(plant, guide, aims, row))
-        plant.move_jp(aims.q_hover[row])
+        if recorder is not None:
+            recorder.target = case.targets.names[number]
+        reached.append(_reach(plant, devices, guide, aims, row))
+        devices.move_jp(aims.q_hover[row])
+    if recorder is not None:
+        recorder.finish((case.markers.names, case.targets.names), reading)
     return Session(seed, workcell, calibration, mapping, stereo_mm, tuple(reached), guide)
 
 
@@ -235,17 +250,17 @@ def _try_stereo(
     return np.array(errors)
 
 
-def _reach(plant: StereoPlant, guide: Guide, aims: Aims, row: int) -> Reached:
+def _reach(plant: StereoPlant, arm: Arm, guide: Guide, aims: Aims, row: int) -> Reached:
     """Move from the hovering point onto the target by the robot alone, then by the servo."""
     workcell, number = plant.workcell, aims.numbers[row]
     true_target, unseen, seen = workcell.targets_c[number], None, None
-    done = aims.bring(row, plant)
+    done = aims.bring(row, arm)
     first = len(plant.rests) - 1
     if done is None:
         unseen = _outcome(plant, guide.needle_unseen(aims.q_aim[row]), number)
     before = float(np.linalg.norm(workcell.ball_c(plant.rests[-1]) - true_target))
     if done is None:
-        done = aims.correct(row, guide, plant)
+        done = aims.correct(row, guide, arm)
         seen = _outcome(plant, guide.needle_seen(), number) if done.ended_in_sight else None
     ball, estimated = workcell.ball_c(plant.rests[-1]), guide.target_c
     return Reached(

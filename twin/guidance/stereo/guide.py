@@ -142,3 +142,8 @@ class JointGuide(Guide):
         found = self.adjusted().offset(-1, self.target_m)
         self.target_c = found.target_c
         return Seen(found.ball_c, found.target_c, found.ball_covariance)
+
+
+def guide_of(known: Known) -> Guide:
+    """The estimates that the case asks for."""
+    return (JointGuide if known.case.file.servo.estimate == "joint" else Guide)(known)

@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
 from puncture_twin.twin.guidance.stereo.detection import Detector, Search, look_at
 from puncture_twin.twin.guidance.stereo.planned import calibrating_rod, grid_points, planned_cameras
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import ball_base, configurations
+from puncture_twin.twin.guidance.stereo.servo_law import Posture, ball_base, configurations
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, path_contact
 
 FIRST_SEARCH_PX = 80.0
@@ -56,29 +56,42 @@ class RobotCalibration:
     branch: int
 
 
-def calibrate_by_robot(
-    case: ServoCase, arm: Arm, touch: MeasuringArm, detector: Detector, checker: StateChecker
-) -> RobotCalibration:
-    """Move to the points, detect, measure, and fit.
+def calibration_commands(case: ServoCase, checker: StateChecker) -> Posture:
+    """Joints that put the ball on the calibration's points, along a path that touches nothing.
 
     Args:
         case: The case.
-        arm: Carries the ball to the points.
-        touch: Measures each.
-        detector: Takes the images.
         checker: Checks contacts; the head is not there yet.
 
     Raises:
-        NoAnswerError: The arm cannot go there, or a ball is not found.
-        InputError: The points do not determine a camera.
+        NoAnswerError: The arm cannot go there.
     """
-    rod = calibrating_rod(case)
-    q_command, branch = configurations(rod, grid_points(case), checker)
+    q_command, branch = configurations(calibrating_rod(case), grid_points(case), checker)
     for number, (start, end) in enumerate(pairwise(q_command), start=2):
         contact = path_contact(checker, np.stack([start, end]))
         if contact is not None:
             what = f"calibration: {contact.body} would touch {contact.other} on the way to point {number}"
             raise NoAnswerError(what, code="motion_touches")
+    return Posture(q_command, branch)
+
+
+def calibrate_by_robot(
+    case: ServoCase, commands: Posture, arm: Arm, touch: MeasuringArm, detector: Detector
+) -> RobotCalibration:
+    """Move to the points, detect, measure, and fit.
+
+    Args:
+        case: The case.
+        commands: Joints that put the ball on the points.
+        arm: Carries it there.
+        touch: Measures each.
+        detector: Takes the images.
+
+    Raises:
+        NoAnswerError: A ball is not found.
+        InputError: The points do not determine a camera.
+    """
+    rod, (q_command, branch) = calibrating_rod(case), commands
     measured, detections, radius_mm = [], [], case.file.tool.ball_diameter_mm / 2
     for number, q in enumerate(q_command, start=1):
         arm.move_jp(q)

@@ -215,6 +215,11 @@ class ServoCase:
         """The case's name."""
         return self.file.name
 
+    @property
+    def hough_only(self) -> bool:
+        """Whether a ball's centre is that of the paper's method."""
+        return self.file.cameras.centre == "hough"
+
     @cached_property
     def errors(self) -> ServoErrors:
         """The declared errors: all that guidance believes of errors."""

@@ -132,7 +132,7 @@ def servo(task: Task, q_command: Floats, look: Look, arm: Arm) -> Servoed:
         return Servoed(stop, tuple(visits), q_command, detail, position_only)
 
     while True:
-        seen = _look(task, q_command, look)
+        seen = look_again(look, q_command, task.looks)
         if isinstance(seen, Lost):
             return ended(ServoStop.LOST_BALL, seen.reason)
         error_c = seen.target_c - seen.ball_c
@@ -156,10 +156,10 @@ def path_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
     return first_contact(checker, dense_states(checker, q_path, RESOLUTION_RAD / FINER))
 
 
-def _look(task: Task, q_command: Floats, look: Look) -> Seen | Lost:
+def look_again(look: Look, q_command: Floats, looks: int) -> Seen | Lost:
     """Look, and look again where the ball was not found, without moving the arm."""
     found = look(q_command)
-    for _ in range(task.looks - 1):
+    for _ in range(looks - 1):
         if isinstance(found, Seen):
             break
         found = look(q_command)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.devices import Arm, Operator
 from puncture_twin.twin.guidance.stereo.detection import Detections, Detector, Search, in_space, look_at
 from puncture_twin.twin.guidance.stereo.guide import Guide
+from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError
 from puncture_twin.twin.guidance.stereo.planned import carried_rod, workcell_checker
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
@@ -25,8 +26,9 @@ from puncture_twin.twin.guidance.stereo.servo_law import (
     configurations,
     map_head,
     path_upward,
+    servo_step,
 )
-from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, path_contact, servo
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen, Servoed, Task, look_again, path_contact, servo
 
 
 class ImageReading(NamedTuple):
@@ -102,6 +104,14 @@ class Aims:
         return servo(self.task, self.q_aim[row], guide.look, arm)
 
 
+def step_limits(case: ServoCase) -> StepLimits:
+    """What one step of the servo may do."""
+    limits = case.file.servo
+    return StepLimits(
+        limits.max_step_mm, float(np.radians(limits.max_joint_step_deg)), float(np.radians(limits.max_drift_deg))
+    )
+
+
 def aims_of(
     case: ServoCase,
     calibration: RobotCalibration,
@@ -127,10 +137,50 @@ def aims_of(
     aims_base = apply(calibration.T_base_c, mapping.to_c(targets_m[chosen]))
     hovers = path_upward(rod, aims_base, case.file.servo.hover_mm)
     q = configurations(rod, np.concatenate([aims_base, hovers]), checker, first=calibration.branch).q
-    limits = case.file.servo
-    steps = StepLimits(
-        limits.max_step_mm, float(np.radians(limits.max_joint_step_deg)), float(np.radians(limits.max_drift_deg))
-    )
+    limits, steps = case.file.servo, step_limits(case)
     task = Task(rod, calibration.T_base_c, limits.tolerance_mm, limits.max_steps, limits.looks, steps, checker)
     expected = mapping.expected_tre_mm(targets_m, case.errors.target_mm)[chosen]
     return Aims(tuple(chosen), q[len(chosen) :], q[: len(chosen)], task, expected)
+
+
+class Looked(NamedTuple):
+    """One look of a recorded session at the ball."""
+
+    target: str
+    q_command: Floats
+    """Shape (6,), rad."""
+    seen: Seen | Lost
+    error_c: Floats
+    """Shape (3,), mm, C: from the ball to the target; NaN where the ball was lost."""
+    needle: NeedleError | None
+    """The needle as it is believed there."""
+    q_next: Floats | None
+    """Where the servo would send the arm next, shape (6,), rad; None where it would not."""
+
+
+def follow(
+    case: ServoCase, guide: Guide, T_base_c: Floats, targets_m: Floats, stops: Sequence[tuple[str, Floats]], arm: Arm
+) -> Iterator[Looked]:
+    """What a session's looks say, stop by stop.
+
+    Args:
+        case: The case.
+        guide: Of its calibration and mapping.
+        T_base_c: Shape (4, 4), mm, as calibrated.
+        targets_m: Shape (k, 3), mm, in the image.
+        stops: Name of the target, and joints (6,), rad.
+        arm: Moves to each.
+    """
+    rod, limits, last = carried_rod(case), step_limits(case), ""
+    for name, q in stops:
+        arm.move_jp(q)
+        if name != last:
+            guide.aim_at(targets_m[case.targets.names.index(name)])
+            last = name
+        seen = look_again(guide.look, q, case.file.servo.looks)
+        if isinstance(seen, Lost):
+            yield Looked(name, q, seen, np.full(3, np.nan), None, None)
+            continue
+        error_c = seen.target_c - seen.ball_c
+        step = servo_step(rod, q, T_base_c[:3, :3] @ error_c, limits)
+        yield Looked(name, q, seen, error_c, guide.needle_seen(), None if step.stop else step.q_path[-1])

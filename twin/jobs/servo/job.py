@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Count
+from puncture_twin.twin.guidance.stereo.detection import image_detector
+from puncture_twin.twin.guidance.stereo.guide import Known, guide_of
+from puncture_twin.twin.guidance.stereo.recording import read_recording
+from puncture_twin.twin.guidance.stereo.robot_calibration import calibrate_by_robot
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
+from puncture_twin.twin.guidance.stereo.servo_law import Posture
+from puncture_twin.twin.guidance.stereo.session import follow, map_markers, see_markers
 from puncture_twin.twin.jobs.servo import liu2007
 from puncture_twin.twin.jobs.servo.liu2007 import finished_sessions
 from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence
 from puncture_twin.twin.jobs.servo.report import (
     Facts,
     Pictures,
+    recording_facts,
+    recording_text,
     reproduction_facts,
     servo_facts,
     servo_text,
@@ -42,6 +54,7 @@ def run_servo(
     seeds: int,
     done: Count | None = None,
     note: Callable[[str], None] | None = None,
+    record: Path | None = None,
 ) -> ServoJob:
     """Hold the sessions of a case and write pictures, plot and page.
 
@@ -51,6 +64,7 @@ def run_servo(
         seeds: How many, from the case's own on.
         done: Told how many of how many are done.
         note: Told what was removed that nobody might expect.
+        record: A folder that is not there yet, for all that the devices of the first session say.
 
     Raises:
         InputError: The case cannot be used.
@@ -58,11 +72,69 @@ def run_servo(
     """
     case = load_servo_case(path)
     with writing(out_dir, "servo", inputs=case.inputs, names=NAMES, note=note) as draft:
-        result = finished_sessions(case, seeds, done)
+        with new_folder(record) as kept:
+            result = finished_sessions(case, seeds, done, kept)
         facts = servo_facts(case, result.trials, result.ours)
         written = _files(case, result.first, facts, draft.folder)
     facts["files"] = [str(path) for path in draft.final(written)]
     return ServoJob(result.ours.not_confirmed == 0.0 and result.ours.refused == 0, facts, servo_text(facts))
+
+
+@contextmanager
+def new_folder(path: Path | None) -> Iterator[Path | None]:
+    """A folder that appears whole or not at all; None for none.
+
+    Raises:
+        InputError: Something is there already, or it cannot be made.
+    """
+    if path is None:
+        yield None
+        return
+    if path.exists():
+        refuse("is there already", path, "a new folder", "output_exists")
+    with tempfile.TemporaryDirectory(dir=check_writable(path.parent), prefix=".") as beside:
+        kept = Path(beside) / path.name
+        kept.mkdir()
+        yield kept
+        kept.replace(path)
+
+
+def refuse_with_recording(out_dir: Path | None, record: Path | None, seeds: int) -> None:
+    """A recorded session is read: nothing is drawn or written.
+
+    Raises:
+        InputError: One of the options that draw or write is given too.
+    """
+    if out_dir is not None or record is not None or seeds != 1:
+        refuse("--out, --record and --seeds", "servo --recording", "--recording FOLDER alone", "conflicting_options")
+
+
+def follow_recording(path: Path, recording: Path) -> ServoJob:
+    """Calibrate and map from a recorded session, and say what each of its looks at the ball says.
+
+    Args:
+        path: The case.
+        recording: Its folder; see `twin.guidance.stereo.recording`.
+
+    Raises:
+        InputError: Case or recording cannot be used.
+        NoAnswerError: A point or a marker is not found in its pictures.
+    """
+    case = load_servo_case(path)
+    replay = read_recording(recording)
+    unknown = {name for name, _ in replay.stops} - set(case.targets.names)
+    if unknown:
+        allowed = ", ".join(case.targets.names)
+        refuse(f"target {', '.join(sorted(unknown))}", recording / "stops.csv", allowed, "no_target")
+    detector = image_detector(replay, hough_only=case.hough_only)
+    calibration = calibrate_by_robot(case, Posture(replay.q_points, -1), replay, replay, detector)
+    reading = replay.reading(case.markers, case.targets)
+    seen = see_markers(case, calibration, detector, replay)
+    mapping = map_markers(case, calibration, seen, reading)
+    guide = guide_of(Known(case, calibration, mapping, seen, reading.markers_m, detector))
+    looks = list(follow(case, guide, calibration.T_base_c, reading.targets_m, replay.stops, replay))
+    facts = recording_facts(case, recording, calibration, mapping, looks)
+    return ServoJob(facts["converged"], facts, recording_text(facts))
 
 
 def reproduce_paper(out_dir: Path, seeds: int | None) -> ServoJob:

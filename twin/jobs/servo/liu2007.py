@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -219,9 +220,11 @@ def paper_gain_mm() -> float:
     return float(rows[:, 1].mean() - rows[:, 2].mean())
 
 
-def finished_sessions(case: ServoCase, seeds: int, done: Count | None = None) -> ServoSessions:
+def finished_sessions(
+    case: ServoCase, seeds: int, done: Count | None = None, record: Path | None = None
+) -> ServoSessions:
     """The sessions of a case, from its own seed on."""
-    first = run_session(case, case.file.seed)
+    first = run_session(case, case.file.seed, record=record)
     report = done or (lambda at, of: None)
     report(1, seeds)
     others: Sequence[ServoTrial] = run_trials(

@@ -10,9 +10,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
+from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
+from puncture_twin.twin.guidance.stereo.servo_law import Mapping as HeadMapping
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost
+from puncture_twin.twin.guidance.stereo.session import Looked
 from puncture_twin.twin.jobs.servo.liu2007 import (
     TABLE_1,
     TABLE_2,
@@ -131,6 +137,62 @@ def _target(row: TargetRow) -> dict[str, Any]:
 
 def _outcome(one: NeedleOutcome) -> dict[str, Any]:
     return {**one._asdict(), "half_axes_mm": list(one.half_axes_mm), "in_region": one.in_region}
+
+
+def recording_facts(
+    case: ServoCase, folder: Path, calibration: RobotCalibration, mapping: HeadMapping, looks: Sequence[Looked]
+) -> dict[str, Any]:
+    """What a recorded session says; mm and degrees."""
+    last = {one.target: one for one in looks}
+    within = [bool(np.linalg.norm(one.error_c) <= case.file.servo.tolerance_mm) for one in last.values()]
+    return {
+        "case": case.name,
+        "recording": str(folder),
+        "inputs": inputs_document(case.inputs),
+        "tolerance_mm": case.file.servo.tolerance_mm,
+        "calibration_rms_px": list(calibration.rms_px),
+        "robot_residual_mm": float(np.mean(calibration.robot_residual_mm)),
+        "T_base_c": calibration.T_base_c.tolist(),
+        "fre_mm": mapping.fre_mm,
+        "looks": [_looked(case, one) for one in looks],
+        "converged": all(within),
+    }
+
+
+def _looked(case: ServoCase, one: Looked) -> dict[str, Any]:
+    radius, believed = case.file.target.hit_radius_mm, one.needle
+    lost = one.seen.reason if isinstance(one.seen, Lost) else None
+    return {
+        "target": one.target,
+        "joints_deg": np.degrees(one.q_command).tolist(),
+        "lost": lost,
+        "error_c_mm": None if lost else one.error_c.tolist(),
+        "error_mm": None if lost else float(np.linalg.norm(one.error_c)),
+        "needle_rms_mm": None if believed is None else believed.rms_mm,
+        "p_hit": None if believed is None or radius is None else believed.p_hit(radius),
+        "next_joints_deg": None if one.q_next is None else np.degrees(one.q_next).tolist(),
+    }
+
+
+LOOK = (
+    Field("target", "target"),
+    Field("ball to target, mm", lambda row: row["lost"] or number(row["error_mm"], 3)),
+    Field("needle expected (rms)", "needle_rms_mm", 2, "mm"),
+    Field("chance to hit", lambda row: "" if row["p_hit"] is None else chance_text(row["p_hit"])),
+)
+
+
+def recording_text(facts: Facts) -> str:
+    """What a recorded session says, for a terminal."""
+    pixels = " and ".join(number(rms, 3) for rms in facts["calibration_rms_px"])
+    rows = [
+        ("cameras", f"residuals of {pixels} px (rms)"),
+        ("robot to cameras", f"residual of {number(facts['robot_residual_mm'], 3, 'mm')} (mean)"),
+        ("markers", f"residual of {number(facts['fre_mm'], 3, 'mm')} (rms)"),
+    ]
+    looks = grid(LOOK, facts["looks"])
+    head = Section(f"case {facts['case']}, recorded in {facts['recording']}", [facts_table(rows)])
+    return text([head, Section("every look at the ball", [looks])])
 
 
 class Pictures(NamedTuple):
