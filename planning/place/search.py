@@ -13,62 +13,49 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-import fcl
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
-from puncture_twin.planning.arm.insertion import flange_poses
-from puncture_twin.planning.arm.tool import Box, Tool
-from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError, NoAnswerError
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.processes import working
-from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case, bed_frame
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import MountSection
-from puncture_twin.planning.collision.bodies import Solid, connected_parts
+from puncture_twin.planning.collision.bodies import connected_parts
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.patient import FclSkin
-from puncture_twin.planning.collision.state_checker import PATIENT, Contact
 from puncture_twin.planning.collision.workcell import (
     ARM_PADDING_MM,
-    case_boxes,
-    case_tool,
-    home_configuration,
-    outside_surface,
     patient_surface,
 )
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
-from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.place.arm_spheres import Boxes, SkinField, Surroundings
+from puncture_twin.planning.place.check import (
+    Checked,
+    PlacementCheck,
+    Verdict,
+    expected_tip_error_mm,
+    needle_can_start,
+    placement_check,
+)
 from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
 from puncture_twin.planning.place.mounts import (
     Site,
-    WantedDirections,
     mount_lines,
     mount_section,
     regions,
-    wanted_directions,
 )
-from puncture_twin.planning.reach.reach import assess_reach_all
-from puncture_twin.planning.reach.survey import ReachAnswer, ReachRequest
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise, touches
-from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.placement import Placement, default_method
-from puncture_twin.planning.registration.registration import Registration, register
+from puncture_twin.planning.reach.survey import ReachAnswer
+from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 GoesOn = Callable[[int, int | None], bool]
 """Called with how many directions were checked, summed over placements, of how many (None before the finalists are
@@ -191,7 +178,7 @@ def search_placements(
         raise NoAnswerError(what, counts=candidates.counts(), code="no_safe_direction")
     # 1. The workcell, and the directions in which the needle itself is clear at its standoff.
     T_ct_bed, step_mm = bed_frame(case), case.place.step_mm
-    check = _placement_check(case, anatomy, candidates)
+    check = placement_check(case, anatomy, candidates)
     CellChecker(check.model, check.tool)  # refuses shapes that hang on nothing before minutes are spent
     near, beyond = _parted(anatomy)
     surroundings = Surroundings(
@@ -281,24 +268,6 @@ def _parted(anatomy: Anatomy) -> tuple[TriangleMesh, list[Box]]:
     return joined(near), boxes
 
 
-def _placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> PlacementCheck:
-    """The case's workcell, with what moves with the patient apart from what moves with the arm, and its directions."""
-    carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
-    boxes = case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
-    return PlacementCheck(
-        model=case.robot.model,
-        tool=case_tool(case),
-        skin=anatomy.skin.mesh,
-        outside=outside_surface(anatomy),
-        fixed=tuple(box for box in boxes if box.name not in carried),
-        carried=tuple(box for box in boxes if box.name in carried),
-        padding_mm=ARM_PADDING_MM,
-        target_ct=case.target_ct,
-        wanted=wanted_directions(case, candidates),
-        home=home_configuration(case),
-    )
-
-
 @dataclass(eq=False)
 class _Contender:
     """A placement that is checked in ever more directions."""
@@ -311,7 +280,7 @@ class _Contender:
     home_contact: str = ""
 
 
-Work = Callable[..., Iterable["Checked"]]
+Work = Callable[..., Iterable[Checked]]
 """As ``map`` does it."""
 
 
@@ -344,7 +313,7 @@ class _Race:
         return _Contender(None, mount_section(T_ct_base, self._case.space), placement.T_base_ct, None)
 
     def run(self, contenders: Sequence[_Contender], own: _Contender | None, jobs: int) -> None:
-        """Check all in a few directions, then the finalists in all: who leads first, then the case's own."""
+        """Check all in a few directions, then the finalists in all: who leads first, and the case's own after it."""
         others = [] if own is None else [own]
         everyone, few = [*contenders, *others], min(FIRST, self._all)
         with working(jobs, len(everyone)) as work:
@@ -355,8 +324,9 @@ class _Race:
             left = [one for one in contenders if one.site in chosen]
             self._total = few * len(everyone) + (self._all - few) * (len(left) + len(others))
             while left or others:
-                whole = any(len(one.answers) == self._all for one in contenders)
-                one = others[0] if others and (whole or not left) else max(left, key=self._fraction)
+                most = max((len(one.answers) for one in contenders), default=self._all)
+                follows = others and (len(others[0].answers) < most or not left)
+                one = others[0] if follows else max(left, key=self._fraction)
                 if not self.further(work, [one], SECOND if len(one.answers) < SECOND else self._all):
                     return
                 left, others = ([one for one in some if len(one.answers) < self._all] for some in (left, others))
@@ -434,7 +404,7 @@ def _neighbours(site: Site, step_mm: float) -> list[Site]:
     return [Site(site.region, (float(x), float(y), float(z))) for x, y, z in around]
 
 
-Scored = TypeVar("Scored", ReachEstimate, "Verdict")
+Scored = TypeVar("Scored", ReachEstimate, Verdict)
 
 
 def _score(estimate: ReachEstimate | Verdict) -> tuple[float, float]:
@@ -473,157 +443,6 @@ def _best_apart(pairs: Sequence[tuple[Site, Scored]], distance_mm: float, count:
 def _far(one: Site, other: Site, distance_mm: float) -> bool:
     apart = float(np.linalg.norm(np.subtract(one.position, other.position)))
     return one.region != other.region or apart >= distance_mm
-
-
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Exact reach from one placement, in the directions that were checked.
-
-    Attributes:
-        fraction: Solid angle of the reached directions over that of all that are wanted, 0..1; where not all were
-            checked, each counts for those that are nearest to it.
-        reached: How many directions the arm can reach and insert along.
-        count: How many directions were checked.
-        margin: Mean reach margin of the reached ones, 0..1; 0 for none.
-        reasons: How many of the others fell to which reason.
-        home_contact: What the arm touches in its home configuration, or "".
-        q_insertion: Shape (reached, 6), rad, the tip on the target.
-        answers: Of each checked direction; where all were checked, in the order of the candidates.
-    """
-
-    fraction: float
-    reached: int
-    count: int
-    margin: float
-    reasons: Mapping[str, int]
-    home_contact: str
-    q_insertion: Floats
-    answers: tuple[ReachAnswer, ...]
-
-
-class Checked(NamedTuple):
-    """Directions checked from one placement: of each insertion the last state alone is kept."""
-
-    answers: list[ReachAnswer]
-    home_contact: str
-
-
-@dataclass(frozen=True, eq=False)
-class PlacementCheck:
-    """Checks placements. Its values can be sent to another process.
-
-    Attributes:
-        model: The arm.
-        tool: What its flange carries.
-        skin: CT frame.
-        outside: CT frame, what the CT shows outside of it, or None.
-        fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
-        carried: Boxes that stand with the arm, base frame.
-        padding_mm: Of the arm.
-        target_ct: Shape (3,), mm.
-        wanted: The directions.
-        home: Shape (6,), rad.
-    """
-
-    model: UrModel
-    tool: Tool
-    skin: TriangleMesh
-    outside: TriangleMesh | None
-    fixed: tuple[Box, ...]
-    carried: tuple[Box, ...]
-    padding_mm: float
-    target_ct: Floats
-    wanted: WantedDirections
-    home: Floats
-
-    def checked(self, piece: tuple[Floats, NDArray[np.int64]]) -> Checked:
-        """Check some directions from a pose ``T_base_ct`` (4, 4); a base in the patient or the unseen reaches none."""
-        T_base_ct, rows = piece
-        try:
-            checker = self._checker(T_base_ct)
-        except InputError as error:
-            if not error.code.startswith("base_in"):
-                raise
-            return Checked([ReachAnswer.refused(Reason.ARM_COLLISION, None, str(error))] * len(rows), str(error))
-        target = T_base_ct[:3, :3] @ self.target_ct + T_base_ct[:3, 3]
-        requests = [
-            ReachRequest(target, T_base_ct[:3, :3] @ outward, self.tool.needle_length_mm, float(standoff))
-            for outward, standoff in zip(self.wanted.outward_ct[rows], self.wanted.standoff_mm[rows], strict=True)
-        ]
-        home = checker.contact(self.home, needle_may_touch_patient=False)
-        answers = assess_reach_all(checker, requests)
-        return Checked([replace(one, insertion_q=one.insertion_q[-1:]) for one in answers], _contact_text(home))
-
-    def _checker(self, T_base_ct: Floats) -> FastChecker:
-        boxes = [Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed]
-        outside = None if self.outside is None else self.outside.transformed(T_base_ct)
-        model, everything = self.model, (*boxes, *self.carried)
-        skin, cache = self.skin.transformed(T_base_ct), user_cache()
-        return FastChecker(model, self.tool, everything, skin, outside=outside, padding_mm=self.padding_mm, cache=cache)
-
-
-def _contact_text(contact: Contact | None) -> str:
-    return "" if contact is None else f"{contact.body} touches {contact.other}"
-
-
-def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Floats, q: Floats) -> float | None:
-    """Root mean square over insertions (n, 6) of sqrt(trace(Sigma_dd)); None without declared errors, markers or q.
-
-    How the arm will touch the markers from there nobody has said, so that the arm's own errors do not cancel (2 J_f
-    Sigma_eta J_f' stands for them); the residuals of the old touches say nothing of the new ones.
-
-    Args:
-        case: Declares the errors.
-        placement: Where the case has the arm; gives the markers.
-        T_base_ct: Shape (4, 4), mm: where the arm is to stand.
-        q: Joints (rad) with the tip on the target from there.
-    """
-    registration = None if placement is None else placement.registration
-    if case.errors is None or registration is None or not len(q):
-        return None
-    covariance = pose_error_from(case, registration, T_base_ct).covariance(q)
-    return float(np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2).mean()))
-
-
-def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -> PoseError:
-    """The needle's pose error from another placement; arguments as above, the case with errors."""
-    assert case.errors is not None  # the caller has looked
-    errors, old = replace(case.errors, found=False), registration.markers
-    markers = MarkerPairs(old.names, old.points_ct, apply(T_base_ct, old.points_ct))
-    model, tip = case.robot.model, case.needle.length_mm
-    noise = reading_noise(errors, model, tip, touches(case, markers), known=False)
-    method = (None if case.registration is None else case.registration.method) or default_method(errors)
-    fitted = register(markers, method=method, target_ct=case.target_ct, noise=noise)
-    assert fitted.uncertainty is not None  # its markers have noise
-    return PoseError(model, tip, apply(T_base_ct, case.target_ct), errors, fitted.uncertainty)
-
-
-def needle_can_start(
-    tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections, padding_mm: float
-) -> NDArray[np.bool_]:
-    """Whether the padded needle at standoff is clear of the skin: else no placement can reach the direction.
-
-    Args:
-        tool: With the needle.
-        skin: CT frame.
-        target_ct: Shape (3,), mm.
-        wanted: n directions.
-        padding_mm: What the arm's checker keeps from the patient.
-
-    Returns:
-        Shape (n,).
-    """
-    start, end = tool.needle_span_mm
-    radius, length = tool.needle_diameter_mm / 2 + padding_mm, end - start + 2 * padding_mm
-    needle, half = Solid(partial(fcl.Cylinder, radius, length)), np.array([radius, radius, length / 2])
-    patient = FclSkin(skin, PATIENT)
-    # From the tip, at the standoff from the target, the needle's middle is half its body farther out.
-    poses = flange_poses(target_ct, wanted.outward_ct, wanted.standoff_mm + (end - start) / 2)
-    clear = np.empty(len(wanted), np.bool_)
-    for row, T in enumerate(poses):
-        needle.place(fcl.Transform(T[:3, :3], T[:3, 3]))
-        clear[row] = not patient.touches(needle, np.array([-half, half]))
-    return clear
 
 
 PLACE_VERSION = 2

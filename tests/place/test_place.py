@@ -40,6 +40,7 @@ from puncture_twin.planning.place.arm_spheres import (
     clear_branches,
     skin_distance,
 )
+from puncture_twin.planning.place.check import PlacementCheck, needle_can_start
 from puncture_twin.planning.place.estimate import Estimator, insertion_branches
 from puncture_twin.planning.place.mounts import (
     Region,
@@ -51,7 +52,7 @@ from puncture_twin.planning.place.mounts import (
     ring_weights,
     wanted_directions,
 )
-from puncture_twin.planning.place.search import PlacementCheck, _parted, needle_can_start, search_placements
+from puncture_twin.planning.place.search import _parted, search_placements
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.constraints import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
