@@ -1,6 +1,6 @@
 """The exact check of a placement: directions as the batch search checks them, and the expected error of the tip.
 
-Whether the needle can wait before the insertion at all is asked of the needle alone: no placement changes it.
+Whether the needle can wait before the insertion at all depends on the needle alone: no placement changes it.
 """
 
 from __future__ import annotations

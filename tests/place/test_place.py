@@ -27,6 +27,7 @@ from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.case.options import CaseOptions
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.settings import mount_pose
+from puncture_twin.planning.case.tables import MountSection
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.geometry.containment import Side, side_of
@@ -40,7 +41,7 @@ from puncture_twin.planning.place.arm_spheres import (
     clear_branches,
     skin_distance,
 )
-from puncture_twin.planning.place.check import PlacementCheck, needle_can_start
+from puncture_twin.planning.place.check import PlacementCheck, needle_can_start, placement_check
 from puncture_twin.planning.place.estimate import Estimator, insertion_branches
 from puncture_twin.planning.place.mounts import (
     Region,
@@ -489,6 +490,16 @@ def test_finalists_are_each_mounts_best_and_all_are_checked_in_full(whole):
     for mount in {one.site.region.mount for one in full.rated}:
         best = max((one for one in full.rated if one.site.region.mount == mount), key=lambda one: one.verdict.fraction)
         assert best.verdict.count == full.directions
+
+
+@pytest.mark.parametrize("z", [450.0, -420.0])
+def test_a_base_in_what_nobody_saw_reaches_nothing(grid, z):
+    """Beyond the trunk's ends, at its own height: no direction is checked there, and the reason is kept."""
+    context, candidates = grid
+    mount = MountSection(position_mm=(0.0, 0.0, z), x_axis=(1.0, 0.0, 0.0), z_axis=(0.0, -1.0, 0.0))
+    T = mount_pose(mount, context.case.space, context.case.path)
+    found = placement_check(context.case, context.anatomy, candidates).checked((T, np.arange(5)))
+    assert [one.reachable for one in found.answers] == [False] * 5 and "base" in found.home_contact
 
 
 def test_what_a_clock_ends_is_said_with_the_way_to_the_end(case_folder, tmp_path, capsys):
