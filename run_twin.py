@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -360,16 +361,21 @@ def pivot(
 def place(
     case: CaseArgument,
     out_dir: OutOfCaseOption = None,
-    jobs: JobsOption = 2,
+    quick: Annotated[
+        float,
+        typer.Option("--quick", metavar="SECONDS", min=1, help="Answer after about so long, as far as known then."),
+    ] = 30.0,
+    full: Annotated[bool, typer.Option("--full", help="Search to the end, however long it takes.")] = False,
+    jobs: JobsOption = 1,
     pictures: PicturesOption = True,
     as_json: JsonOption = False,
 ) -> None:
     """Find where the arm should stand to hold most of the organ-safe directions; write the placements and their map."""
     from puncture_twin.twin.jobs.patient.place_job import place_case, place_text
 
-    folder = out_folder(out_dir, case, "place")
+    folder, began = out_folder(out_dir, case, "place"), time.perf_counter()
     with prepared(case, arm=False) as context:
-        run = place_case(context, folder, jobs=jobs, pictures=pictures)
+        run = place_case(context, folder, jobs=jobs, pictures=pictures, quick_s=None if full else quick, began=began)
     finish("place", run, run.summary(), place_text(run), as_json)
 
 

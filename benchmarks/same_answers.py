@@ -58,7 +58,7 @@ def commands(cases: Path) -> Iterator[Command]:
     yield Command("carton-sweep", sweep, slow=True)
     check = ("check", str(cases / "abdomen"), "--theta", "30", "--beta", "100", "--json")
     yield Command("abdomen-check", check)
-    yield Command("place", ("place", str(cases / "abdomen"), "--out", "place"), slow=True)
+    yield Command("place", ("place", str(cases / "abdomen"), "--out", "place", "--full"), slow=True)
     yield Command("servo", ("servo", str(cases / "head"), "--out", "servo"), slow=True)
     yield Command("selfcal", ("selfcal", str(cases / "selfcal"), "--seeds", "1", "--out", "selfcal"), slow=True)
     yield Command("chen2019", ("reproduce", "chen2019", "--json"))

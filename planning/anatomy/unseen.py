@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from scipy.sparse.csgraph import connected_components
 
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, FieldOfView
 from puncture_twin.planning.anatomy.scan import Scan
@@ -102,7 +101,7 @@ def _shows_arms(skin: TriangleMesh) -> bool:
     """Whether beside the trunk, at its left and at its right, lie parts of the body that are as large as arms are."""
     edges = np.concatenate([skin.faces[:, :2], skin.faces[:, 1:]])
     graph = scipy.sparse.coo_array((np.ones(len(edges), bool), edges.T), (len(skin.vertices),) * 2)
-    part = connected_components(graph, directed=False)[1][skin.faces[:, 0]]
+    part = scipy.sparse.csgraph.connected_components(graph, directed=False)[1][skin.faces[:, 0]]
     a, b, c = np.moveaxis(skin.triangles - skin.bounds.mean(axis=0), 1, 0)
     volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0)
     trunk, sides = skin.triangles[part == volume.argmax(), :, 0], set()

@@ -10,20 +10,11 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from functools import partial
 from types import MappingProxyType
-from typing import Any, TypeVar
-
-from puncture_twin.planning.base.progress import Count
-
-Thing = TypeVar("Thing")
-Answer = TypeVar("Answer")
-
-BATCH = 48
-"""At most so many things at a time go to a process."""
+from typing import Any
 
 
 def _mapping(values: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -81,6 +72,21 @@ def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
+@contextmanager
+def working(jobs: int, pieces: int) -> Iterator[Callable[..., Iterable[Any]]]:
+    """What works as ``map`` does, in this process or in several; a function and its results must then be pickled.
+
+    Args:
+        jobs: Processes, at most one a core; 1 computes in this one, each piece when its result is taken.
+        pieces: Of the work.
+    """
+    if worker_count(jobs, pieces) == 1:
+        yield map
+        return
+    with process_pool(jobs, pieces) as pool:
+        yield pool.map
+
+
 def on_threads(work: Callable[[int], None], pieces: int, threads: int) -> Iterator[int]:
     """Do pieces of work that let go of the interpreter, side by side; yields how many are done.
 
@@ -102,38 +108,3 @@ def on_threads(work: Callable[[int], None], pieces: int, threads: int) -> Iterat
             yield done + 1
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def map_all(
-    function: Callable[[Thing], Answer],
-    things: Sequence[Thing],
-    *,
-    jobs: int,
-    progress: Count,
-) -> list[Answer]:
-    """The results in the order of the things.
-
-    Args:
-        function: What is computed of each; with several jobs it and its results must be such as can be pickled.
-        things: Its arguments.
-        jobs: Processes, at most one a core; 1 computes in this one.
-        progress: Called with (done, all).
-    """
-    jobs = worker_count(jobs, len(things))
-    size = max(1, min(BATCH, len(things) // (4 * jobs)))
-    batches = [things[start : start + size] for start in range(0, len(things), size)]
-    answers: list[Answer] = []
-    if jobs == 1 or len(batches) < 2:
-        for batch in batches:
-            answers += _batch(function, batch)
-            progress(len(answers), len(things))
-        return answers
-    with process_pool(jobs, len(batches)) as pool:
-        for some in pool.map(partial(_batch, function), batches):
-            answers += some
-            progress(len(answers), len(things))
-    return answers
-
-
-def _batch(function: Callable[[Thing], Answer], things: Sequence[Thing]) -> list[Answer]:
-    return [function(thing) for thing in things]

@@ -1,4 +1,4 @@
-"""Estimated fraction of directions an arm reaches from a placement: kinematics, bounding spheres, self-contacts."""
+"""Estimated fraction of directions an arm reaches from a placement: kinematics and bounding spheres."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, link_poses, s
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.place.arm_spheres import ArmSpheres, Surroundings, base_is_clear, clear_branches
 from puncture_twin.planning.place.mounts import Site, WantedDirections
 
@@ -37,15 +35,13 @@ class ReachEstimate(NamedTuple):
 
     reach: float
     """Kinematics allow the insertion."""
-    unobstructed: float
-    """Links and holder keep clear of the patient and of what is around, too."""
     fraction: float
-    """They keep clear of one another, too; equal to `unobstructed` where that is not tested."""
+    """Links and holder keep clear of the patient and of what is around, too; whether of one another is not tested."""
     margin: float
     """Mean distance of the reached directions from singularities, 0..1; 0 where none is reached."""
 
 
-NOTHING = ReachEstimate(0.0, 0.0, 0.0, 0.0)
+NOTHING = ReachEstimate(0.0, 0.0, 0.0)
 
 
 def insertion_branches(
@@ -77,7 +73,6 @@ class Estimator:
         surroundings: Patient and boxes around it.
         T_ct_bed: Shape (4, 4), mm, its origin the target.
         wanted: The directions.
-        itself: Whether the arm must keep clear of itself, which takes as long as all the rest.
     """
 
     model: UrModel
@@ -85,7 +80,6 @@ class Estimator:
     surroundings: Surroundings
     T_ct_bed: Floats
     wanted: WantedDirections
-    itself: bool
 
     def estimate(self, site: Site) -> ReachEstimate:
         """The fractions at one site; ``NOTHING`` where the base would lie in something."""
@@ -98,22 +92,15 @@ class Estimator:
         depths = np.linspace(0.0, 1.0, STATES)
         distances = self.tool.needle_length_mm + self.wanted.standoff_mm[:, None] * (1.0 - depths)
         found = insertion_branches(model, target, self.wanted.outward_ct @ T_base_ct[:3, :3].T, distances)
-        open_margin = self._open_margins(found, T_ct_base)
-        best = self._clear_of_itself(found.q, open_margin) if self.itself else open_margin.max(axis=1)
+        best = self._open_margins(found, T_ct_base)
         fraction = self._fraction(best)
         margin = float(best @ self.wanted.weight) / fraction if fraction > 0.0 else 0.0
-        return ReachEstimate(
-            self._fraction(found.margin.max(axis=1)), self._fraction(open_margin.max(axis=1)), fraction, margin
-        )
+        return ReachEstimate(self._fraction(found.margin.max(axis=1)), fraction, margin)
 
     def _open_margins(self, branches_reached: Branches, T_ct_base: Floats) -> Floats:
-        """The margins of the branches that keep clear of the surroundings, shape (n, 8); 0 for the others.
-
-        The branches of each direction are tested in the order of their margins. Where the arm itself does not
-        count, those after the first clear one are left at 0: no answer depends on them.
-        """
+        """The margin of each direction's best branch that keeps clear of the surroundings, shape (n,); 0 for none."""
         model, spheres = self.model, _spheres(self.model, self.tool)
-        open_margin = np.zeros_like(branches_reached.margin)
+        best = np.zeros(len(branches_reached.margin))
         order = np.argsort(-branches_reached.margin, axis=1, kind="stable")
         rows = np.arange(len(order))
         for place in range(N_BRANCHES):
@@ -122,34 +109,14 @@ class Estimator:
             clear = clear_branches(
                 spheres, self.surroundings, T_ct_base, link_poses(model, branches_reached.q[rows, branches])
             )
-            open_margin[rows[clear], branches[clear]] = branches_reached.margin[rows[clear], branches[clear]]
-            if not self.itself:
-                rows = rows[~clear]
-        return open_margin
+            best[rows[clear]] = branches_reached.margin[rows[clear], branches[clear]]
+            rows = rows[~clear]
+        return best
 
     def _fraction(self, margins: Floats) -> float:
         return float(self.wanted.weight[margins > 0.0].sum())
-
-    def _clear_of_itself(self, q: Floats, margin: Floats) -> Floats:
-        """The margin of each direction's best branch on which the arm does not touch itself, shape (n,); 0 for none."""
-        checker = _alone(self.model, self.tool)
-        best = np.zeros(len(q))
-        for row in np.flatnonzero(margin.any(axis=1)):
-            for branch in np.argsort(-margin[row], kind="stable"):
-                if margin[row, branch] == 0.0:
-                    break
-                if checker.first_contact(q[row, branch, [0, -1]], needle_may_touch_patient=True) is None:
-                    best[row] = margin[row, branch]
-                    break
-        return best
 
 
 @cache
 def _spheres(model: UrModel, tool: Tool) -> ArmSpheres:
     return ArmSpheres.of(model, tool)
-
-
-@cache
-def _alone(model: UrModel, tool: Tool) -> FastChecker:
-    """The arm in an empty workcell: it can touch nothing but itself."""
-    return FastChecker(model, tool, cache=user_cache())

@@ -234,18 +234,25 @@ class WantedDirections:
         """Some of them, with their weights."""
         return WantedDirections(self.outward_ct[rows], self.standoff_mm[rows], self.weight[rows])
 
-    def spread(self, count: int) -> WantedDirections:
-        """At most ``count`` directions, each as far as can be from those before, weighted by all nearest to it."""
-        if count >= len(self):
-            return self
+    def order(self, count: int) -> NDArray[np.int64]:
+        """All rows, shape (n,): the first ``count`` each as far as can be from those before, then the others."""
         chosen = [int(np.argmax(self.weight))]
         cosine = self.outward_ct @ self.outward_ct[chosen[0]]
-        while len(chosen) < count:
+        while len(chosen) < min(count, len(self)):
+            cosine[chosen[-1]] = np.inf  # of the same direction twice, each row once
             chosen.append(int(np.argmin(cosine)))  # farthest-point sampling
             cosine = np.maximum(cosine, self.outward_ct @ self.outward_ct[chosen[-1]])
-        nearest = np.argmax(self.outward_ct @ self.outward_ct[chosen].T, axis=1)
-        weight = np.bincount(nearest, self.weight, minlength=count).astype(np.float64)
-        return WantedDirections(self.outward_ct[chosen], self.standoff_mm[chosen], weight)
+        return np.concatenate([chosen, np.setdiff1d(np.arange(len(self)), chosen)])
+
+    def standing_for_all(self, rows: NDArray[np.int64]) -> WantedDirections:
+        """Some of them, each weighted by all that are nearest to it."""
+        nearest = np.argmax(self.outward_ct @ self.outward_ct[rows].T, axis=1)
+        weight = np.bincount(nearest, self.weight, minlength=len(rows)).astype(np.float64)
+        return WantedDirections(self.outward_ct[rows], self.standoff_mm[rows], weight)
+
+    def spread(self, count: int) -> WantedDirections:
+        """At most ``count`` directions, evenly spread, with the weight of all."""
+        return self if count >= len(self) else self.standing_for_all(self.order(count)[:count])
 
 
 def wanted_directions(case: Case, candidates: Candidates) -> WantedDirections:

@@ -1,7 +1,8 @@
-"""The search for a placement of the arm: all regions coarsely, the best of each finely, the finalists exactly.
+"""The search for a placement of the arm, coarse to fine: it can end early, and says how far it came.
 
-A finalist is checked as the batch search checks it: the arm for every organ-safe direction, the expected tip error with
-the markers touched anew from there, and whether the needle can wait before the insertion at all.
+All sites are estimated, the best walk uphill, and those ends are checked as the batch search checks: in a few
+directions each, then the leader in ever more, until it has been checked in all and leads still; then the others.
+What ends it is the caller's: a count of directions gives the same answer each time, a clock may not.
 Results: ``placements.csv`` as a table, ``place.json`` with everything.
 """
 
@@ -10,65 +11,55 @@ from __future__ import annotations
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-import fcl
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
-from puncture_twin.planning.arm.insertion import flange_poses
-from puncture_twin.planning.arm.tool import Box, Tool
-from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.base.processes import map_all
-from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.base.processes import working
 from puncture_twin.planning.case.case import Case, bed_frame
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import MountSection
-from puncture_twin.planning.collision.bodies import Solid, connected_parts
+from puncture_twin.planning.collision.bodies import connected_parts
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.fast_checker import FastChecker
-from puncture_twin.planning.collision.patient import FclSkin
-from puncture_twin.planning.collision.state_checker import PATIENT, Contact
 from puncture_twin.planning.collision.workcell import (
     ARM_PADDING_MM,
-    case_boxes,
-    case_tool,
-    home_configuration,
-    outside_surface,
     patient_surface,
 )
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
-from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.place.arm_spheres import Boxes, SkinField, Surroundings
+from puncture_twin.planning.place.check import (
+    Checked,
+    PlacementCheck,
+    Verdict,
+    expected_tip_error_mm,
+    needle_can_start,
+    placement_check,
+)
 from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
 from puncture_twin.planning.place.mounts import (
     Site,
-    WantedDirections,
     mount_lines,
     mount_section,
     regions,
-    wanted_directions,
 )
-from puncture_twin.planning.reach.reach import assess_reach_all
-from puncture_twin.planning.reach.survey import ReachRequest
-from puncture_twin.planning.registration.fit_uncertainty import reading_noise, touches
-from puncture_twin.planning.registration.marker_pairs import MarkerPairs
-from puncture_twin.planning.registration.placement import Placement, default_method
-from puncture_twin.planning.registration.registration import Registration, register
+from puncture_twin.planning.reach.survey import ReachAnswer
+from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.uncertainty.pose_error import PoseError
 
-Progress = Callable[[str, int, int], None]
+GoesOn = Callable[[int, int | None], bool]
+"""Called with how many directions were checked, summed over placements, of how many (None before the finalists are
+known); False ends the search."""
 
 COARSE_DIRECTIONS = 64
 """Directions that a site is estimated with at first."""
@@ -82,8 +73,14 @@ SEEDS = 10
 HALVINGS = 3
 """How often the step is halved: from 150 mm to 19 mm, about as exactly as a base is set up."""
 
-FINALISTS = 6
-"""Sites that are checked exactly; each mount's best is among them."""
+FIRST, SECOND = 64, 512
+"""Directions, evenly spread, in which a placement is checked before it is checked in all."""
+
+PIECE = 256
+"""Directions checked in one piece: some tenths of a second to some seconds."""
+
+FINALISTS = 8
+"""Placements that are checked in all directions; each mount's best is among them."""
 
 FRACTION_DIGITS = 3
 """Fractions that agree to so many digits are equal; then the expected error decides, then the margin."""
@@ -100,7 +97,7 @@ class RatedPlacement:
         site: Position of the base; None for the case's own placement.
         mount: The base's pose as a case states it.
         estimate: The estimate that it was chosen by; None for the case's own.
-        verdict: The result of the exact check.
+        verdict: The result of the exact check, in some directions or all.
         expected_mm: Expected (rms) error of the tip over its insertions, the markers touched anew from there; None
             where the case declares no errors, or has no markers.
     """
@@ -125,17 +122,28 @@ class PlaceSearch:
         T_ct_bed: Shape (4, 4), mm: the frame of the sites.
         coarse: Every site of the first lattice with its estimate.
         refined: How many more sites were estimated.
+        resolution_mm: The step between sites at the end.
         possible: Fraction of directions, 0..1, in which the needle may wait at its standoff: no placement reaches more.
+        directions: How many are safe for the organs.
+        checked: Directions checked, summed over placements, and how many would have been in the end, if known.
         rated: Best first; the case's own placement is not among them.
-        own: The case's own placement, checked; None where it has none.
+        own: The case's own placement, checked; None where it has none, or the search ended before.
     """
 
     T_ct_bed: Floats
     coarse: tuple[tuple[Site, ReachEstimate], ...]
     refined: int
+    resolution_mm: float
     possible: float
+    directions: int
+    checked: tuple[int, int | None]
     rated: tuple[RatedPlacement, ...]
     own: RatedPlacement | None
+
+    @property
+    def complete(self) -> bool:
+        """Whether the search came to its end."""
+        return self.checked[1] is not None and self.checked[0] >= self.checked[1]
 
 
 def search_placements(
@@ -145,19 +153,21 @@ def search_placements(
     placement: Placement | None,
     *,
     jobs: int = 1,
-    progress: Progress = lambda stage, done, total: None,
+    goes_on: GoesOn = lambda done, total: True,
+    first: Callable[[RatedPlacement], None] = lambda one: None,
 ) -> PlaceSearch:
     """Search for the placements from which the arm can reach most of the organ-safe directions.
 
-    The answer does not depend on ``jobs``.
+    One placement at least is checked, in `FIRST` directions. The answer does not depend on ``jobs``.
 
     Args:
         case: The validated case.
         anatomy: Its structures.
         candidates: Its directions, checked against the organs alone.
         placement: Where the case itself has the arm.
-        jobs: Processes.
-        progress: Called with (stage, done, total).
+        jobs: Processes that check.
+        goes_on: Ends the search.
+        first: Called with the first answer.
 
     Raises:
         InputError: Bounds that contradict the case, or an own arm or tool with a shape that hangs on nothing.
@@ -167,65 +177,55 @@ def search_placements(
         what = "no direction is safe for the organs, so no placement can help"
         raise NoAnswerError(what, counts=candidates.counts(), code="no_safe_direction")
     # 1. The workcell, and the directions in which the needle itself is clear at its standoff.
-    T_ct_bed = bed_frame(case)
-    check = _placement_check(case, anatomy, candidates)
+    T_ct_bed, step_mm = bed_frame(case), case.place.step_mm
+    check = placement_check(case, anatomy, candidates)
     CellChecker(check.model, check.tool)  # refuses shapes that hang on nothing before minutes are spent
     near, beyond = _parted(anatomy)
     surroundings = Surroundings(
-        SkinField.of(patient_surface(near)), Boxes.of((*check.fixed, *beyond)), Boxes.of(check.carried), ARM_PADDING_MM
+        SkinField.of(near), Boxes.of((*check.fixed, *beyond)), Boxes.of(check.carried), ARM_PADDING_MM
     )
-    startable = check.wanted.only(
-        needle_can_start(check.tool, check.patient, case.target_ct, check.wanted, ARM_PADDING_MM)
+    startable = check.wanted.spread(SECOND)
+    startable = startable.only(
+        needle_can_start(check.tool, patient_surface(anatomy), case.target_ct, startable, ARM_PADDING_MM)
     )
     if not len(startable):
         what = "in every organ-safe direction the needle would start too near the skin"
         raise NoAnswerError(what, code="standoff_in_skin")
-    # 2. All sites of a lattice, by bounding spheres (an estimate).
-    coarse = Estimator(
-        check.model, check.tool, surroundings, T_ct_bed, startable.spread(COARSE_DIRECTIONS), itself=False
-    )
-    fine = replace(coarse, wanted=startable.spread(FINE_DIRECTIONS))
-    sites = [
-        Site(region, (float(x), float(y), float(z)))
+    # 2. All sites of a lattice, by bounding spheres (an estimate); the best of them checked in a few directions.
+    estimator = Estimator(check.model, check.tool, surroundings, T_ct_bed, startable.spread(COARSE_DIRECTIONS))
+    coarse = tuple(
+        (site, estimator.estimate(site))
         for region in regions(case, T_ct_bed)
-        for x, y, z in region.lattice(case.place.step_mm)
-    ]
-    estimates = map_all(coarse.estimate, sites, jobs=jobs, progress=partial(progress, "placements estimated"))
-    first = tuple(zip(sites, estimates, strict=True))
-    # 3. The best of them refined, by ever shorter steps; 4. the best of those checked exactly.
-    seeds = [site for site, _ in _best_apart(first, 1.5 * case.place.step_mm, SEEDS)]
-    refiner = _Refiner(fine, partial(progress, "placements refined"))
-    finalists = _best_apart(refiner.refine(seeds, case.place.step_mm), case.place.step_mm / 2, FINALISTS)
-    rated, own = _checked(case, check, T_ct_bed, finalists, placement, jobs, partial(progress, "placements checked"))
-    return PlaceSearch(T_ct_bed, first, refiner.estimated, float(startable.weight.sum()), rated, own)
-
-
-def _checked(
-    case: Case,
-    check: PlacementCheck,
-    T_ct_bed: Floats,
-    finalists: Sequence[tuple[Site, ReachEstimate]],
-    placement: Placement | None,
-    jobs: int,
-    progress: Count,
-) -> tuple[tuple[RatedPlacement, ...], RatedPlacement | None]:
-    """The finalists checked exactly, best first, and the case's own placement, which is checked too."""
-    mounts = [mount_section(T_ct_bed @ site.T_bed_base(), case.space) for site, _ in finalists]
-    poses = [mount_pose(mount, case.space, case.path) for mount in mounts]
-    if placement is not None:  # first: nobody chose it, and the directions that are not reached take longest
-        poses.insert(0, placement.T_base_ct)
-    verdicts = map_all(check.verdict, poses, jobs=jobs, progress=progress)
-    own = None
-    if placement is not None:
-        T_ct_base = np.asarray(np.linalg.inv(placement.T_base_ct), dtype=np.float64)
-        verdict, pose = verdicts.pop(0), poses.pop(0)
-        expected = expected_tip_error_mm(case, placement, pose, verdict.q_insertion)
-        own = RatedPlacement(None, mount_section(T_ct_base, case.space), None, verdict, expected)
-    rated = [
-        RatedPlacement(site, mount, guess, verdict, expected_tip_error_mm(case, placement, pose, verdict.q_insertion))
-        for (site, guess), mount, pose, verdict in zip(finalists, mounts, poses, verdicts, strict=True)
-    ]
-    return tuple(sorted(rated, key=_worth)), own
+        for site in (Site(region, (float(x), float(y), float(z))) for x, y, z in region.lattice(step_mm))
+    )
+    seeds = _best_apart(coarse, 1.5 * step_mm, SEEDS)
+    race = _Race(case, T_ct_bed, check, goes_on)
+    contenders = [race.contender(*pair) for pair in seeds[:1]]
+    going = race.further(map, contenders, FIRST)
+    for one in contenders:
+        first(race.rated(one, placement))
+    # 3. The best walk to better places, by ever shorter steps; 4. where they end is checked, the best further.
+    fine = replace(estimator, wanted=startable.spread(FINE_DIRECTIONS))
+    walk = _walked(fine, seeds, step_mm, race.goes_on) if going else _Walk(seeds, 0, step_mm)
+    ends = [end for end in _best_apart(walk.ends, step_mm / 2, SEEDS) if end not in seeds[:1]]
+    contenders += [race.contender(*end) for end in ends]
+    own = None if placement is None else race.own(placement)
+    if going:
+        race.run(contenders, own, jobs)
+    rated = sorted((race.rated(one, placement) for one in contenders if one.answers), key=_worth)
+    rated_own = None if own is None or not own.answers else race.rated(own, placement)
+    possible = float(startable.weight.sum())
+    return PlaceSearch(
+        T_ct_bed,
+        coarse,
+        walk.estimated,
+        walk.step_mm,
+        possible,
+        len(check.wanted),
+        race.checked,
+        tuple(rated),
+        rated_own,
+    )
 
 
 def _worth(one: RatedPlacement) -> tuple[float, float, float]:
@@ -234,77 +234,169 @@ def _worth(one: RatedPlacement) -> tuple[float, float, float]:
     return -round(one.verdict.fraction, FRACTION_DIGITS), expected, -one.verdict.margin
 
 
-def _parted(anatomy: Anatomy) -> tuple[Anatomy, list[Box]]:
-    """The anatomy inside the image, and boxes, CT frame, about the body assumed beyond it, which is metres long."""
-    view, solids = anatomy.skin.field_of_view, anatomy.surroundings
-    T = np.eye(4) if view is None else view.T_ct_box
-    parts = [part for one in solids if one.name == BEYOND_IMAGE for part in connected_parts(one.mesh)]
-    boxes = []
-    for part in parts:
-        low, high = box_of((part - T[:3, 3]) @ T[:3, :3])
-        boxes.append(Box(BEYOND_IMAGE, T @ pose(np.eye(3), (low + high) / 2), tuple((high - low).tolist())))
-    return replace(anatomy, surroundings=tuple(one for one in solids if one.name != BEYOND_IMAGE)), boxes
+BEYOND_MM = 1.0
+"""What reaches farther beyond a face of the image was drawn on there."""
 
 
-def _placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> PlacementCheck:
-    """The case's workcell, with what moves with the patient apart from what moves with the arm, and its directions."""
-    carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
-    boxes = case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
-    return PlacementCheck(
-        model=case.robot.model,
-        tool=case_tool(case),
-        skin=anatomy.skin.mesh,
-        outside=outside_surface(anatomy),
-        fixed=tuple(box for box in boxes if box.name not in carried),
-        carried=tuple(box for box in boxes if box.name in carried),
-        padding_mm=ARM_PADDING_MM,
-        target_ct=case.target_ct,
-        wanted=wanted_directions(case, candidates),
-        home=home_configuration(case),
-    )
+def _parted(anatomy: Anatomy) -> tuple[TriangleMesh, list[Box]]:
+    """The surface inside the image, and boxes about what is drawn on beyond it, metres long; CT frame.
 
-
-class _Refiner:
-    """Local search: from sites to better neighbours with ever shorter steps; no site is estimated twice.
-
-    Whether the arm touches itself takes longest to compute, and can only lower a fraction. So it is computed for the
-    leading site alone, until the leading site is one for which it is known.
+    For the estimate alone: the rough profile of a couch, drawn on, would be ten million places of the distance field.
     """
+    view, skin = anatomy.skin.field_of_view, anatomy.skin.mesh
+    unseen = [one for one in anatomy.surroundings if one.role is Role.UNKNOWN]
+    T, imaged = np.eye(4), np.array([[-np.inf], [np.inf]]) * np.ones(3)
+    if view is not None:
+        T, imaged = view.T_ct_box, np.stack([np.zeros(3), view.size_mm])
+    near, parts = [skin], [part for one in unseen if one.name == BEYOND_IMAGE for part in connected_parts(one.mesh)]
+    drawn = [box_of((part - T[:3, 3]) @ T[:3, :3]) for part in parts]
+    for mesh in (one.mesh for one in unseen if one.name != BEYOND_IMAGE):
+        corners = ((mesh.vertices - T[:3, 3]) @ T[:3, :3])[mesh.faces]
+        inside = np.ones(len(corners), np.bool_)
+        for end, axis in np.ndindex(2, 3):
+            past = ((corners[:, :, axis] - imaged[end, axis]) * (2 * end - 1) > BEYOND_MM).any(axis=1)
+            if past.any():
+                drawn.append(box_of(corners[past].reshape(-1, 3)))
+                drawn[-1][1 - end, axis] = imaged[end, axis]
+            inside &= ~past
+        if inside.any():
+            used, faces = np.unique(mesh.faces[inside], return_inverse=True)
+            near.append(TriangleMesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32)))
+    boxes = [
+        Box(BEYOND_IMAGE, T @ pose(np.eye(3), (low + high) / 2), tuple((high - low).tolist())) for low, high in drawn
+    ]
+    return joined(near), boxes
 
-    def __init__(self, estimator: Estimator, progress: Count) -> None:
-        self._quick = replace(estimator, itself=False)
-        self._full = replace(estimator, itself=True)
-        self._progress = progress
-        self._upper: dict[Site, ReachEstimate] = {}  # without contacts of the arm with itself
-        self._whole: dict[Site, ReachEstimate] = {}
+
+@dataclass(eq=False)
+class _Contender:
+    """A placement that is checked in ever more directions."""
+
+    site: Site | None
+    mount: MountSection
+    T_base_ct: Floats
+    estimate: ReachEstimate | None
+    answers: list[ReachAnswer] = field(default_factory=list)
+    home_contact: str = ""
+
+
+Work = Callable[..., Iterable[Checked]]
+"""As ``map`` does it."""
+
+
+class _Race:
+    """Exact checks of contenders, in the order that finds the best soonest."""
+
+    def __init__(self, case: Case, T_ct_bed: Floats, check: PlacementCheck, goes_on: GoesOn) -> None:
+        self._case, self._T_ct_bed, self._check, self._goes_on = case, T_ct_bed, check, goes_on
+        self._order, self._all = check.wanted.order(SECOND), len(check.wanted)
+        self._done = 0
+        self._total: int | None = None
 
     @property
-    def estimated(self) -> int:
-        """Number of estimated sites."""
-        return len(self._upper)
+    def checked(self) -> tuple[int, int | None]:
+        """Directions checked, and how many will be, summed over the contenders; None where that is not known yet."""
+        return self._done, self._total
 
-    def refine(self, seeds: Sequence[Site], step_mm: float) -> list[tuple[Site, ReachEstimate]]:
-        """End of each seed's walk, with its estimate; each end once."""
-        ends = list(seeds)
-        for halving in range(1, HALVINGS + 1):
-            ends = self._leaders([[end, *_neighbours(end, step_mm / 2**halving)] for end in ends])
-        return [(end, self._whole[end]) for end in dict.fromkeys(ends)]
+    def goes_on(self) -> bool:
+        """Whether the search may."""
+        return self._goes_on(self._done, self._total)
 
-    def _leaders(self, groups: Sequence[Sequence[Site]]) -> list[Site]:
-        """The best site of each group."""
-        self._estimate(self._quick, self._upper, [site for group in groups for site in group])
-        while True:
-            leaders = [
-                max(group, key=lambda site: _score(self._whole.get(site, self._upper[site]))) for group in groups
-            ]
-            if all(leader in self._whole for leader in leaders):
-                return leaders
-            self._estimate(self._full, self._whole, leaders)
+    def contender(self, site: Site, estimate: ReachEstimate) -> _Contender:
+        """A site, its pose rounded as it is written."""
+        mount = mount_section(self._T_ct_bed @ site.T_bed_base(), self._case.space)
+        return _Contender(site, mount, mount_pose(mount, self._case.space, self._case.path), estimate)
 
-    def _estimate(self, estimator: Estimator, known: dict[Site, ReachEstimate], sites: Sequence[Site]) -> None:
-        new = [site for site in dict.fromkeys(sites) if site not in known]
-        # In this process: there are few of them, and a new process would have to build its arm first.
-        known |= dict(zip(new, map_all(estimator.estimate, new, jobs=1, progress=self._progress), strict=True))
+    def own(self, placement: Placement) -> _Contender:
+        """The case's own placement."""
+        T_ct_base = np.asarray(np.linalg.inv(placement.T_base_ct), dtype=np.float64)
+        return _Contender(None, mount_section(T_ct_base, self._case.space), placement.T_base_ct, None)
+
+    def run(self, contenders: Sequence[_Contender], own: _Contender | None, jobs: int) -> None:
+        """Check all in a few directions, then the finalists in all: who leads first, and the case's own after it."""
+        others = [] if own is None else [own]
+        everyone, few = [*contenders, *others], min(FIRST, self._all)
+        with working(jobs, len(everyone)) as work:
+            if not self.further(work, everyone, FIRST):
+                return
+            scores = [(one.site, self.verdict(one)) for one in contenders if one.site is not None]
+            chosen = [site for site, _ in _best_apart(scores, 0.0, FINALISTS)]
+            left = [one for one in contenders if one.site in chosen]
+            self._total = few * len(everyone) + (self._all - few) * (len(left) + len(others))
+            while left or others:
+                most = max((len(one.answers) for one in contenders), default=self._all)
+                follows = others and (len(others[0].answers) < most or not left)
+                one = others[0] if follows else max(left, key=self._fraction)
+                if not self.further(work, [one], SECOND if len(one.answers) < SECOND else self._all):
+                    return
+                left, others = ([one for one in some if len(one.answers) < self._all] for some in (left, others))
+
+    def further(self, work: Work, contenders: Sequence[_Contender], count: int) -> bool:
+        """Check contenders in so many directions each, as far as the search may go on; whether it may still."""
+        count = min(count, self._all)
+        begins = [(one, row) for one in contenders for row in range(len(one.answers), count, PIECE)]
+        pieces = [(one, row, min(row + PIECE, count)) for one, row in begins]
+        found = work(self._check.checked, [(one.T_base_ct, self._order[begin:end]) for one, begin, end in pieces])
+        for (one, begin, end), piece in zip(pieces, found, strict=True):
+            one.answers += piece.answers
+            one.home_contact = piece.home_contact
+            self._done += end - begin
+            if not self.goes_on():
+                return False
+        return True
+
+    def _fraction(self, one: _Contender) -> float:
+        return self.verdict(one).fraction
+
+    def verdict(self, one: _Contender) -> Verdict:
+        """What the checks of a contender say so far; each direction stands for all that are nearest to it."""
+        rows, answers, wanted = self._order[: len(one.answers)], one.answers, self._check.wanted
+        if len(rows) == self._all:
+            weight, answers = wanted.weight, [answers[row] for row in np.argsort(rows)]
+        else:
+            weight = wanted.standing_for_all(rows).weight
+        reached = np.array([answer.reachable for answer in answers], bool)
+        margins = [answer.margin for answer in answers if answer.reachable]
+        ends = [answer.insertion_q[-1] for answer in answers if answer.reachable]
+        return Verdict(
+            fraction=float(weight[reached].sum()),
+            reached=int(reached.sum()),
+            count=len(reached),
+            margin=float(np.mean(margins)) if margins else 0.0,
+            reasons=dict(Counter(answer.reason.value for answer in answers if not answer.reachable).most_common()),
+            home_contact=one.home_contact,
+            q_insertion=np.array(ends).reshape(-1, 6),
+            answers=tuple(answers),
+        )
+
+    def rated(self, one: _Contender, placement: Placement | None) -> RatedPlacement:
+        """A contender with what it is worth."""
+        verdict = self.verdict(one)
+        expected = expected_tip_error_mm(self._case, placement, one.T_base_ct, verdict.q_insertion)
+        return RatedPlacement(one.site, one.mount, one.estimate, verdict, expected)
+
+
+class _Walk(NamedTuple):
+    """Where sites have come to."""
+
+    ends: Sequence[tuple[Site, ReachEstimate]]
+    estimated: int
+    step_mm: float
+
+
+def _walked(
+    estimator: Estimator, seeds: Sequence[tuple[Site, ReachEstimate]], step_mm: float, goes_on: Callable[[], bool]
+) -> _Walk:
+    """The ends of walks uphill, by ever shorter steps, each end once; no site is estimated twice."""
+    known: dict[Site, ReachEstimate] = {}
+    pairs, halvings = list(seeds), 0
+    while halvings < HALVINGS and goes_on():
+        halvings += 1
+        groups = [[end, *_neighbours(end, step_mm / 2**halvings)] for end in dict(pairs)]
+        for site in (site for group in groups for site in group if site not in known):
+            known[site] = estimator.estimate(site)
+        pairs = [max(((site, known[site]) for site in group), key=lambda pair: _score(pair[1])) for group in groups]
+    return _Walk(list(dict(pairs).items()), len(known), step_mm / 2**halvings)
 
 
 def _neighbours(site: Site, step_mm: float) -> list[Site]:
@@ -312,19 +404,20 @@ def _neighbours(site: Site, step_mm: float) -> list[Site]:
     return [Site(site.region, (float(x), float(y), float(z))) for x, y, z in around]
 
 
-def _score(estimate: ReachEstimate) -> tuple[float, float]:
+Scored = TypeVar("Scored", ReachEstimate, Verdict)
+
+
+def _score(estimate: ReachEstimate | Verdict) -> tuple[float, float]:
     """Sort key of an estimate, more is better."""
     return round(estimate.fraction, FRACTION_DIGITS), estimate.margin
 
 
-def _order(estimate: ReachEstimate) -> tuple[float, float]:
+def _order(estimate: ReachEstimate | Verdict) -> tuple[float, float]:
     fraction, margin = _score(estimate)
     return -fraction, -margin
 
 
-def _best_apart(
-    pairs: Sequence[tuple[Site, ReachEstimate]], distance_mm: float, count: int
-) -> list[tuple[Site, ReachEstimate]]:
+def _best_apart(pairs: Sequence[tuple[Site, Scored]], distance_mm: float, count: int) -> list[tuple[Site, Scored]]:
     """Each mount's best, then the best of the others, as far as they reach any direction.
 
     Args:
@@ -334,8 +427,8 @@ def _best_apart(
     """
     holding = [pair for pair in pairs if pair[1].fraction > 0.0]
     mounts = {site.region.mount for site, _ in holding}
-    firsts: list[tuple[Site, ReachEstimate]] = []
-    others: list[tuple[Site, ReachEstimate]] = []
+    firsts: list[tuple[Site, Scored]] = []
+    others: list[tuple[Site, Scored]] = []
     for pair in sorted(holding, key=lambda pair: _order(pair[1])):
         is_first = pair[0].region.mount not in {site.region.mount for site, _ in firsts}
         if is_first:
@@ -352,161 +445,7 @@ def _far(one: Site, other: Site, distance_mm: float) -> bool:
     return one.region != other.region or apart >= distance_mm
 
 
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """Exact reach from one placement.
-
-    Attributes:
-        fraction: Solid angle of the reached directions over that of all that are wanted, 0..1.
-        reached: How many directions the arm can reach and insert along.
-        count: How many directions are wanted.
-        margin: Mean reach margin of the reached ones, 0..1; 0 for none.
-        reasons: How many of the others fell to which reason.
-        home_contact: What the arm touches in its home configuration, or "".
-        q_insertion: Shape (reached, 6), rad, the tip on the target.
-    """
-
-    fraction: float
-    reached: int
-    count: int
-    margin: float
-    reasons: Mapping[str, int]
-    home_contact: str
-    q_insertion: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class PlacementCheck:
-    """Checks placements. Its values can be sent to another process.
-
-    Attributes:
-        model: The arm.
-        tool: What its flange carries.
-        skin: CT frame.
-        outside: CT frame, what the CT shows outside of it, or None.
-        fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
-        carried: Boxes that stand with the arm, base frame.
-        padding_mm: Of the arm.
-        target_ct: Shape (3,), mm.
-        wanted: The directions.
-        home: Shape (6,), rad.
-    """
-
-    model: UrModel
-    tool: Tool
-    skin: TriangleMesh
-    outside: TriangleMesh | None
-    fixed: tuple[Box, ...]
-    carried: tuple[Box, ...]
-    padding_mm: float
-    target_ct: Floats
-    wanted: WantedDirections
-    home: Floats
-
-    @cached_property
-    def patient(self) -> TriangleMesh:
-        """Patient surface, CT frame: the skin, and what the CT shows outside of it."""
-        return self.skin if self.outside is None else joined([self.skin, self.outside])
-
-    def verdict(self, T_base_ct: Floats) -> Verdict:
-        """Check every direction.
-
-        Raises:
-            InputError: The base stands in the patient.
-        """
-        checker = self._checker(T_base_ct)
-        target = T_base_ct[:3, :3] @ self.target_ct + T_base_ct[:3, 3]
-        requests = [
-            ReachRequest(target, T_base_ct[:3, :3] @ outward, self.tool.needle_length_mm, float(standoff))
-            for outward, standoff in zip(self.wanted.outward_ct, self.wanted.standoff_mm, strict=True)
-        ]
-        answers = assess_reach_all(checker, requests)
-        reached = np.array([answer.reachable for answer in answers], bool)
-        margins = [answer.margin for answer in answers if answer.reachable]
-        ends = [answer.insertion_q[-1] for answer in answers if answer.reachable]
-        return Verdict(
-            fraction=float(self.wanted.weight[reached].sum()),
-            reached=int(reached.sum()),
-            count=len(reached),
-            margin=float(np.mean(margins)) if margins else 0.0,
-            reasons=dict(Counter(answer.reason.value for answer in answers if not answer.reachable).most_common()),
-            home_contact=_contact_text(checker.contact(self.home, needle_may_touch_patient=False)),
-            q_insertion=np.array(ends).reshape(-1, 6),
-        )
-
-    def _checker(self, T_base_ct: Floats) -> FastChecker:
-        boxes = [Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed]
-        outside = None if self.outside is None else self.outside.transformed(T_base_ct)
-        model, everything = self.model, (*boxes, *self.carried)
-        skin, cache = self.skin.transformed(T_base_ct), user_cache()
-        return FastChecker(model, self.tool, everything, skin, outside=outside, padding_mm=self.padding_mm, cache=cache)
-
-
-def _contact_text(contact: Contact | None) -> str:
-    return "" if contact is None else f"{contact.body} touches {contact.other}"
-
-
-def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Floats, q: Floats) -> float | None:
-    """Root mean square over insertions (n, 6) of sqrt(trace(Sigma_dd)); None without declared errors, markers or q.
-
-    How the arm will touch the markers from there nobody has said, so that the arm's own errors do not cancel (2 J_f
-    Sigma_eta J_f' stands for them); the residuals of the old touches say nothing of the new ones.
-
-    Args:
-        case: Declares the errors.
-        placement: Where the case has the arm; gives the markers.
-        T_base_ct: Shape (4, 4), mm: where the arm is to stand.
-        q: Joints (rad) with the tip on the target from there.
-    """
-    registration = None if placement is None else placement.registration
-    if case.errors is None or registration is None or not len(q):
-        return None
-    covariance = pose_error_from(case, registration, T_base_ct).covariance(q)
-    return float(np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2).mean()))
-
-
-def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -> PoseError:
-    """The needle's pose error from another placement; arguments as above, the case with errors."""
-    assert case.errors is not None  # the caller has looked
-    errors, old = replace(case.errors, found=False), registration.markers
-    markers = MarkerPairs(old.names, old.points_ct, apply(T_base_ct, old.points_ct))
-    model, tip = case.robot.model, case.needle.length_mm
-    noise = reading_noise(errors, model, tip, touches(case, markers), known=False)
-    method = (None if case.registration is None else case.registration.method) or default_method(errors)
-    fitted = register(markers, method=method, target_ct=case.target_ct, noise=noise)
-    assert fitted.uncertainty is not None  # its markers have noise
-    return PoseError(model, tip, apply(T_base_ct, case.target_ct), errors, fitted.uncertainty)
-
-
-def needle_can_start(
-    tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections, padding_mm: float
-) -> NDArray[np.bool_]:
-    """Whether the padded needle at standoff is clear of the skin: else no placement can reach the direction.
-
-    Args:
-        tool: With the needle.
-        skin: CT frame.
-        target_ct: Shape (3,), mm.
-        wanted: n directions.
-        padding_mm: What the arm's checker keeps from the patient.
-
-    Returns:
-        Shape (n,).
-    """
-    start, end = tool.needle_span_mm
-    radius, length = tool.needle_diameter_mm / 2 + padding_mm, end - start + 2 * padding_mm
-    needle, half = Solid(partial(fcl.Cylinder, radius, length)), np.array([radius, radius, length / 2])
-    patient = FclSkin(skin, PATIENT)
-    # From the tip, at the standoff from the target, the needle's middle is half its body farther out.
-    poses = flange_poses(target_ct, wanted.outward_ct, wanted.standoff_mm + (end - start) / 2)
-    clear = np.empty(len(wanted), np.bool_)
-    for row, T in enumerate(poses):
-        needle.place(fcl.Transform(T[:3, :3], T[:3, 3]))
-        clear[row] = not patient.touches(needle, np.array([-half, half]))
-    return clear
-
-
-PLACE_VERSION = 1
+PLACE_VERSION = 2
 """Version of ``place.json``'s layout."""
 
 COLUMNS = (
@@ -534,12 +473,7 @@ def _row(rank: int | None, one: RatedPlacement) -> dict[str, Any]:
 
 
 def _estimate(estimate: ReachEstimate) -> dict[str, float]:
-    return {
-        "reach": estimate.reach,
-        "room": estimate.unobstructed,
-        "share": estimate.fraction,
-        "margin": estimate.margin,
-    }
+    return {"reach": estimate.reach, "share": estimate.fraction, "margin": estimate.margin}
 
 
 def place_document(found: PlaceSearch, provenance: Mapping[str, Any]) -> dict[str, Any]:
@@ -556,6 +490,13 @@ def place_document(found: PlaceSearch, provenance: Mapping[str, Any]) -> dict[st
         "T_ct_bed": np.asarray(found.T_ct_bed).tolist(),
         "sites": {"coarse": len(found.coarse), "refined": found.refined, "judged": len(found.rated)},
         "possible_share": found.possible,
+        "search": {
+            "complete": found.complete,
+            "checked": found.checked[0],
+            "to_check": found.checked[1],
+            "directions": found.directions,
+            "resolution_mm": found.resolution_mm,
+        },
         "placements": rows,
         "mount_lines": None if best is None else mount_lines(best.mount),
     }

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import repeat
 from typing import Any
@@ -23,7 +24,7 @@ from puncture_twin.planning.clearance.engine import Clearances
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.standoff import standoffs
-from puncture_twin.planning.reach.survey import ReachRequest
+from puncture_twin.planning.reach.survey import ReachAnswer, ReachRequest
 from puncture_twin.planning.search.candidates import ARM_CHECKED, ArmColumns, Candidates, Verdict
 
 Column = NDArray[Any] | str | float
@@ -139,10 +140,16 @@ def with_reach(case: Case, candidates: Candidates, reach: ArmReach, progress: Co
     """Check whether the arm reaches, and can insert along, every candidate that is safe so far; fill its columns."""
     rows = np.flatnonzero(candidates.safe)
     requests = reach_requests(case, candidates, rows, reach.T_base_ct)
-    answers = assess_reach_all(reach.checker, requests, progress)
+    return with_answers(case, candidates, assess_reach_all(reach.checker, requests, progress))
+
+
+def with_answers(case: Case, candidates: Candidates, answers: Sequence[ReachAnswer]) -> Candidates:
+    """The arm's columns filled with the reach answers of all candidates that are safe so far, in their order."""
+    rows = np.flatnonzero(candidates.safe)
+    waiting = standoffs(case.needle, candidates.path.length[rows], candidates.path.skin_angle[rows])
     verdict = {field.name: getattr(candidates.verdict, field.name).copy() for field in fields(candidates.verdict)}
     reachable, margin, q_insertion = (getattr(candidates.arm, field.name).copy() for field in fields(candidates.arm))
-    for row, request, answer in zip(rows, requests, answers, strict=True):
+    for row, standoff_mm, answer in zip(rows, waiting, answers, strict=True):
         reachable[row] = int(answer.reachable)
         margin[row] = answer.margin
         if answer.reachable:
@@ -151,7 +158,7 @@ def with_reach(case: Case, candidates: Candidates, reach: ArmReach, progress: Co
             verdict["reason"][row], verdict["detail"][row] = answer.reason.value, answer.detail
             verdict["structure"][row] = "" if answer.contact is None else "/".join(answer.contact)
             inserted = answer.depth_mm  # the tip's distance from the target is what is left of the standoff
-            verdict["depth"][row] = np.nan if inserted is None else request.standoff_mm - inserted
+            verdict["depth"][row] = np.nan if inserted is None else standoff_mm - inserted
     return replace(
         candidates, verdict=Verdict(**verdict), arm=ArmColumns(reachable, margin, q_insertion), arm_note=ARM_CHECKED
     )

@@ -10,7 +10,7 @@ import pytest
 from hostile.makers import MAKERS
 from places import TESTS
 
-from puncture_twin.planning.base.processes import map_all, worker_count
+from puncture_twin.planning.base.processes import worker_count, working
 
 HERE = TESTS
 CASES = tomllib.loads((HERE / "hostile" / "cases.toml").read_text())["case"]
@@ -93,7 +93,8 @@ def test_a_million_jobs_are_as_many_processes_as_cores():
     assert worker_count(1_000_000, 1_000_000) == cores
     assert worker_count(1_000_000, 1) == 1
     assert worker_count(1_000_000, 0) == 1
-    answers = map_all(_process, range(400), jobs=1_000_000, progress=lambda done, of: None)
+    with working(1_000_000, 400) as work:
+        answers = list(work(_process, range(400), chunksize=48))
     assert [number for number, _ in answers] == list(range(400))
     assert len({process for _, process in answers}) <= cores
 

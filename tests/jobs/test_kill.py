@@ -198,7 +198,13 @@ def test_place_killed_at_random(tmp_path):
         case = tmp_path / name / "case.toml"
         case.write_text(case.read_text().replace("step_deg = 2.0", f"step_deg = {step}") + PLACE)
         cases.append(case)
-    kills("place", "place", [["place", case] for case in cases], [sha256(case) for case in cases], tmp_path / "out")
+    kills(
+        "place",
+        "place",
+        [["place", case, "--full"] for case in cases],
+        [sha256(case) for case in cases],
+        tmp_path / "out",
+    )
 
 
 @needs_time

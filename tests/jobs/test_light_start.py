@@ -60,6 +60,15 @@ def test_a_search_without_arm_and_pictures_loads_no_library_that_it_does_not_use
     assert left_loaded(tmp_path, ["--no-pictures"], UNUSED) == "[] 0"
 
 
+def test_a_check_of_one_candidate_loads_no_writer_of_tables():
+    """With arm and chances: pyarrow is a list's."""
+    case = ["check", str(ROOT / "meshes" / "abdomen"), "--theta", "64", "--beta", "98"]
+    code = f"import sys\nfrom puncture_twin import run_twin\ncode = run_twin.main({case!r})\n"
+    said = code + "print(sorted({'pyarrow', 'matplotlib', 'plotly'} & set(sys.modules)), code)"
+    done = subprocess.run([sys.executable, "-c", said], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[] 0"
+
+
 def test_pictures_are_drawn_without_the_state_of_pyplot(tmp_path):
     """No window system is asked for, and nothing is drawn that another part of a program has set up."""
     assert left_loaded(tmp_path, [], {"matplotlib.pyplot", "plotly"}) == "[] 0"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,18 +16,22 @@ from refusals import refused
 
 from puncture_twin import run_twin
 from puncture_twin.meshes import folder
+from puncture_twin.planning.anatomy.skin import FieldOfView
+from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.base.processes import map_all
+from puncture_twin.planning.base.processes import working
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.case.options import CaseOptions
 from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.settings import mount_pose
+from puncture_twin.planning.case.tables import MountSection
 from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.geometry.containment import Side, side_of
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.place.arm_spheres import (
     ArmSpheres,
     Boxes,
@@ -37,6 +41,7 @@ from puncture_twin.planning.place.arm_spheres import (
     clear_branches,
     skin_distance,
 )
+from puncture_twin.planning.place.check import PlacementCheck, needle_can_start, placement_check
 from puncture_twin.planning.place.estimate import Estimator, insertion_branches
 from puncture_twin.planning.place.mounts import (
     Region,
@@ -46,8 +51,9 @@ from puncture_twin.planning.place.mounts import (
     mount_section,
     regions,
     ring_weights,
+    wanted_directions,
 )
-from puncture_twin.planning.place.search import PlacementCheck, needle_can_start, search_placements
+from puncture_twin.planning.place.search import _parted, search_placements
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.constraints import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
@@ -281,19 +287,16 @@ def test_turning_the_base_about_its_own_axis_changes_no_share(ball):
     shares = set()
     for turn in (0.0, 2.5):
         R = trimesh.transformations.rotation_matrix(turn, [0, 0, 1])
-        shares.add(check.verdict(np.linalg.inv(T @ R)).reached)
+        answers = check.checked((np.linalg.inv(T @ R), np.arange(30))).answers
+        shares.add(sum(one.reachable for one in answers))
     assert len(shares) == 1 and 0 < shares.pop() < 30
 
 
 def test_answers_come_in_order_from_however_many_processes():
-    """And progress ends at the number of things."""
-    seen = []
+    """As by ``map``, and of nothing nothing."""
     for jobs in (1, 2):
-        assert map_all(abs, [-3, 2, -1, 0, -7, 5], jobs=jobs, progress=lambda done, n: seen.append((done, n))) == [
-            *(3, 2, 1, 0, 7, 5)
-        ]
-    assert seen.count((6, 6)) == 2
-    assert map_all(abs, [], jobs=2, progress=lambda done, n: None) == []
+        with working(jobs, 6) as work:
+            assert list(work(abs, [-3, 2, -1, 0, -7, 5])) == [3, 2, 1, 0, 7, 5] and list(work(abs, [])) == []
 
 
 def test_asking_the_best_branch_first_changes_no_estimate():
@@ -306,7 +309,7 @@ def test_asking_the_best_branch_first_changes_no_estimate():
     at = trimesh.transformations.translation_matrix([0.0, 0.0, -120.0])
     table = Boxes.of([Box("table", at, (800.0, 800.0, 20.0))])
     room = Surroundings(skin, table, nothing, 5.0)
-    quick = Estimator(UR3, TOOL, room, np.eye(4), wanted, itself=False)
+    quick = Estimator(UR3, TOOL, room, np.eye(4), wanted)
     region, seen = Region("ceiling", "", (0, 0, -1), ANYWHERE, ANYWHERE), set()
     for position in rng.uniform([-400, -400, 0], [400, 400, 600], (8, 3)):
         site = Site(region, tuple(position))
@@ -323,7 +326,6 @@ def test_asking_the_best_branch_first_changes_no_estimate():
         said = quick.estimate(site)
         assert said.fraction == pytest.approx((best > 0).mean())
         assert said.margin == pytest.approx(best[best > 0].mean() if best.any() else 0.0)
-        assert replace(quick, itself=True).estimate(site).unobstructed == said.unobstructed
         seen.add(round(said.fraction, 3))
     assert len(seen) > 3
 
@@ -332,16 +334,16 @@ def test_what_the_needle_cannot_do_is_said_only_where_there_is_such_a_thing():
     """No line about directions that nobody can hold where every one can be held."""
     assert needle_line(1.0) == [] and needle_line(1.0 - 1e-12) == []
     (line,) = needle_line(0.815)
-    assert "at most 81.5 %" in line and "too near the skin" in line
+    assert "81.5 %" in line and "too near the skin" in line
 
 
 def test_place_from_the_command_line(case_folder, tmp_path, capsys):
     """Table, document and pictures agree; the share is the search's own from there."""
     here = case_folder(more=FEW)
     out = tmp_path / "out"
-    assert run_twin.main(["place", str(here), "--out", str(out), "--no-pictures"]) == 0
+    assert run_twin.main(["place", str(here), "--out", str(out), "--no-pictures", "--full"]) == 0
     printed = capsys.readouterr().out
-    assert run_twin.main(["place", str(here), "--out", str(out), "--json"]) == 0
+    assert run_twin.main(["place", str(here), "--out", str(out), "--json", "--full"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["warnings"] and all(f"warning: {one}" in printed for one in said["warnings"])
     best, own = said["placements"][0], said["placements"][-1]
@@ -355,6 +357,8 @@ def test_place_from_the_command_line(case_folder, tmp_path, capsys):
     rows = list(csv.DictReader((out / "placements.csv").open(encoding="utf-8")))
     assert [float(row["share"]) for row in rows] == [one["share"] for one in said["placements"]]
     assert all(one["share"] <= said["possible_share"] + 1e-9 for one in said["placements"])
+    assert said["search"]["complete"] and said["search"]["checked"] == said["search"]["to_check"]
+    assert not any("ended by the clock" in one for one in said["warnings"])
     assert [Path(name).name for name in said["files"]] == [
         *("placements.csv", "place.json", "placements.png", "map_best_place.png")
     ]
@@ -380,7 +384,7 @@ def test_no_placement_holds_anything(case_folder, tmp_path, capsys):
     """Bounds out of reach: exit code 1, and the table is there, with the case's own placement alone."""
     more = '\n[place]\nmounts = ["floor"]\nstep_mm = 500.0\n[place.floor]\nalong_mm = [3000.0, 3500.0]\n'
     here = case_folder(more=more)
-    assert run_twin.main(["place", str(here), "--out", str(tmp_path / "out"), "--no-pictures", "--jobs", "1"]) == 1
+    assert run_twin.main(["place", str(here), "--out", str(tmp_path / "out"), "--no-pictures"]) == 1
     assert "no placement holds any" in capsys.readouterr().err
     rows = list(csv.DictReader((tmp_path / "out" / "placements.csv").open(encoding="utf-8")))
     assert [row["placement"] for row in rows] == ["as in the case"]
@@ -392,6 +396,136 @@ def test_a_search_that_finds_nothing_safe_says_so(case_folder):
     found = organ_candidates(context.case, context.anatomy, context.engine, context.case.directions())
     with pytest.raises(Exception, match="no direction is safe"):
         search_placements(context.case, context.anatomy, found, None)
+
+
+LITTLE = """
+[place]
+mounts = ["ceiling", "side"]
+step_mm = 300.0
+[place.ceiling]
+along_mm = [-100.0, 200.0]
+across_mm = [0.0, 450.0]
+height_mm = [450.0, 550.0]
+[place.side]
+along_mm = [-300.0, 300.0]
+across_mm = [0.0, 450.0]
+height_mm = [450.0, 550.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory):
+    """The embedded abdomen with a step of 8 degrees and little room for two mounts; its organ-safe directions."""
+    here = tmp_path_factory.mktemp("grid") / "abdomen"
+    shutil.copytree(folder() / "abdomen", here)
+    text = (here / "case.toml").read_text().replace("step_deg = 2.0", "step_deg = 8.0")
+    (here / "case.toml").write_text(text + LITTLE)
+    context = prepare(here, arm=False)
+    return context, organ_candidates(context.case, context.anatomy, context.engine, context.case.directions())
+
+
+def searched(grid, checks, jobs=1):
+    """The search that ends after so many checks, and the leave that it asked for."""
+    context, candidates = grid
+    asked = []
+
+    def goes_on(done, total):
+        asked.append((done, total))
+        return done < checks
+
+    return search_placements(
+        context.case, context.anatomy, candidates, context.placement, jobs=jobs, goes_on=goes_on
+    ), asked
+
+
+def best_share(grid, one):
+    """The share of a placement, checked in every direction from the pose that is written."""
+    context, candidates = grid
+    T = mount_pose(one.mount, context.case.space, context.case.path)
+    reached = with_reach(context.case, candidates, ArmReach(case_checker(context.case, context.anatomy, T), T))
+    wanted = wanted_directions(context.case, candidates)
+    return float(wanted.weight[reached.arm.reachable[candidates.safe] == 1].sum())
+
+
+@pytest.fixture(scope="module")
+def whole(grid):
+    """The search to its end."""
+    return searched(grid, np.inf)
+
+
+def test_a_search_that_ends_early_says_how_far_it_came_and_is_near_the_best(grid, whole):
+    """After a fifth of the checks the best is nearly the whole search's; nothing is claimed that was not checked."""
+    full, asked = whole
+    assert full.complete and asked[-1] == full.checked and full.checked[0] == full.checked[1]
+    first, _ = searched(grid, 1)
+    some, _ = searched(grid, full.checked[1] // 5)
+    for found in (first, some):
+        assert not found.complete and found.checked[0] < full.checked[0]
+        for one in (*found.rated, *([found.own] if found.own else [])):
+            assert one.verdict.count == len(one.verdict.answers) <= found.directions
+            assert one.verdict.reached == sum(answer.reachable for answer in one.verdict.answers)
+    assert len(first.rated) == 1 and first.rated[0].verdict.count == 64 and first.resolution_mm == 300.0
+    assert full.resolution_mm == 300.0 / 8
+    best = best_share(grid, full.rated[0])
+    assert full.rated[0].verdict.fraction == pytest.approx(best, abs=1e-12)
+    assert best_share(grid, first.rated[0]) > 0.8 * best
+    assert best_share(grid, some.rated[0]) > 0.95 * best
+
+
+def test_the_same_count_of_checks_gives_the_same_answer_from_however_many_processes(grid):
+    """And a further check later than that changes nothing before it."""
+    one, two = (searched(grid, 700, jobs)[0] for jobs in (1, 2))
+    said = [
+        [(rated.name, rated.mount, rated.verdict.count, rated.verdict.fraction) for rated in found.rated]
+        for found in (one, two)
+    ]
+    assert said[0] == said[1] and one.checked == two.checked and one.checked[0] >= 700
+
+
+def test_finalists_are_each_mounts_best_and_all_are_checked_in_full(whole):
+    """Eight at least, and the case's own; the others stay at the few directions."""
+    full, _ = whole
+    counts = [one.verdict.count for one in full.rated]
+    assert counts.count(full.directions) >= min(8, len(counts)) and full.own.verdict.count == full.directions
+    for mount in {one.site.region.mount for one in full.rated}:
+        best = max((one for one in full.rated if one.site.region.mount == mount), key=lambda one: one.verdict.fraction)
+        assert best.verdict.count == full.directions
+
+
+@pytest.mark.parametrize("z", [450.0, -420.0])
+def test_a_base_in_what_nobody_saw_reaches_nothing(grid, z):
+    """Beyond the trunk's ends, at its own height: no direction is checked there, and the reason is kept."""
+    context, candidates = grid
+    mount = MountSection(position_mm=(0.0, 0.0, z), x_axis=(1.0, 0.0, 0.0), z_axis=(0.0, -1.0, 0.0))
+    T = mount_pose(mount, context.case.space, context.case.path)
+    found = placement_check(context.case, context.anatomy, candidates).checked((T, np.arange(5)))
+    assert [one.reachable for one in found.answers] == [False] * 5 and "base" in found.home_contact
+
+
+def test_what_a_clock_ends_is_said_with_the_way_to_the_end(case_folder, tmp_path, capsys):
+    """A second is over before the first answer, which is given all the same, checked as far as it says."""
+    here, out = case_folder(("step_deg = 15.0", "step_deg = 8.0"), more=FEW), tmp_path / "out"
+    assert run_twin.main(["place", str(here), "--out", str(out), "--no-pictures", "--json", "--quick", "1"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    (best,) = said["placements"]
+    assert not said["search"]["complete"] and 0 < best["held"] <= best["asked"] == 64 < said["search"]["directions"]
+    assert "--full" in said["warnings"][-1]
+
+
+def test_what_is_drawn_on_beyond_the_image_is_boxes_for_the_estimate(ball):
+    """A couch through the image and metres beyond it: the field's grid ends with the image."""
+    skin, couch = ball(100.0), trimesh.creation.box(extents=(300.0, 40.0, 4000.0))
+    solid = TriangleMesh(np.asarray(couch.vertices), np.asarray(couch.faces))
+    ends = trimesh.creation.box(extents=(300.0, 40.0, 200.0))
+    inner = TriangleMesh(np.asarray(ends.vertices), np.asarray(ends.faces))
+    T = np.eye(4)
+    T[:3, 3] = -100.0, -100.0, -100.0
+    view = FieldOfView(T, np.full(3, 200.0), np.zeros((3, 2), bool))
+    outside = SimpleNamespace(role=Role.UNKNOWN, name="outside_body", mesh=joined([solid, inner]))
+    near, boxes = _parted(SimpleNamespace(skin=SimpleNamespace(mesh=skin, field_of_view=view), surroundings=(outside,)))
+    assert np.abs(near.bounds).max() <= 101.0
+    corners = np.array([box.T_base_box[:3, 3] + s * np.array(box.size_mm) / 2 for box in boxes for s in (-1, 1)])
+    np.testing.assert_allclose([corners.min(axis=0), corners.max(axis=0)], [[-150, -20, -2000], [150, 20, 2000]])
 
 
 @pytest.mark.parametrize("z", [450.0, -420.0])

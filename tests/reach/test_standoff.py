@@ -18,8 +18,8 @@ from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.place.check import needle_can_start
 from puncture_twin.planning.place.mounts import wanted_directions
-from puncture_twin.planning.place.search import needle_can_start
 from puncture_twin.planning.reach.standoff import (
     MAX_GAP_MM,
     UNEVEN_SKIN_MM,

@@ -110,6 +110,16 @@ def test_numba_and_llvmlite_are_used_by_their_public_names():
     assert option == ["numba_kernels.py"]  # the one private option; without it the answers are the same
 
 
+def test_no_private_part_of_a_library_is_imported():
+    """A module or name with an underscore before it is moved without a word, by any version."""
+    files = [
+        *modules().values(),
+        *(path for part in ("tests", "benchmarks", "docs", "tools") for path in (ROOT / part).rglob("*.py")),
+    ]
+    others = {(path.name, name) for path in files for name in imported(path) if not within(name, NAME)}
+    assert sorted(pair for pair in others if re.search(r"\._[^_]", f".{pair[1]}")) == []
+
+
 def test_everything_is_imported_under_one_name():
     """A second way to the same file would be a second copy of every class."""
     folders = ("tests", "benchmarks", "docs", "examples")

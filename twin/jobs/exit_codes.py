@@ -15,7 +15,6 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, get_args
 
 import typer
-from typer._click.exceptions import ClickException
 
 from puncture_twin.planning.base.errors import (
     MOST_WHAT,
@@ -143,7 +142,7 @@ def _exit_code_of(command: Callable[[], object], print_line: PrintLine, as_json:
                 flush_output()
         except (KeyboardInterrupt, typer.Abort):
             result = INTERRUPTED
-        except (PlanningError, ClickException) as error:
+        except (PlanningError, typer.TyperException) as error:
             line, code = _line_and_code(error)
             print_line(line)
             return code
@@ -182,8 +181,8 @@ def _failed(error: Exception, print_line: PrintLine) -> int:
     return PROGRAM_FAILED
 
 
-def _line_and_code(error: PlanningError | ClickException) -> tuple[str, int]:
-    if isinstance(error, ClickException):
+def _line_and_code(error: PlanningError | typer.TyperException) -> tuple[str, int]:
+    if isinstance(error, typer.TyperException):
         what = one_line(error.format_message().replace("Value error, ", ""), MOST_WHAT).rstrip(".")
         return f"command line: {what}; allowed: {allowed_text(error)}", BAD_INPUT
     if isinstance(error, NoAnswerError):
@@ -195,7 +194,7 @@ def _answered(command: Callable[[], object]) -> object:
     """Run a command; what it raises on purpose stands on stdout too, as the one object that ``--json`` promises."""
     try:
         return command()
-    except (PlanningError, ClickException) as error:
+    except (PlanningError, typer.TyperException) as error:
         what, _, allowed = _line_and_code(error)[0].partition("; allowed: ")
         document = {
             "code": getattr(error, "code", "command_line"),
@@ -226,7 +225,7 @@ def _notes(usual: Callable[..., None], print_line: PrintLine) -> Callable[..., N
 NUMBERS = {int: "a whole number", float: "a number"}
 
 
-def allowed_text(error: ClickException) -> str:
+def allowed_text(error: typer.TyperException) -> str:
     """The values of the option whose value is wrong; where they cannot be listed, the help that has them."""
     option = getattr(error, "param", None)
     descriptor = getattr(option, "type_descriptor", None)  # typer's own: what is not there is not told

@@ -24,7 +24,6 @@ from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, finite
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.twin.jobs.patient.answers import explain_choice
-from puncture_twin.twin.jobs.patient.candidates_export import csv_text
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
 
@@ -194,12 +193,15 @@ def write_checked(checked: CheckedList, context: CaseContext, out: Path) -> Chec
     names, stages, note = (CSV, PARQUET), context.stages.seconds, context.watcher.note
     with writing(out, "check list", inputs=checked.inputs, seconds=stages, names=names, note=note) as draft:
         paths = (draft.folder / CSV, draft.folder / PARQUET)
+        # Here: pyarrow takes 0.05 s, and a single candidate needs none.
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        from puncture_twin.twin.jobs.patient.candidates_export import csv_text
+
         rows = [[row[name] for name in COLUMNS] for row in checked.rows]
         paths[0].write_text(csv_text(COLUMNS, rows), encoding="utf-8", newline="")
         run = {**context.provenance(), "inputs": inputs_document(checked.inputs)}
-        import pyarrow as pa  # here: it takes 0.05 s, and a single candidate needs none
-        import pyarrow.parquet as pq
-
         table = pa.table({name: pa.array([row[name] for row in checked.rows], _kind(name)) for name in COLUMNS})
         pq.write_table(table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)}), paths[1])
     return CheckedList(**{**vars(checked), "files": draft.final(paths)})

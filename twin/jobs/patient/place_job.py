@@ -5,6 +5,7 @@ What ``place`` prints for a person.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +15,6 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.output.output_set import withdraw, writing
-from puncture_twin.planning.case.settings import mount_pose
-from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.place.search import (
     PlaceSearch,
     RatedPlacement,
@@ -25,7 +24,7 @@ from puncture_twin.planning.place.search import (
     write_placements,
 )
 from puncture_twin.planning.search.candidates import ARM_CHECKED
-from puncture_twin.planning.search.constraints import ArmReach, with_reach
+from puncture_twin.planning.search.constraints import with_answers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.search import organ_candidates
@@ -43,8 +42,6 @@ class PlaceRun:
     found: PlaceSearch
     document: dict[str, Any]
     files: tuple[Path, ...]
-    directions: int
-    """That the organs allow."""
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm; shares 0..1."""
@@ -52,8 +49,59 @@ class PlaceRun:
         return {**self.document, "seconds": seconds, "files": [str(path) for path in self.files]}
 
 
-def place_case(context: CaseContext, out: Path, *, jobs: int, pictures: bool = True) -> PlaceRun:
+QUICK_S = 30.0
+"""As long as a person waits."""
+
+PICTURES_S = 2.0
+"""What drawing takes, about."""
+
+
+class _Clock:
+    """Whether the search goes on, and for how long still.
+
+    Args:
+        context: Whose watcher is told.
+        end: `time.perf_counter` then; infinite for a search to its end.
+    """
+
+    def __init__(self, context: CaseContext, end: float) -> None:
+        self._count, self._end = context.watcher.count, end
+        self._began = time.perf_counter()
+        self._last = self._since = (self._began, 0)
+
+    def __call__(self, done: int, total: int | None) -> bool:
+        """Not where the next piece of work, as long as the last one, would end too late."""
+        now = time.perf_counter()
+        piece = now - self._last[0] if self._last[1] else 0.0  # what came before the first is no such piece
+        self._last = now, done
+        if total is None:
+            self._since = now, done
+        began, first = self._since
+        if total is not None and now + (total - done) * (now - began) / max(1, done - first) < self._end:
+            self._count("directions checked", done, total)
+        elif now < self._end < np.inf:
+            self._count("seconds of the search", round(now - self._began), round(self._end - self._began))
+        return now + piece < self._end
+
+
+def place_case(
+    context: CaseContext,
+    out: Path,
+    *,
+    jobs: int = 1,
+    pictures: bool = True,
+    quick_s: float | None = QUICK_S,
+    began: float | None = None,
+) -> PlaceRun:
     """Search; write ``placements.csv``, ``place.json`` and, if wanted, the two pictures.
+
+    Args:
+        context: The case, whose own arm need not be checked.
+        out: The folder.
+        jobs: Processes.
+        pictures: Whether to draw.
+        quick_s: End after about so many seconds, with what is known then; None searches to the end.
+        began: `time.perf_counter` from which they count; now, if None.
 
     Raises:
         InputError: Bounds that contradict the case.
@@ -70,17 +118,18 @@ def place_case(context: CaseContext, out: Path, *, jobs: int, pictures: bool = T
             names=names,
             note=context.watcher.note,
         ) as draft:
-            run = _placed(context, draft.folder, jobs, pictures)
+            until = np.inf if quick_s is None else quick_s + (time.perf_counter() if began is None else began)
+            run = _placed(context, draft.folder, jobs, pictures, until)
     except NoAnswerError:
         withdraw(out, "place")
         raise
     if not any(one.verdict.reached for one in run.found.rated):
-        what = f"no placement holds any of the {run.directions} organ-safe directions"
+        what = f"no placement holds any of the organ-safe directions ({run.found.checked[0]:,} checks)"
         raise NoAnswerError(what, code="no_placement")
     return replace(run, files=draft.final(run.files))
 
 
-def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> PlaceRun:
+def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: float) -> PlaceRun:
     """Search, and write everything into a folder."""
     case, stages = context.case, context.stages
     with stages.time("organs"):
@@ -92,9 +141,12 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> Place
             candidates,
             context.placement,
             jobs=jobs,
-            progress=context.watcher.count,
+            goes_on=_Clock(context, until - PICTURES_S * pictures),
+            first=lambda one: context.watcher.note(_first_text(one)),
         )
     document = place_document(found, context.provenance() | {"arm": ARM_CHECKED})
+    if not found.complete:
+        document["warnings"] = [*document["warnings"], _ended_text(found)]
     write_placements(found, out / "placements.csv")
     write_place_document(document, out / "place.json")
     files = [out / "placements.csv", out / "place.json"]
@@ -104,16 +156,30 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> Place
         with stages.time("pictures"):
             draw_placements(found, case, context.anatomy.skin.mesh, out / "placements.png")
             files.append(out / "placements.png")
-    if pictures and any(one.verdict.reached for one in found.rated):
+    best = found.rated[0].verdict if found.rated else None
+    if pictures and best is not None and best.reached and best.count == found.directions:
         from puncture_twin.twin.report.map.map_picture import draw_map
 
-        T_base_ct = mount_pose(found.rated[0].mount, case.space, case.path)
         with stages.time("map"):
-            reach = ArmReach(case_checker(case, context.anatomy, T_base_ct), np.asarray(T_base_ct))
-            reached = ranked(case, with_reach(case, candidates, reach))
+            reached = ranked(case, with_answers(case, candidates, best.answers))
             draw_map(reached, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
             files.append(out / "map_best_place.png")
-    return PlaceRun(context, found, document, tuple(files), int(candidates.safe.sum()))
+    return PlaceRun(context, found, document, tuple(files))
+
+
+def _first_text(one: RatedPlacement) -> str:
+    """The first answer, while the search goes on."""
+    share = f"{100 * one.verdict.fraction:.0f} % ({one.verdict.reached} of {one.verdict.count} directions checked)"
+    return f"so far: {one.name}, base at {list(one.mount.position_mm)} mm, {share}"
+
+
+def _ended_text(found: PlaceSearch) -> str:
+    """How far a search came that the clock ended."""
+    whole = sum(one.verdict.count == found.directions for one in found.rated)
+    return (
+        f"ended by the clock: {whole} of {len(found.rated)} placements were checked in all directions, and positions "
+        f"are good to {found.resolution_mm:.0f} mm. Another run may check more or fewer; --full searches to the end"
+    )
 
 
 HALF_A_DIGIT = 5e-4
@@ -123,7 +189,6 @@ HALF_A_DIGIT = 5e-4
 def place_text(run: PlaceRun) -> str:
     """The ranked placements, the case's own, the lines to paste, and the files."""
     case, found = run.context.case, run.found
-    wanted = found.rated[0].verdict.count if found.rated else 0
     x, y, z = (direction_text(found.T_ct_bed[:3, axis], str(case.space)) for axis in range(3))
     frame = f"from the target, mm: along = toward {x}, across = toward {y}, height = toward {z}"
     ranked = [(str(rank), one) for rank, one in enumerate(found.rated, start=1)]
@@ -132,8 +197,8 @@ def place_text(run: PlaceRun) -> str:
     truth = "a proposal: where the arm then really stands, markers must say ([registration])"
     return text([
         Section(
-            f"case {case.name}: {wanted} organ-safe directions; {len(found.coarse)} + {found.refined} placements "
-            f"estimated, {len(found.rated)} checked",
+            f"case {case.name}: {found.directions:,} organ-safe directions; {len(found.coarse):,} + {found.refined:,} "
+            f"placements estimated, {len(found.rated)} checked",
             [frame, *needle_line(found.possible), grid(_fields(run), [*ranked, *own])]),
         *([Section("the best, for the case (in place of its [registration] or [robot.mount]):", [best]),
            Section(truth, [])] if best.lines else []),
@@ -157,6 +222,7 @@ def _fields(run: PlaceRun) -> list[Field]:
         Field("rank", lambda ranked: ranked[0]),
         Field("share", lambda ranked: 100 * ranked[1].verdict.fraction, 1, "%"),
         Field("held", lambda ranked: ranked[1].verdict.reached),
+        Field("of checked", lambda ranked: ranked[1].verdict.count),
         Field("margin", lambda ranked: ranked[1].verdict.margin, 2),
         *(Field(name, at(axis), 0) for axis, name in enumerate(("along", "across", "height"))),
         Field("expected tip error", lambda ranked: ranked[1].expected_mm, 2, "mm"),
@@ -168,5 +234,5 @@ def needle_line(possible: float) -> list[str]:
     """What no placement can mend, where there is such a thing."""
     if possible > 1.0 - HALF_A_DIGIT:
         return []
-    fraction = f"at most {100 * possible:.1f} % can be held from anywhere"
+    fraction = f"at most about {100 * possible:.1f} % can be held from anywhere"
     return [f"{fraction}: elsewhere the needle itself would start too near the skin"]
