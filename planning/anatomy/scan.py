@@ -194,6 +194,11 @@ class Scan:
         """Hounsfield units as they are stored, shape (nx, ny, nz), and the map (4, 4) of an index to LPS mm."""
         return self._ct.stored, self._ct.T_ct_index
 
+    @property
+    def measured(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
+        """As `voxels`, with the padding far below air, as `hu_at` has it."""
+        return self._ct.hu, self._ct.T_ct_index
+
     def release(self) -> None:
         """Let go of all voxels; what asks for them again decodes them again."""
         vars(self).pop("_body", None)

@@ -142,19 +142,22 @@ class CaseContext:
         """Uncertainty breakdown of a direction (3,) at joints (6,), rad, as of a plan; None without declared errors."""
         return None if self.chance is None else uncertainty_breakdown(self.chance, outward_ct, q)
 
-    def region_ct(self, q: Floats) -> Floats | None:
-        """The tip's 95 % region about the target: x' inv(region) x <= 1, shape (3, 3), mm^2, CT axes.
+    def regions_ct(self, q: Floats) -> Floats | None:
+        """The tip's 95 % region about the target: x' inv(region) x <= 1, shape (n, 3, 3), mm^2, CT axes.
 
         Args:
-            q: Shape (6,), rad, the tip on the target; NaN where the arm does not reach it.
+            q: Shape (n, 6), rad, the tip on the target; NaN where the arm does not reach it, and then in the region.
 
         Returns:
-            None there, and without declared errors.
+            None without declared errors.
         """
-        if self.chance is None or not np.isfinite(q).all():
+        if self.chance is None:
             return None
-        error = self.chance.error
-        return np.asarray(error.fit.test.region_factor**2 * error.tip_covariance_ct(q[None])[0])
+        error, known = self.chance.error, np.isfinite(q).all(axis=1)
+        regions = np.full((len(q), 3, 3), np.nan)
+        if known.any():
+            regions[known] = error.fit.test.region_factor**2 * error.tip_covariance_ct(q[known])
+        return regions
 
     def cross_check(self, count: int) -> CrossChecked:
         """Measure random directions of the grid again with FCL.

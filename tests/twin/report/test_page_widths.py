@@ -1,10 +1,37 @@
-"""The page on a phone, a tablet and a desk, by Playwright in headless Chromium; skipped where there is no browser."""
+"""The page on a phone, a tablet and a desk, by Playwright in headless Chromium; skipped where there is no browser.
 
+What its script cuts out of the page's block of the CT is what ``slices.png`` shows.
+"""
+
+import base64
+import io
+
+import numpy as np
 import pytest
 import report_world as world
+import scipy
 from page_browser import chromium, opened, serious_findings
+from PIL import Image
+
+from puncture_twin.planning.search.choice import Pick
+from puncture_twin.twin.report.slices.panel import PIXELS, TONES, draw_panel
+from puncture_twin.twin.report.slices.planes import needle_planes
+from puncture_twin.twin.report.slices.sheet import flat
+from puncture_twin.twin.report.slices.subject import Subject
 
 WIDTHS = [390, 900, 1440]
+GREYS = 2
+"""Of 255, in the window of 400 HU: half a step of the page's bytes (1.7 HU), and the rounding of a grey."""
+LETTERS = 46
+"""Pixels from the middle of an edge within which letters stand; the browser's are of another font."""
+SHOWN = """() => [...document.querySelectorAll("#slices-a .slice")].map((one) => {
+    const [base, over] = one.querySelectorAll("canvas"), both = document.createElement("canvas");
+    both.width = both.height = base.width;
+    const context = both.getContext("2d");
+    context.drawImage(base, 0, 0);
+    context.drawImage(over, 0, 0, base.width, base.height);
+    return [base.toDataURL(), both.toDataURL()];
+})"""
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +49,80 @@ def address(tmp_path_factory):
     return path.as_uri()
 
 
-@pytest.fixture(params=WIDTHS)
+@pytest.fixture(scope="module")
+def patient():
+    """Case, anatomy with a CT of noise, candidates."""
+    case = world.make_case()
+    anatomy = world.make_anatomy()
+    anatomy.scan = world.make_scan()
+    return case, anatomy, world.make_candidates(case)
+
+
+@pytest.fixture(scope="module", params=WIDTHS)
 def page(request, browser, address):
-    """The page, open and drawn, at one width."""
+    """The page, open and drawn, at one width; all tests of a width share it."""
     with opened(browser, address, request.param) as page:
         page.wait_for_function("document.body.dataset.ready === 'true'")
+        drawn(page)
         yield page
+
+
+def drawn(page, what=None):
+    """Wait until a row's slices, or any, are drawn; returns the row."""
+    one = "document.getElementById('slices-a').dataset.drawn"
+    page.wait_for_function(f"{one} === '{what}'" if what is not None else f"{one} !== undefined")
+    return page.evaluate(one)
+
+
+def picture(address):
+    """The pixels of a data address, RGB."""
+    content = base64.b64decode(address.partition(",")[2])
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
+
+
+def row_of(candidates, theta_deg, beta_deg):
+    """The row of two angles."""
+    same = np.isclose(candidates.theta, np.radians(theta_deg)) & np.isclose(candidates.beta, np.radians(beta_deg))
+    return int(np.flatnonzero(same)[0])
+
+
+def same_slices(page, patient, row):
+    """Every slice of a row as ``slices.png`` has it: the CT to `GREYS`, lines where its lines are."""
+    case, anatomy, candidates = patient
+    region = world.REGION if candidates.safe[row] else None
+    subject = Subject(case, anatomy, Pick(candidates, row), region)
+    planes = needle_planes(case.target_ct, subject.outward_ct, subject.path_mm)
+    wanted = [draw_panel(subject, plane) for plane in planes]
+    for (base, both), panel in zip(page.evaluate(SHOWN), wanted, strict=True):
+        grey = TONES["abdomen"].grey(panel.hu).astype(int)
+        assert (np.abs(picture(base)[..., 0] - grey) > GREYS).mean() < 1e-3, panel.plane.name
+        found, theirs = picture(both), np.asarray(flat(panel, TONES["abdomen"])).astype(int)
+        free = ~letters_and_scale()
+        for colour in ((0, 229, 255), (255, 77, 240), (224, 124, 72)):
+            mine, other = (np.abs(one - colour).max(axis=2) for one in (found, theirs))
+            for one, two in ((mine, other), (other, mine)):
+                alone = (one < 40) & free & ~widened(two < 110)
+                assert alone.sum() <= 0.02 * (one < 40).sum() + 3, (panel.plane.name, colour)
+        off = (np.abs(found - theirs).max(axis=2) > 80) & free
+        assert off.mean() < 0.005, panel.plane.name
+
+
+def widened(mask):
+    """A pixel more to every side."""
+    return scipy.ndimage.binary_dilation(mask, np.ones((3, 3)))
+
+
+def letters_and_scale():
+    """Where words stand."""
+    mask = np.zeros((PIXELS, PIXELS), bool)
+    middle, edge = (
+        slice(PIXELS // 2 - LETTERS, PIXELS // 2 + LETTERS),
+        (slice(0, LETTERS), slice(PIXELS - LETTERS, PIXELS)),
+    )
+    for one in edge:
+        mask[middle, one] = mask[one, middle] = True
+    mask[PIXELS - 60 :, :200] = True
+    return mask
 
 
 def test_axe_finds_nothing_serious(page):
@@ -59,3 +154,28 @@ def test_dates_film_and_fractions_are_there(page):
     assert "Made on 20" in said and "scan of a date that its files do not state" in said
     assert page.locator("a[href='rehearsal.mp4']").count() == 1
     assert "of solid angle" in page.locator(".mapside").inner_text()
+
+
+def test_slices_of_what_is_chosen_are_those_of_the_program(page, patient):
+    """By the map, a slider and a row of the table, safe or not: pixels of CT, needle, margin, region and outlines."""
+    candidates = patient[2]
+    box = page.locator("#map-image").bounding_box()
+    page.locator("#map-image").click(position={"x": 0.3 * box["width"], "y": 0.62 * box["height"]})
+    clicked = (
+        page.evaluate("+document.getElementById('command').textContent.match(/theta (\\S+)/)[1]"),
+        page.evaluate("+document.getElementById('command').textContent.match(/beta (\\S+)/)[1]"),
+    )
+    row = row_of(candidates, *clicked)
+    drawn(page, row)
+    same_slices(page, patient, row)
+    page.locator("#theta").focus()
+    for _ in range(6):
+        page.keyboard.press("ArrowLeft")
+    slid = row_of(candidates, clicked[0] - 30, clicked[1])
+    drawn(page, slid)
+    same_slices(page, patient, slid)
+    page.locator("button.pick").first.click()
+    best = int(page.locator("button.pick").first.get_attribute("data-row"))
+    drawn(page, best)
+    same_slices(page, patient, best)
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

@@ -24,14 +24,14 @@ from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import ring_weights
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.twin.report import annotate
 from puncture_twin.twin.report.map.map_picture import DISC, draw_map
 from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
 from puncture_twin.twin.report.numbers import reason_counts
-from puncture_twin.twin.report.page import page as page_slices, page_scene as lighter_mesh
-from puncture_twin.twin.report.page.page import Shown, slices_data, write_page
+from puncture_twin.twin.report.page import page_scene as lighter_mesh
+from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
 from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
@@ -45,8 +45,6 @@ from puncture_twin.twin.report.scene.scene_parts import SceneBody, needle_bodies
 from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
 from puncture_twin.twin.report.scene.shapes import LIFT_MM, corridor_mouth, corridor_walls
 from puncture_twin.twin.report.scene.views import outermost, overview, up_ct
-from puncture_twin.twin.report.slices.sheet import draw_slices
-from puncture_twin.twin.report.slices.subject import Subject
 
 FRAMES = {
     "bed": ("LPS", None),
@@ -638,14 +636,6 @@ def test_the_target_stands_in_the_case_s_space(anatomy, candidates, tmp_path):
     """A case in RAS names its target as it was typed."""
     write_page(Shown(world.make_case(space="RAS"), anatomy, candidates), tmp_path / "page.html")
     assert "at (-10.0, 20.0, 30.0) mm RAS" in (tmp_path / "page.html").read_text(encoding="utf-8")
-
-
-def test_slices_beyond_the_page_s_size_are_left_out(anatomy, case, candidates, monkeypatch):
-    """The first direction always comes; each knows its angles."""
-    drawn = [draw_slices(Subject(case, anatomy, Pick(candidates, int(row)))) for row in candidates.ranked[:2]]
-    assert [one["theta_deg"] for one in slices_data(drawn)["directions"]] == [0.0, 0.0]
-    monkeypatch.setattr(page_slices, "MOST_BYTES", 1)
-    assert len(slices_data(drawn)["directions"]) == 1
 
 
 def test_what_is_unknown_is_hatched(case, candidates):
