@@ -101,7 +101,7 @@ def test_surfaces_are_kept_to_what_is_said_of_them(monkeypatch):
 
 
 def test_far_surfaces_are_left_out_and_farther_corners_wrap():
-    """Only triangles that reach the box; corners 4 m apart come back although a difference fits no 16 bits."""
+    """Only what reaches the box; corners 4 m apart come back although a difference fits no 16 bits."""
     target = np.zeros(3)
     wall = TriangleMesh(
         np.array([[-2200.0, -2000, 10], [2100, -2000, 10], [0, 2100, 10]]), np.array([[0, 1, 2]], np.int32)
@@ -151,3 +151,31 @@ def test_the_row_more_has_all_columns():
     assert data["structures"][data["near"][-1][0]] == "rib_right_9" and data["near"][-1][1] == pytest.approx(
         apart.clearance.distance[5, 0], abs=1e-3
     )
+
+
+@given(st.integers(0, 200))
+def test_inside_stays_inside_of_a_surface_that_the_box_cuts(seed):
+    """Rays from points in the box, to every side, cross what is kept as oddly as the whole; little is kept beyond."""
+    rng = np.random.default_rng(seed)
+    centre, radius = rng.uniform(-60, 60, 3), rng.uniform(30, 200)
+    ball = world._ball(radius, centre)
+    box = np.stack([rng.uniform(-60, -20, 3), rng.uniform(20, 60, 3)])
+    packed = surfaces([("ball", "avoid", ball)], np.zeros(3), box)
+    points = rng.uniform(box[0], box[1], (20, 3))
+    points = points[np.abs(np.linalg.norm(points - centre, axis=1) - radius) > 3]
+    inside = np.linalg.norm(points - centre, axis=1) < radius
+    for (corners, faces), part in zip(unpacked_surfaces(packed), packed.facts["parts"], strict=True):
+        assert part["drawn"] <= part["triangles"] == len(faces) <= part["drawn"] + 800
+        for toward in rng.normal(size=(3, 3)):
+            assert (crossed(corners[faces], points, toward) == inside).all()
+    assert packed.facts["parts"] or not inside.any()
+
+
+def crossed(triangles, points, toward):
+    """Whether a ray from each point crosses triangles (m, 3, 3) an odd number of times, by signed volumes."""
+    a, b, c = (triangles[:, k][None] - points[:, None] for k in range(3))
+    sides = [np.einsum("nmk,k->nm", np.cross(p, q), toward) > 0 for p, q in ((a, b), (b, c), (c, a))]
+    ahead = (
+        np.einsum("nmk,nmk->nm", a, np.cross(b - a, c - a)) * np.einsum("nmk,k->nm", np.cross(b - a, c - a), toward) > 0
+    )
+    return ((sides[0] == sides[1]) & (sides[1] == sides[2]) & ahead).sum(axis=1) % 2 == 1

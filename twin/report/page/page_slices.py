@@ -38,6 +38,9 @@ LEAST_UNIT_MM = 1 / 16
 MOST_UNITS = 32_000
 """A corner's coordinates fit 16 bits."""
 
+COARSE_MM = 32.0
+"""How coarse surfaces beyond the box are, and how far beyond: they are not drawn."""
+
 LEVEL = 6
 """Of gzip's."""
 
@@ -170,56 +173,78 @@ def _differences(values: NDArray[np.uint8]) -> bytes:
 
 
 def surfaces(parts: Iterable[tuple[str, str, TriangleMesh]], target_ct: Floats, box_ct: Floats) -> Packed:
-    """The triangles of surfaces that reach a box; corners from the target, in whole units, as differences.
+    """Surfaces in a box; corners from the target, in whole units, as differences.
 
     Corners that round to one are one: so surfaces grow coarser, each of its points by less than 0.87 units, and none
-    of them vanishes but what is smaller than a unit. Of a closed surface each edge stays one of an
-    even number of triangles, so that its inside stays known.
+    of them vanishes but what is smaller than a unit. What lies beyond the box is only kept as far as it tells what is
+    inside of a closed surface; the first triangles of each, ``drawn`` of them, are those that reach the box.
 
     Args:
         parts: Name, role and mesh.
         target_ct: Shape (3,), mm.
         box_ct: Shape (2, 3), mm.
     """
-    near = [(name, role, mesh, _reaching(mesh, box_ct)) for name, role, mesh in parts]
-    near = [one for one in near if len(one[3])]
-    farthest = max((float(np.abs(mesh.vertices[f] - target_ct).max()) for *_, mesh, f in near), default=0.0)
+    box = box_ct - target_ct
+    boxed = [
+        (name, role, mesh.closed, *_boxed(mesh.vertices - target_ct, mesh.faces, box)) for name, role, mesh in parts
+    ]
+    farthest = max((float(np.abs(one[3]).max(initial=0.0)) for one in boxed), default=0.0)
     unit = LEAST_UNIT_MM
     while farthest / unit > MOST_UNITS:
         unit *= 2
     while True:
-        rounded = [_rounded((mesh.vertices - target_ct) / unit, faces) for *_, mesh, faces in near]
-        if sum(len(faces) for _, faces in rounded) <= MOST_TRIANGLES:
+        rounded = [_rounded(vertices / unit, faces, drawn) for *_, vertices, faces, drawn in boxed]
+        if sum(len(faces) for _, faces, _ in rounded) <= MOST_TRIANGLES:
             break
         unit *= 2
-    corners = [np.diff(v, axis=0, prepend=0).astype("<i2").T.tobytes() for v, _ in rounded]
-    triangles = [np.diff(f.ravel(), prepend=0).astype("<i4").tobytes() for _, f in rounded]
+    found = zip(boxed, rounded, strict=True)
+    kept = [(one, v, f, drawn) for one, (v, f, drawn) in found if drawn or (one[2] and len(f))]
+    corners = [np.diff(v, axis=0, prepend=0).astype("<i2").T.tobytes() for _, v, _, _ in kept]
+    triangles = [np.diff(f.ravel(), prepend=0).astype("<i4").tobytes() for _, _, f, _ in kept]
     facts = [
-        {"name": name, "role": role, "closed": bool(mesh.closed), "corners": len(v), "triangles": len(f)}
-        for (name, role, mesh, _), (v, f) in zip(near, rounded, strict=True)
+        {"name": one[0], "role": one[1], "closed": one[2], "corners": len(v), "triangles": len(f), "drawn": drawn}
+        for one, v, f, drawn in kept
     ]
-    return Packed({"unit_mm": unit, "parts": facts}, gzip.compress(b"".join([*corners, *triangles]), LEVEL, mtime=0))
+    content = gzip.compress(b"".join([*corners, *triangles]), LEVEL, mtime=0)
+    return Packed({"unit_mm": unit, "parts": facts}, content)
 
 
-def _reaching(mesh: TriangleMesh, box_ct: Floats) -> NDArray[np.int32]:
-    """The triangles whose box reaches a box, shape (n, 3)."""
-    corner = mesh.vertices[mesh.faces]
-    seen = (corner.max(axis=1) >= box_ct[0]) & (corner.min(axis=1) <= box_ct[1])
-    return np.asarray(mesh.faces[seen.all(axis=1)])
+def _boxed(vertices: Floats, faces: NDArray[np.int32], box: Floats) -> tuple[Floats, NDArray[np.int32], int]:
+    """Triangles that reach a box first, and their number; the corners of all others drawn near, and coarse.
+
+    Each of these others lies beyond one face of the box with all of its corners, before and after: what is inside of a
+    closed surface, for a point in the box, stays so.
+    """
+    corner = vertices[faces]
+    reach = ((corner.max(axis=1) >= box[0]) & (corner.min(axis=1) <= box[1])).all(axis=1)
+    exact = np.zeros(len(vertices), bool)
+    exact[faces[reach]] = True
+    coarse = np.clip(np.round(vertices / COARSE_MM) * COARSE_MM, *box)
+    beyond = np.where(vertices > box[1], box[1] + COARSE_MM, np.where(vertices < box[0], box[0] - COARSE_MM, coarse))
+    moved = np.where(exact[:, None], vertices, beyond)
+    return moved, np.concatenate([faces[reach], faces[~reach]]), int(reach.sum())
 
 
-def _rounded(vertices: Floats, faces: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Whole corners, each once and in the order of its first use, and the triangles that are left of these."""
+def _rounded(
+    vertices: Floats, faces: NDArray[np.int32], drawn: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    """Whole corners, each once and in the order of first use; the triangles left of these, and of those to be drawn.
+
+    Of the others two in one place cancel out.
+    """
     used, index = np.unique(faces, return_inverse=True)
     whole = np.round(vertices[used]).astype(np.int64)
     key = ((whole + MOST_UNITS) << np.array([32, 16, 0])).sum(axis=1)  # one number a corner: 16 bits an axis
     _, same = np.unique(key, return_inverse=True)
     found = same[index.reshape(-1, 3)]
-    kept = (found != np.roll(found, 1, axis=1)).all(axis=1)
-    used, first = np.unique(found[kept], return_index=True)
+    apart = (found != np.roll(found, 1, axis=1)).all(axis=1)
+    near, others = found[:drawn][apart[:drawn]], found[drawn:][apart[drawn:]]
+    _, one, count = np.unique(np.sort(others, axis=1), axis=0, return_index=True, return_counts=True)
+    left = np.concatenate([near, others[np.sort(one[count % 2 == 1])]])
+    used, first = np.unique(left, return_index=True)
     order = np.argsort(first)
     place = np.zeros(len(whole), np.int64)
     place[used[order]] = np.arange(len(order))
     corner = np.zeros((len(whole), 3), np.int64)
     corner[same] = whole
-    return corner[used[order]], place[found[kept]]
+    return corner[used[order]], place[left], len(near)

@@ -93,9 +93,9 @@ def leaning(subject: Subject, plane: Plane) -> str:
         return ""
     lean = float(subject.outward_ct @ plane.normal)
     if abs(lean) <= IN_PLANE:
-        return "holds the needle"
+        return "Holds the needle."
     side = letters(subject.case.space, np.sign(lean) * plane.normal)
-    return f"the skin entry is {abs(lean) * subject.path_mm:.0f} mm {side} of it"
+    return f"The skin entry is {abs(lean) * subject.path_mm:.0f} mm {side} of it."
 
 
 def _line(axes: Axes, points: Floats, width: float, colour: Rgb, style: str = "-", rim: float = 0.0) -> None:

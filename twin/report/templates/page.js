@@ -301,6 +301,7 @@
 
   // ---- the scene -----------------------------------------------------------------------------------------------
   const scene = byId("scene");
+  let probing = null;
   const probeTrace = data.scene.data.length - 1;
   function hasWebgl() {
     const canvas = document.createElement("canvas");
@@ -357,10 +358,13 @@
     marker.setAttribute("cx", x);
     marker.setAttribute("cy", y);
     if (!drawn) return;
-    const end = plus(data.target, outwardOf(row), data.probe_mm);
-    Plotly.restyle(scene, {
-      x: [[data.target[0], end[0]]], y: [[data.target[1], end[1]]], z: [[data.target[2], end[2]]],
-    }, [probeTrace]);
+    clearTimeout(probing); // the scene follows when slider and pointer rest: the slices follow at once
+    probing = setTimeout(() => {
+      const end = plus(data.target, outwardOf(row), data.probe_mm);
+      Plotly.restyle(scene, {
+        x: [[data.target[0], end[0]]], y: [[data.target[1], end[1]]], z: [[data.target[2], end[2]]],
+      }, [probeTrace]);
+    }, 60);
   }
   const traces = (wanted) => data.scene.data.flatMap((trace, i) => trace.meta && wanted(trace.meta) ? [i] : []);
   const poses = { none: byId("pose-none"), target: byId("pose-target"), standoff: byId("pose-standoff") };

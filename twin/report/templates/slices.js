@@ -82,16 +82,18 @@ const slicing = (() => {
     return found;
   })();
   const skin = parts.find((part) => part.role === "skin");
-  /* Segments in which a plane cuts a surface: x1, y1, x2, y2 of each, mm in the plane. */
+  /* Segments in which a plane cuts a surface: x1, y1, x2, y2 of each, mm in the plane; first those to be drawn. */
   function cut(part, plane) {
     const { normal, right, up } = plane, offset = dot(plane.at, normal) + plane.offset, { corner, faces, height } = part;
     const reach = [0, 1, 2].reduce((sum, k) => sum + Math.abs(normal[k]) * (part.high[k] - part.low[k]) / 2, 0);
     const middle = [0, 1, 2].map((k) => (part.low[k] + part.high[k]) / 2);
-    if (Math.abs(dot(middle, normal) - offset) > reach + 1e-6) return [];
+    if (Math.abs(dot(middle, normal) - offset) > reach + 1e-6) return Object.assign([], { drawn: 0 });
     for (let v = 0; v < height.length; v++)
       height[v] = corner[3 * v] * normal[0] + corner[3 * v + 1] * normal[1] + corner[3 * v + 2] * normal[2] - offset;
     const x0 = dot(plane.at, right), y0 = dot(plane.at, up), segments = [];
+    segments.drawn = -1;
     for (let f = 0; f < faces.length; f += 3) {
+      if (f === 3 * part.drawn) segments.drawn = segments.length;
       const a = height[faces[f]] > 0, b = height[faces[f + 1]] > 0, c = height[faces[f + 2]] > 0;
       if (a === b && b === c) continue;
       const alone = a === b ? 2 : a === c ? 1 : 0, tip = faces[f + alone];
@@ -106,6 +108,7 @@ const slicing = (() => {
         segments.push(x, y);
       }
     }
+    if (segments.drawn < 0) segments.drawn = segments.length;
     return segments;
   }
   function holds(segments, x, y) {
@@ -274,7 +277,7 @@ const slicing = (() => {
       context.beginPath();
       if (part.role === "unknown") {
         const cell = 0.025 * plane.half, seen = new Set();
-        for (let s = 0; s < segments.length; s += 4) {
+        for (let s = 0; s < segments.drawn; s += 4) {
           const [x1, y1, x2, y2] = segments.slice(s, s + 4), steps = 1 + Math.floor(Math.hypot(x2 - x1, y2 - y1) / cell);
           for (let k = 0; k <= steps; k++) {
             const x = x1 + (x2 - x1) * k / steps, y = y1 + (y2 - y1) * k / steps, key = `${Math.round(x / cell)} ${Math.round(y / cell)}`;
@@ -288,7 +291,7 @@ const slicing = (() => {
         context.fill();
         return;
       }
-      for (let s = 0; s < segments.length; s += 4) {
+      for (let s = 0; s < segments.drawn; s += 4) {
         context.moveTo(px(segments[s]), py(segments[s + 1]));
         context.lineTo(px(segments[s + 2]), py(segments[s + 3]));
       }
@@ -370,6 +373,14 @@ const slicing = (() => {
   const voxel = facts.ct ? Math.max(...facts.ct.shown_mm) : 0;
   const lengthText = (mm) => `${mm.toFixed(voxel >= 1 ? 0 : 1)} mm`;
 
+  /* How the needle lies to a plane: of one that is not in it only the cut is drawn. */
+  function leaning(plane, needle) {
+    const lean = dot(needle.outward, plane.normal), tip = dot(plus(needle.at, plane.at, -1), plane.normal) - plane.offset;
+    const far = tip + (Math.abs(lean) <= IN_PLANE ? 0 : lean * needle.path), side = lettersOf(scaled(plane.normal, Math.sign(far)));
+    if (Math.abs(lean) <= IN_PLANE) return Math.abs(far) < 0.5 ? "Holds the needle." : `The needle is ${lengthText(Math.abs(far))} ${side} of this plane.`;
+    return Number.isFinite(far) ? `The skin entry is ${lengthText(Math.abs(far))} ${side} of this plane.` : "";
+  }
+
   // ---- one path in four planes ---------------------------------------------------------------------------------
   const shared = { mode: "point" };
   class View {
@@ -391,8 +402,11 @@ const slicing = (() => {
         over.addEventListener("pointermove", (event) => this.pointed(number, event));
         over.addEventListener("pointerleave", () => this.readout(""));
         over.addEventListener("pointerdown", (event) => this.pressed(number, event));
-        over.addEventListener("pointerup", () => { this.held = null; });
-        over.addEventListener("pointercancel", () => { this.held = null; });
+        for (const end of ["pointerup", "pointercancel"])
+          over.addEventListener(end, () => {
+            if (this.held?.what) this.show({ ...this.needle, frame: undefined }); // planes of the new path
+            this.held = null;
+          });
         return { base, over, caption, beside, depth, shown };
       });
     }
@@ -405,7 +419,7 @@ const slicing = (() => {
       this.waiting ??= requestAnimationFrame(() => { this.waiting = null; this.draw(); });
     }
     draw() {
-      const { needle } = this, planes = planesOf(needle.frame ?? needle);
+      const began = performance.now(), { needle } = this, planes = planesOf(needle.frame ?? needle);
       this.panels.forEach((panel, number) => {
         const plane = panel.plane = planes[number];
         plane.offset = this.point ? dot(plus(this.point, plane.at, -1), plane.normal) : 0;
@@ -415,9 +429,7 @@ const slicing = (() => {
         panel.cuts = drawOver(panel.over, plane, needle, { point: this.point, ruler, handles });
         const off = plane.offset, side = lettersOf(scaled(plane.normal, Math.sign(off) || 1));
         panel.caption.textContent = off ? `${plane.name.replace(/, through the target| at the target/, "")}, ${lengthText(Math.abs(off))} ${side} of the target` : plane.name;
-        const lean = dot(needle.outward, plane.normal), far = lean * needle.path;
-        panel.beside.textContent = Math.abs(lean) <= IN_PLANE ? "The needle lies in this plane." : number === 3 || !(Math.abs(far) >= 1) ? "The needle crosses this plane." :
-          `The needle crosses this plane: at the skin it is ${lengthText(Math.abs(far))} ${lettersOf(scaled(plane.normal, Math.sign(far)))} of the target's.`;
+        panel.beside.textContent = leaning(plane, needle);
         panel.depth.value = off;
         panel.shown.textContent = `${off.toFixed(0)} mm`.replace("-", "−");
         panel.depth.setAttribute("aria-label", `${plane.name}: mm from the target`);
@@ -425,6 +437,7 @@ const slicing = (() => {
       });
       this.host.dataset.drawn = needle.key;
       this.host.dataset.tone = tone;
+      this.host.dataset.ms = (performance.now() - began).toFixed(0);
     }
     inPlane(plane, point) {
       const from = plus(point, plane.at, -1);
@@ -490,7 +503,8 @@ const slicing = (() => {
 
   // ---- the units along the needle --------------------------------------------------------------------------------
   function drawUnits(canvas, needle) {
-    const context = canvas.getContext("2d"), [width, height] = [canvas.width, canvas.height], BEHIND = 15, BEYOND = 25;
+    const width = canvas.width = Math.max(320, Math.min(976, canvas.parentElement.clientWidth)), narrow = width < 600;
+    const context = canvas.getContext("2d"), { height } = canvas, BEHIND = 15, BEYOND = 25;
     const path = Number.isFinite(needle.path) ? needle.path : facts.needle.shaft, end = path + BEYOND;
     const passed = parts.filter((part) => part !== skin && part.closed && part.role !== "unknown").map((part) => {
       const at = crossings(part, needle.at, needle.outward).filter((mm) => mm > -400);
@@ -498,7 +512,7 @@ const slicing = (() => {
       for (let k = at.length - 1; k >= 0; k -= 2) inside.push([Math.max(-BEHIND, at[k - 1] ?? -BEHIND), Math.min(end, at[k])]);
       return { part, inside: inside.filter(([a, b]) => b > a) };
     }).filter(({ inside }) => inside.length).sort((one, other) => Math.max(...other.inside.map(([, b]) => b)) - Math.max(...one.inside.map(([, b]) => b)));
-    const rowHeight = Math.min(20, 0.5 * height / Math.max(1, passed.length)), left = 190, right = width - 14, bottom = height - 44;
+    const rowHeight = Math.min(20, 0.5 * height / Math.max(1, passed.length)), left = narrow ? 110 : 190, right = width - 14, bottom = height - 44;
     const split = bottom - rowHeight * Math.max(1, passed.length), top = 12;
     const px = (mm) => left + (end - mm) / (end + BEHIND) * (right - left);
     context.fillStyle = "#fff";
@@ -532,8 +546,8 @@ const slicing = (() => {
     line(TARGET, 1.9, [], [px(0), top], [px(0), bottom]);
     if (Number.isFinite(needle.path)) { line("#000", 1.3, [5, 3], [px(path), top], [px(path), bottom]); write("skin", px(path) + 6, top + 8, "left"); }
     write("target", px(0) + 6, top + 8, "left");
-    for (let mm = 0; mm <= end; mm += 25) write(String(mm), px(mm), bottom + 12, "center");
-    write("mm from the target along the needle (left: outside; right of the target: deeper)", (left + right) / 2, bottom + 32, "center");
+    for (let mm = 0; mm <= end; mm += narrow ? 50 : 25) write(String(mm), px(mm), bottom + 12, "center");
+    write(narrow ? "mm from the target (right: deeper)" : "mm from the target along the needle (left: outside; right of the target: deeper)", (left + right) / 2, bottom + 32, "center");
   }
 
   return {
