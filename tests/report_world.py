@@ -30,7 +30,13 @@ def make_case(*, space="LPS", frame=None, name="ball"):
     """A case with a 210 mm needle; the entry frame is the space's own unless said."""
     rotation = entry_frame(frame, Space(space))
     needle = SimpleNamespace(
-        length_mm=210.0, shaft_mm=150.0, diameter_mm=1.2, radius_mm=0.6, skin_gap_mm=10.0, holder_diameter_mm=30.0
+        length_mm=210.0,
+        shaft_mm=150.0,
+        diameter_mm=1.2,
+        radius_mm=0.6,
+        skin_gap_mm=10.0,
+        holder_diameter_mm=30.0,
+        lengths_mm=(),
     )
     return SimpleNamespace(
         name=name,
@@ -259,7 +265,7 @@ def make_scan(*, spacing=(2.0, 2.5, 3.0)):
     def hu_at(points):
         return nearest(hu, np.linalg.inv(T), points)
 
-    return SimpleNamespace(hu_at=hu_at, measured=(hu, T))
+    return SimpleNamespace(hu_at=hu_at, measured=(hu, T), grid=SimpleNamespace(shape=hu.shape, T_ct_index=T))
 
 
 def _ball(radius, centre, subdivisions=3):

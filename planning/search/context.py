@@ -132,11 +132,10 @@ class CaseContext:
     def entry_facts(self, entry_ct: Floats, outward_ct: Floats) -> EntryFacts:
         """Skin entry (3,), mm, and outward direction (3,), unit, described to a person at the patient."""
         registration = None if self.placement is None else self.placement.registration
-        if registration is None:
-            return entry_facts(self.case, (), entry_ct, outward_ct)
-        named = zip(registration.markers.names, registration.markers.points_ct, strict=True)
-        markers = tuple(Landmark(f"marker {name}", point) for name, point in named)
-        return entry_facts(self.case, markers, entry_ct, outward_ct)
+        known = ((), ()) if registration is None else (registration.markers.names, registration.markers.points_ct)
+        markers = tuple(Landmark(f"marker {name}", point) for name, point in zip(*known, strict=True))
+        grid = None if self.anatomy.scan is None else self.anatomy.scan.grid
+        return entry_facts(self.case, markers, entry_ct, outward_ct, grid)
 
     def breakdown_at(self, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown | None:
         """Uncertainty breakdown of a direction (3,) at joints (6,), rad, as of a plan; None without declared errors."""

@@ -143,8 +143,10 @@ def write_page(shown: Shown, path: Path) -> None:
         counts=blocks_html(patient.counts(found)),
         best=blocks_html(patient.windows(found)),
         plan=blocks_html(patient.plan(plan, at_patient, shown.refusal, declared=declared, notes=shown.notes)),
-        registration=blocks_html(patient.registration(shown.registration)),
-        rehearsal=blocks_html(_rehearsed(done, demanding(shown.anatomy), shown.film, shown.failures)),
+        planned="Plan" if plan is not None or shown.refusal else "The best path at the patient",
+        registration=blocks_html(patient.registration(shown.registration)) if shown.registration else "",
+        rehearsal="" if done is None else blocks_html(_rehearsed(done, shown)),
+        study=scan_date(case),
         warnings=_doubts(found, shown.anatomy),
         inputs=inputs_table(case.inputs),
         origin=origin_section(case.rehearsal.seed if plan is None else plan.seed),
@@ -169,11 +171,11 @@ def _drawn(shown: Shown) -> dict[str, Any]:
     return {"data": script_json(data), "ct": base64_text(ct), "surfaces": base64_text(surfaces)}
 
 
-def _rehearsed(rehearsal: Any | None, away: frozenset[str], film: str | None, failures: Sequence[str]) -> list[Block]:
+def _rehearsed(rehearsal: Any, shown: Shown) -> list[Block]:
     """The rehearsal's numbers, and its curves over time."""
-    alt = "True tip to true target, and true needle to true structures, over time"
-    curves = [] if rehearsal is None else [picture(rehearsal_png(rehearsal, away), alt)]
-    return [*patient.rehearsal(rehearsal, away, film, failures), *curves]
+    alt, away = "True tip to true target, and true needle to true structures, over time", demanding(shown.anatomy)
+    curves = picture(rehearsal_png(rehearsal, away), alt)
+    return [*patient.rehearsal(rehearsal, away, shown.film, shown.failures), curves]
 
 
 def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[str, Any] | None) -> dict[str, Any]:

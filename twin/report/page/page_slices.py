@@ -17,11 +17,12 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.search.bedside import slice_numbers
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.palette import SKIN
 from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, TONES, stored
 from puncture_twin.twin.report.slices.planes import letters
-from puncture_twin.twin.report.slices.subject import Subject
+from puncture_twin.twin.report.slices.subject import BESIDE, Subject
 
 AROUND_MM = 60.0
 """What the block holds beyond target and entries, to every side."""
@@ -82,6 +83,9 @@ def slices_data(
         "tones": dict(TONES),
         "letters": [[letters(case.space, np.array(axis)), axis] for axis in _axes()],
         "needle": {"shaft": case.needle.shaft_mm, "radius": case.needle.radius_mm},
+        "numbers": None if anatomy.scan is None else _numbers(*slice_numbers(anatomy.scan.grid)),
+        "catalogue": [[mm, case.needle.of_length(mm).longest_path_mm] for mm in sorted(case.needle.lengths_mm)],
+        "names": {name: text for name, (text, _) in BESIDE.items()},
         "bent": {} if bent is None else {picked: bent},
         "regions": {} if regions_ct is None else _regions(regions_ct, picked, subject.region_ct),
         "margins": {
@@ -99,6 +103,10 @@ def _regions(regions_ct: Floats, picked: int, of_picked: Floats | None) -> dict[
     known = np.flatnonzero(np.isfinite(regions_ct).all(axis=(1, 2)))
     found = dict(zip(known.tolist(), np.round(regions_ct[known][:, *upper], 3).tolist(), strict=True))
     return found if of_picked is None else found | {picked: np.round(of_picked[upper], 3).tolist()}
+
+
+def _numbers(of_point: Floats, count: int) -> list[Any]:
+    return [of_point.tolist(), count]
 
 
 def _axes() -> Iterator[list[float]]:

@@ -226,7 +226,16 @@
   function placesOf(needle) { // of a path, for whoever stands at the scanner
     const entry = plus(needle.at, needle.outward, needle.path), [left, back, head] = needle.outward, degrees = (radians) => `${Math.abs(radians / RAD).toFixed(1)}°`;
     const rows = [["skin entry", Number.isFinite(needle.path) ? slicing.placeText(entry) : "none"], ["path in the body", Number.isFinite(needle.path) ? `${needle.path.toFixed(1)}${half} mm` : "–"]];
+    const reaching = slices.catalogue.find(([, longest]) => longest >= needle.path);
+    if (slices.catalogue.length && Number.isFinite(needle.path)) rows.push(["needle to take", reaching ? `${reaching[0]} mm, the shortest that reaches` : "none reaches"]);
     if (map.space === "local") return rows;
+    if (slices.numbers && Number.isFinite(needle.path)) {
+      const [[a, b, c, d], count] = slices.numbers, [x, y, z] = plus(entry, data.target), number = Math.round(a * x + b * y + c * z + d);
+      rows.push(
+        ["slice of the entry", number >= 1 && number <= count ? `${number} of ${count} from the feet, ${count + 1 - number} from the head` : "outside of the image"],
+        ["table position", `z = ${z.toFixed(1)} mm, as DICOM has it`.replace("-", "−")],
+        ["laser lines", `${Math.abs(x).toFixed(0)} mm to the ${x > 0 ? "left" : "right"} of the sagittal one, ${Math.abs(y).toFixed(0)} mm ${y > 0 ? "behind" : "in front of"} the coronal one, if x = y = 0 is the isocentre`]);
+    }
     const inPlane = Math.atan2(left, -back), out = Math.asin(head), side = (angle, one, other) => Math.abs(angle) < 0.05 * RAD ? "" : angle > 0 ? one : other;
     return [...rows,
       ["in-plane angle", Math.hypot(left, back) > 1e-6 ? `${degrees(inPlane)} from the front${side(inPlane, ", hub to the left", ", hub to the right")}` : "none: the needle runs along the patient"],

@@ -2,7 +2,7 @@
 /* The slices: the page's block of the CT and the surfaces in it, cut in any plane as slices.png is.
    Points are LPS mm from the case's target. Pixels are those of slices.png; lines are drawn twice as fine. */
 const byId = (id) => document.getElementById(id);
-const words = (name) => name.replaceAll("_", " ");
+const words = (name) => data.slices.names[name] ?? name.replaceAll("_", " ");
 const make = (tag, attributes = {}, ...children) => {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
