@@ -5,6 +5,8 @@ What its script cuts out of the page's block of the CT is what ``slices.png`` sh
 
 import base64
 import io
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -179,3 +181,84 @@ def test_slices_of_what_is_chosen_are_those_of_the_program(page, patient):
     drawn(page, best)
     same_slices(page, patient, best)
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def at_pixel(page, number, column, row):
+    """Point at a pixel of a slice, 480 a side; returns where that is in the window."""
+    over = page.locator("#slices-a .over").nth(number)
+    over.scroll_into_view_if_needed()
+    box = over.bounding_box()
+    place = {"x": (column + 0.5) / PIXELS * box["width"], "y": (row + 0.5) / PIXELS * box["height"]}
+    over.hover(position=place)
+    box = over.bounding_box()
+    return box["x"] + place["x"], box["y"] + place["y"]
+
+
+def plane_of(patient, row, number):
+    """A plane of ``slices.png``."""
+    case, _, candidates = patient
+    return needle_planes(case.target_ct, candidates.outward_ct[row], candidates.path.length[row])[number]
+
+
+def test_the_cursor_reads_units_and_structure(page, patient):
+    """At pixels of an axial slice: the CT's value within what is stated, and the structure that holds the point."""
+    case, anatomy, _ = patient
+    page.locator("button.pick").first.click()
+    row = int(page.locator("button.pick").first.get_attribute("data-row"))
+    drawn(page, row)
+    points = plane_of(patient, row, 0).points_ct(PIXELS).reshape(PIXELS, PIXELS, 3)
+    for column, line in ((240, 250), (200, 380), (60, 380), (20, 30)):
+        at_pixel(page, 0, column, line)
+        said, point = page.locator("#cursor").inner_text(), points[line, column]
+        hu, doubt = map(float, re.match(r"(\S+) ± (\d+) HU", said.replace("−", "-")).groups())
+        wanted = anatomy.scan.hu_at(point[None])[0]
+        assert abs(hu - wanted) <= doubt + 0.5, said
+        far = np.linalg.norm(point - case.target_ct)
+        place = "liver" if far < 39 else "in no structure" if far < 99 else "outside of the skin"
+        if np.linalg.norm(point - case.target_ct - [-70, 0, 0]) < 7:
+            place = "rib right 9"
+        assert place in said
+
+
+def test_a_scrolled_slice_is_that_of_the_place(page, patient):
+    """The wheel moves one plane along its normal; its CT is the program's there, and the others stay."""
+    _, anatomy, _ = patient
+    page.locator("button.pick").first.click()
+    row = int(page.locator("button.pick").first.get_attribute("data-row"))
+    page.locator("#slices-centre").click()
+    drawn(page, row)
+    slider = page.locator("#slices-a input[type=range]").first
+    slider.fill("20")
+    page.wait_for_function("document.querySelector('#slices-a output').textContent === '20 mm'")
+    plane = plane_of(patient, row, 0)
+    moved = replace(plane, at_ct=plane.at_ct + 20.0 * plane.normal)
+    grey = TONES["abdomen"].grey(anatomy.scan.hu_at(moved.points_ct(PIXELS)).reshape(PIXELS, PIXELS)).astype(int)
+    assert (np.abs(picture(page.evaluate(SHOWN)[0][0])[..., 0] - grey) > GREYS).mean() < 1e-3
+    assert "20 mm F of the target" in page.locator("#slices-a figcaption").first.inner_text()
+    page.locator("#slices-centre").click()
+
+
+def test_a_path_of_ones_own_has_no_verdict_of_its_own(page, patient):
+    """A dragged entry gets the nearest direction's, said to be that; a moved target none; two paths side by side."""
+    page.locator("button.pick").first.click()
+    row = int(page.locator("button.pick").first.get_attribute("data-row"))
+    page.locator("#slices-keep").click()
+    page.locator("[data-mode=move]").click()
+    drawn(page, row)
+    plane, outward = plane_of(patient, row, 1), patient[2].outward_ct[row]
+    for step, said in ((100.0 * outward, "the nearest searched direction"), (0.0 * outward, "the target was moved by")):
+        x, y = plane.place(plane.at_ct + step) - plane.centre
+        column, line = (1 + np.array([x, -y]) / plane.half_mm) * PIXELS / 2 - 0.5
+        start = at_pixel(page, 1, column, line)
+        page.mouse.down()
+        page.mouse.move(start[0] + 14, start[1] + 3, steps=2)
+        page.mouse.up()
+        text = page.locator("#slices-of").inner_text()
+        assert "not known" in text and said in text and "bad" in page.locator("#slices-of").get_attribute("class")
+    assert page.locator("#slices-numbers thead th").count() == 3 and page.locator("#slices-b .over").count() == 4
+    assert "--targets" in page.locator("#command").inner_text()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    page.locator("#slices-back").click()
+    page.locator("#slices-keep").click()
+    page.locator("[data-mode=point]").click()
+    assert drawn(page, row)

@@ -24,13 +24,13 @@ from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import ring_weights
-from puncture_twin.planning.search.choice import best_pick
+from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.twin.report import annotate
 from puncture_twin.twin.report.map.map_picture import DISC, draw_map
 from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
 from puncture_twin.twin.report.numbers import reason_counts
-from puncture_twin.twin.report.page import page_scene as lighter_mesh
+from puncture_twin.twin.report.page import page_scene
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
@@ -550,6 +550,37 @@ def test_the_film_has_the_frames_it_says(anatomy, case, plan, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
 
 
+def test_the_film_shows_the_patient_and_ends_with_the_result(anatomy, case, plan, tmp_path, monkeypatch):
+    """The body fills the overview, the needle is four pixels wide at least, and the end is written over it."""
+    monkeypatch.setattr(film, "film_times", lambda total: film.FilmTimes((0.0, 0.7 * total, total), 1.0, 1))
+    done = world.make_rehearsal(plan)
+    done.contacts = ()
+    _, (_, before, *_, last) = decoded(draw_film(done, plan, case, anatomy, tmp_path / "film.mp4"))
+    view = before[: film.VIEW_HEIGHT, : film.VIEW_WIDTH].astype(int)
+    reddish = view[..., 0] - view[..., 2] > 12  # skin and organs; ground and arm are grey or blue
+    assert np.ptp(np.flatnonzero(reddish.sum(axis=1) > 20)) > 0.7 * film.VIEW_HEIGHT
+    dark = (view < 70).all(axis=2)[60]
+    assert 4 <= dark.sum() <= 8 and np.ptp(np.flatnonzero(dark)) < 8
+    band = np.s_[film.VIEW_HEIGHT - 36 : film.VIEW_HEIGHT - 8, 10:400]
+    written = [(frame[band].astype(int) < 60).all(axis=2).sum() for frame in (before, last)]
+    assert written[1] > 500 > 10 * written[0]
+
+
+def test_after_a_checked_search_the_arm_is_in_the_scene(anatomy, case, candidates, plan):
+    """With the joints of the search, where the base is known; none of another direction, and none without a base."""
+    best = best_pick(candidates)
+    q = np.full((len(candidates), 6), np.nan)
+    q[best.row] = plan.insertion.q[-1]
+    reached = replace(candidates, arm=replace(candidates.arm, q_insertion=q))
+
+    def arms(pick, T_base_ct):
+        figure = page_scene.scene_figure(case, anatomy, reached, None, pick=pick, T_base_ct=T_base_ct)
+        return [trace for trace in figure["data"] if trace.get("meta", {}).get("arm")]
+
+    assert len(arms(Pick(reached, best.row), plan.T_base_ct)) > 6
+    assert not arms(Pick(reached, best.row), None) and not arms(Pick(reached, best.row + 1), plan.T_base_ct)
+
+
 def test_without_an_encoder_there_is_a_gif(anatomy, case, plan, tmp_path, monkeypatch):
     """A machine without H.264 still gets a film, and no broken MP4 beside it."""
 
@@ -754,7 +785,7 @@ def test_lightened_meshes_are_kept(ball, tmp_path, monkeypatch):
     cache = Cache(tmp_path)
     (first,) = lightened(bodies, 2_000, cache)
     with monkeypatch.context() as patch:
-        patch.setattr(lighter_mesh.fast_simplification, "simplify", None)
+        patch.setattr(page_scene.fast_simplification, "simplify", None)
         (again,) = lightened(bodies, 2_000, cache)
         with pytest.raises(TypeError):
             lightened(bodies, 1_000, cache)

@@ -51,7 +51,8 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
         raster = map_raster(found, map_view(case, found))
         draw_map(found, case, out / "map.png", run.pick, raster)
     with stages.time("scene"):
-        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, failed=bool(run.refusal))
+        T_base_ct = _checked_base(run)
+        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, T_base_ct, failed=bool(run.refusal))
     with stages.time("slices"):
         pick = run.pick or best_pick(found)
         subject = None if pick is None else _subject(context, pick, run.plan)
@@ -79,6 +80,7 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
             uncertainty=_uncertainty(run),
             pick=run.pick,
             subject=drawn.subject,
+            T_base_ct=None if run.refusal else _checked_base(run),
             regions_ct=context.regions_ct(found.arm.q_insertion),
             facts=run.facts,
             refusal=run.refusal,
@@ -88,6 +90,12 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
         )
         write_page(page, out / PAGE)
     return run.with_files(*drawn.files, out / PAGE)
+
+
+def _checked_base(run: Run) -> Floats | None:
+    """Where the patient is for an arm that was checked; None where it was not."""
+    placement = run.context.placement
+    return placement.T_base_ct if placement is not None and run.candidates.arm_checked else None
 
 
 def _registration(context: CaseContext) -> dict[str, Any] | None:

@@ -92,6 +92,7 @@ class Shown:
         uncertainty: What there is to say of chances and rooms; None where the case declares no errors.
         pick: The planned candidate, or the one to be shown; None shows the best.
         subject: What the slices show first; None where there is no direction at all.
+        T_base_ct: Shape (4, 4), mm, where the arm was checked; else None.
         regions_ct: Shape (n, 3, 3), mm^2: of the tip, as `CaseContext.regions_ct`; None without declared errors.
         facts: How the planned or shown path is found at the patient.
         refusal: Why there is no plan although one was requested; "" where none was.
@@ -110,6 +111,7 @@ class Shown:
     uncertainty: Uncertainty | None = None
     pick: Pick | None = None
     subject: Subject | None = None
+    T_base_ct: Floats | None = None
     regions_ct: Floats | None = None
     facts: EntryFacts | None = None
     refusal: str = ""
@@ -163,7 +165,7 @@ def _drawn(shown: Shown) -> dict[str, Any]:
     slices, ct, surfaces = slices_data(subject, found, picked_row(found, pick), shown.regions_ct)
     data = {
         "map": map_data(case, found, pick, shown.raster),
-        "scene": scene_figure(case, shown.anatomy, found, shown.plan, user_cache(), pick),
+        "scene": scene_figure(case, shown.anatomy, found, shown.plan, user_cache(), pick, shown.T_base_ct),
         "slices": slices,
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),

@@ -221,11 +221,12 @@
       Object.keys(slices.bent).length && !needle.bent ? "Where the bevel may take the needle is drawn for the planned or best direction alone." : "",
     ].filter(Boolean).map((note) => make("div", {}, note)));
   }
-  const half = slicing.halfVoxel === null ? "" : ` ± ${slicing.halfVoxel.toFixed(1)}`;
-  const clearanceText = (mm) => mm < 0 ? "crossed" : `${mm.toFixed(1)}${half} mm`;
+  const { halfVoxel } = slicing; // lengths have the digits that a voxel can carry
+  const doubted = (mm) => halfVoxel === null ? `${mm.toFixed(1)} mm` : halfVoxel < 1 ? `${mm.toFixed(1)} ± ${halfVoxel.toFixed(1)} mm` : `${mm.toFixed(0)} ± ${Math.ceil(halfVoxel)} mm`;
+  const clearanceText = (mm) => mm < 0 ? "crossed" : doubted(mm);
   function placesOf(needle) { // of a path, for whoever stands at the scanner
     const entry = plus(needle.at, needle.outward, needle.path), [left, back, head] = needle.outward, degrees = (radians) => `${Math.abs(radians / RAD).toFixed(1)}°`;
-    const rows = [["skin entry", Number.isFinite(needle.path) ? slicing.placeText(entry) : "none"], ["path in the body", Number.isFinite(needle.path) ? `${needle.path.toFixed(1)}${half} mm` : "–"]];
+    const rows = [["skin entry", Number.isFinite(needle.path) ? slicing.placeText(entry) : "none"], ["path in the body", Number.isFinite(needle.path) ? doubted(needle.path) : "–"]];
     const reaching = slices.catalogue.find(([, longest]) => longest >= needle.path);
     if (slices.catalogue.length && Number.isFinite(needle.path)) rows.push(["needle to take", reaching ? `${reaching[0]} mm, the shortest that reaches` : "none reaches"]);
     if (map.space === "local") return rows;
@@ -378,6 +379,10 @@
   const traces = (wanted) => data.scene.data.flatMap((trace, i) => trace.meta && wanted(trace.meta) ? [i] : []);
   const poses = { none: byId("pose-none"), target: byId("pose-target"), standoff: byId("pose-standoff") };
   byId("poses").hidden = traces((meta) => meta.arm).length === 0;
+  if (!traces((meta) => meta.pose === "standoff").length) { // after a search: of one direction, and its motion is not planned
+    byId("pose-standoff").hidden = true;
+    byId("pose-target").textContent = `needle on the target, ${anglesOf(map.first)}`;
+  }
   for (const [pose, button] of Object.entries(poses))
     button.addEventListener("click", () => {
       for (const other of Object.values(poses)) other.setAttribute("aria-pressed", String(other === button));
