@@ -291,6 +291,7 @@ def test_the_scene_is_drawn_and_answers_the_map(browser, case, candidates):
     )
     end = world.TARGET + 210 * candidates.outward_ct[row]
     point_at(browser, case, candidates, 30, 200, click=True)
+    browser.evaluate("document.getElementById('scene').scrollIntoView()")  # what nobody sees is not drawn
     last = "document.getElementById('scene').data.at(-1)"
     browser.until(f"{last}.x.length === 2 && Math.abs({last}.x[1] - {end[0]}) < 0.01")  # not the line before it
     line = np.array(browser.evaluate(f"[{last}.x, {last}.y, {last}.z]")).T

@@ -255,6 +255,7 @@ def test_a_path_of_ones_own_has_no_verdict_of_its_own(page, patient):
         page.mouse.up()
         text = page.locator("#slices-of").inner_text()
         assert "not known" in text and said in text and "bad" in page.locator("#slices-of").get_attribute("class")
+    assert "rank" not in page.locator("#hover").inner_text()  # a verdict of another path stands nowhere as this one's
     assert page.locator("#slices-numbers thead th").count() == 3 and page.locator("#slices-b .over").count() == 4
     assert "--targets" in page.locator("#command").inner_text()
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

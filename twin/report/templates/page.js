@@ -93,6 +93,11 @@
       panel.appendChild(element);
     };
     if (row < 0) { panel.textContent = "Point at the map."; return; }
+    if (own && row === chosen) { // what was searched is another path
+      add("b", own.title, "verdict bad");
+      add("div", own.verdict);
+      return;
+    }
     const code = map.codes[map.reason[row]], safe = code === "safe";
     add("div", `θ ${+map.theta[row].toFixed(3)}°, β ${+map.beta[row].toFixed(3)}°`);
     add("b", safe ? `${map.safe}${map.rank[row] > 0 ? `, rank ${map.rank[row]}` : ""}` : `rejected: ${map.reasons[map.reason[row]]}`,
@@ -149,6 +154,7 @@
   function choose(row, { needle } = {}) {
     if (row < 0) return;
     chosen = row;
+    own = needle ?? null;
     const [theta, beta] = [+map.theta[row].toFixed(3), +map.beta[row].toFixed(3)];
     sliders.theta.value = theta;
     sliders.beta.value = beta;
@@ -160,8 +166,7 @@
       button.setAttribute("aria-pressed", String(+button.dataset.row === row));
     explain(row);
     probe(row);
-    if (needle) present(own = needle);
-    else showSlices(row);
+    present(own ?? needleOf(row));
   }
   for (const button of document.querySelectorAll("button.pick"))
     button.addEventListener("click", () => choose(+button.dataset.row));
@@ -192,10 +197,6 @@
   const readout = (text) => { byId("cursor").textContent = text || "Point at a slice: Hounsfield units, structure, place."; };
   const view = new slicing.View(byId("slices-a"), { readout, moved: moveNeedle });
   let beside = null, kept = -1, own = null;
-  function showSlices(row) {
-    own = null;
-    present(needleOf(row));
-  }
   function present(needle) {
     view.show(needle);
     byId("slices-of").replaceChildren(make("b", {}, needle.title), ` · ${needle.verdict ?? verdictOf(needle.row)}`);
@@ -311,7 +312,7 @@
 
   // ---- the scene -----------------------------------------------------------------------------------------------
   const scene = byId("scene");
-  let probing = null;
+  let probing = null, probed = null, inSight = false;
   const probeTrace = data.scene.data.length - 1;
   function hasWebgl() {
     const canvas = document.createElement("canvas");
@@ -368,14 +369,15 @@
     marker.setAttribute("cx", x);
     marker.setAttribute("cy", y);
     if (!drawn) return;
-    clearTimeout(probing); // the scene follows when slider and pointer rest: the slices follow at once
-    probing = setTimeout(() => {
-      const end = plus(data.target, outwardOf(row), data.probe_mm);
-      Plotly.restyle(scene, {
-        x: [[data.target[0], end[0]]], y: [[data.target[1], end[1]]], z: [[data.target[2], end[2]]],
-      }, [probeTrace]);
-    }, 60);
+    const { at, outward } = own ?? { at: ORIGIN, outward: outwardOf(row) }, tip = plus(data.target, at), hub = plus(tip, outward, data.probe_mm);
+    probed = { x: [[tip[0], hub[0]]], y: [[tip[1], hub[1]]], z: [[tip[2], hub[2]]] };
+    follow();
   }
+  function follow() { // the scene is drawn again when it is in sight and the pointer rests: the slices follow at once
+    clearTimeout(probing);
+    if (inSight && probed) probing = setTimeout(() => { Plotly.restyle(scene, probed, [probeTrace]); probed = null; }, 60);
+  }
+  new IntersectionObserver((entries) => { inSight = entries.at(-1).isIntersecting; follow(); }).observe(scene);
   const traces = (wanted) => data.scene.data.flatMap((trace, i) => trace.meta && wanted(trace.meta) ? [i] : []);
   const poses = { none: byId("pose-none"), target: byId("pose-target"), standoff: byId("pose-standoff") };
   byId("poses").hidden = traces((meta) => meta.arm).length === 0;
