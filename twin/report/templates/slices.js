@@ -504,7 +504,7 @@ const slicing = (() => {
   // ---- the units along the needle --------------------------------------------------------------------------------
   function drawUnits(canvas, needle) {
     const width = canvas.width = Math.max(320, Math.min(976, canvas.parentElement.clientWidth)), narrow = width < 600;
-    const context = canvas.getContext("2d"), { height } = canvas, BEHIND = 15, BEYOND = 25;
+    const height = canvas.height = ct ? 330 : 150, context = canvas.getContext("2d"), BEHIND = 15, BEYOND = 25;
     const path = Number.isFinite(needle.path) ? needle.path : facts.needle.shaft, end = path + BEYOND;
     const passed = parts.filter((part) => part !== skin && part.closed && part.role !== "unknown").map((part) => {
       const at = crossings(part, needle.at, needle.outward).filter((mm) => mm > -400);
