@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import trimesh
 
+from puncture_twin.planning.anatomy.scan import nearest
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
@@ -18,7 +19,6 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
 from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.twin.report.page.page import Shown, write_page
-from puncture_twin.twin.report.slices.sheet import draw_slices
 from puncture_twin.twin.report.slices.subject import Subject
 
 TARGET = np.array([10.0, -20.0, 30.0])
@@ -30,7 +30,13 @@ def make_case(*, space="LPS", frame=None, name="ball"):
     """A case with a 210 mm needle; the entry frame is the space's own unless said."""
     rotation = entry_frame(frame, Space(space))
     needle = SimpleNamespace(
-        length_mm=210.0, shaft_mm=150.0, diameter_mm=1.2, radius_mm=0.6, skin_gap_mm=10.0, holder_diameter_mm=30.0
+        length_mm=210.0,
+        shaft_mm=150.0,
+        diameter_mm=1.2,
+        radius_mm=0.6,
+        skin_gap_mm=10.0,
+        holder_diameter_mm=30.0,
+        lengths_mm=(),
     )
     return SimpleNamespace(
         name=name,
@@ -234,11 +240,32 @@ def make_page(path):
     """The whole page of this patient: a plan, a rehearsal, slices; returns its candidates."""
     case = make_case()
     candidates, anatomy = make_candidates(case), make_anatomy()
-    anatomy.scan = SimpleNamespace(hu_at=lambda points: np.where(np.abs(points).max(axis=1) < 150, 40.0, np.nan))
-    plan, slices = make_plan(case, candidates), (draw_slices(Subject(case, anatomy, best_pick(candidates))),)
+    anatomy.scan = make_scan()
+    plan, subject = make_plan(case, candidates), Subject(case, anatomy, best_pick(candidates), REGION)
+    regions = np.where(candidates.safe[:, None, None], REGION, np.nan)
     told = (make_rehearsal(plan), make_registration())
-    write_page(Shown(case, anatomy, candidates, plan, *told, film="rehearsal.mp4", slices=slices), path)
+    shown = Shown(case, anatomy, candidates, plan, *told, film="rehearsal.mp4", subject=subject, regions_ct=regions)
+    write_page(shown, path)
     return candidates
+
+
+REGION = np.diag([4.0, 9.0, 16.0])
+
+
+def make_scan(*, spacing=(2.0, 2.5, 3.0)):
+    """A CT whose every voxel has another value than those beside it, from the lungs' to the bones'; air about it."""
+    shape = np.ceil(300 / np.array(spacing)).astype(int)
+    T = np.diag([*spacing, 1.0])
+    T[:3, 3] = TARGET - 150.0
+    rng = np.random.default_rng(0)
+    index = np.stack(np.indices(shape), axis=-1)
+    far = np.linalg.norm(index * np.array(spacing) - 150.0, axis=-1)
+    hu = np.where(far < SKIN_RADIUS, rng.integers(-200, 300, shape), -1000).astype(np.int16)
+
+    def hu_at(points):
+        return nearest(hu, np.linalg.inv(T), points)
+
+    return SimpleNamespace(hu_at=hu_at, measured=(hu, T), grid=SimpleNamespace(shape=hu.shape, T_ct_index=T))
 
 
 def _ball(radius, centre, subdivisions=3):

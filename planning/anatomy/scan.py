@@ -33,6 +33,7 @@ from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.formats.labels.label_surface import mask_surface
 from puncture_twin.planning.formats.mesh_guard import fits
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
@@ -193,6 +194,16 @@ class Scan:
     def voxels(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
         """Hounsfield units as they are stored, shape (nx, ny, nz), and the map (4, 4) of an index to LPS mm."""
         return self._ct.stored, self._ct.T_ct_index
+
+    @property
+    def grid(self) -> VolumeGrid:
+        """Where the voxels of the whole file lie."""
+        return self.source.surfaces.source.grid
+
+    @property
+    def measured(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
+        """As `voxels`, with the padding far below air, as `hu_at` has it."""
+        return self._ct.hu, self._ct.T_ct_index
 
     def release(self) -> None:
         """Let go of all voxels; what asks for them again decodes them again."""

@@ -14,6 +14,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.settings import Needle
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 
@@ -26,12 +28,17 @@ class EntryFacts:
         entry_mm: Shape (3,), the skin entry in that space, mm; NaN without one.
         place: Seen from the nearest marker, or from the target where the case has none; None without an entry.
         planes: Its angles in the scanner; None in a local space, which has no anatomy.
+        scanned: Where the entry is in the scan; None without a CT or an entry, and in a local space.
+        needle_mm: The shortest needle of the case's catalogue that reaches, tip to flange; NaN where none does, None
+            without a catalogue.
     """
 
     space: Space
     entry_mm: Floats
     place: EntryPlace | None
     planes: NeedlePlanes | None
+    scanned: ScannedEntry | None = None
+    needle_mm: float | None = None
 
     def rows(self) -> tuple[tuple[str, str], ...]:
         """Pairs of a label and its text for people."""
@@ -39,7 +46,11 @@ class EntryFacts:
         if self.place is not None:
             point = ", ".join(f"{mm:.1f}" for mm in self.entry_mm)
             stated = [("skin entry", f"({point}) mm {self.space}"), ("on the skin", self.place.text(self.space))]
-        return (*stated, *(() if self.planes is None else self.planes.rows()))
+        if self.needle_mm is not None:
+            fits = "none reaches" if np.isnan(self.needle_mm) else f"{self.needle_mm:g} mm, the shortest that reaches"
+            stated.append(("needle to take", fits))
+        parts = (part.rows() for part in (self.scanned, self.planes) if part is not None)
+        return (*stated, *(row for part in parts for row in part))
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees; null where there is no number."""
@@ -58,10 +69,63 @@ class EntryFacts:
             "entry_mm": None if self.place is None else self.entry_mm.tolist(),
             "entry_from": place,
             "in_scanner": None if self.planes is None else self.planes.summary(),
+            "in_scan": None if self.scanned is None else self.scanned._asdict(),
+            "needle_mm": None if self.needle_mm is None or np.isnan(self.needle_mm) else self.needle_mm,
         }
 
 
-def entry_facts(case: Case, markers: Sequence[Landmark], entry_ct: Floats, outward_ct: Floats) -> EntryFacts:
+class ScannedEntry(NamedTuple):
+    """Where a skin entry is in the scan.
+
+    Attributes:
+        slice: Its slice, 1 at the feet; 0 or beyond ``slices`` outside of the image.
+        slices: How many there are.
+        table_mm: Its z, as DICOM has it: a console's slice location or, with its own sign, table position.
+        sagittal_mm: From the sagittal laser's line, positive to the patient's left, if x = 0 is the isocentre.
+        coronal_mm: From the coronal laser's line, positive toward the back, if y = 0 is the isocentre.
+    """
+
+    slice: int
+    slices: int
+    table_mm: float
+    sagittal_mm: float
+    coronal_mm: float
+
+    def rows(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of a label and its text for people."""
+        inside = 1 <= self.slice <= self.slices
+        place = f"{self.slice} of {self.slices} from the feet, {self.slices + 1 - self.slice} from the head"
+        side, height = "left" if self.sagittal_mm > 0 else "right", "behind" if self.coronal_mm > 0 else "in front of"
+        return (
+            ("slice of the entry", place if inside else "outside of the image"),
+            ("table position", f"z = {self.table_mm:.1f} mm, as DICOM has it"),
+            (
+                "laser lines",
+                f"{abs(self.sagittal_mm):.0f} mm to the {side} of the sagittal one, {abs(self.coronal_mm):.0f} mm "
+                f"{height} the coronal one, if x = y = 0 is the isocentre",
+            ),
+        )
+
+
+def slice_numbers(grid: VolumeGrid) -> tuple[Floats, int]:
+    """Coefficients (4,) that make a slice's number, 1 at the feet, of a point (x, y, z, 1), mm, and how many there are.
+
+    Slices lie along the axis of the image that is nearest to the patient's.
+    """
+    axis = int(np.argmax(np.abs(grid.T_ct_index[2, :3])))
+    count, index = grid.shape[axis], np.linalg.inv(grid.T_ct_index)[axis]
+    return (index + [0, 0, 0, 1] if grid.T_ct_index[2, axis] > 0 else [0, 0, 0, count] - index), count
+
+
+def shortest_needle(needle: Needle, path_mm: float) -> float | None:
+    """Of a needle's catalogue the shortest for a path, tip to flange, mm; NaN where none reaches, None without one."""
+    reaching = (mm for mm in sorted(needle.lengths_mm) if needle.of_length(mm).longest_path_mm >= path_mm)
+    return next(reaching, np.nan) if needle.lengths_mm else None
+
+
+def entry_facts(
+    case: Case, markers: Sequence[Landmark], entry_ct: Floats, outward_ct: Floats, grid: VolumeGrid | None = None
+) -> EntryFacts:
     """Skin entry, nearest landmark and scanner angles of one path.
 
     Args:
@@ -69,11 +133,18 @@ def entry_facts(case: Case, markers: Sequence[Landmark], entry_ct: Floats, outwa
         markers: Those of its registration; may be none.
         entry_ct: Shape (3,), mm; NaN without a skin entry.
         outward_ct: Shape (3,), unit, from the target outward.
+        grid: Of its CT, where there is one.
     """
     landmarks = markers or (Landmark("the target", np.asarray(case.target_ct)),)
     planes = None if case.space is Space.LOCAL else needle_planes(outward_ct)
     entry_mm = to_lps(entry_ct[None], case.space)[0]  # the change of signs undoes itself
-    return EntryFacts(case.space, entry_mm, entry_place(entry_ct, landmarks), planes)
+    place, scanned = entry_place(entry_ct, landmarks), None
+    if grid is not None and place is not None and planes is not None:
+        number, count = slice_numbers(grid)
+        x, y, z = entry_ct.tolist()
+        scanned = ScannedEntry(int(np.rint(number @ [x, y, z, 1.0])), count, z, x, y)
+    needle_mm = shortest_needle(case.needle, float(np.linalg.norm(entry_ct - case.target_ct)))
+    return EntryFacts(case.space, entry_mm, place, planes, scanned, None if place is None else needle_mm)
 
 
 class NeedlePlanes(NamedTuple):

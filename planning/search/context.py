@@ -132,29 +132,31 @@ class CaseContext:
     def entry_facts(self, entry_ct: Floats, outward_ct: Floats) -> EntryFacts:
         """Skin entry (3,), mm, and outward direction (3,), unit, described to a person at the patient."""
         registration = None if self.placement is None else self.placement.registration
-        if registration is None:
-            return entry_facts(self.case, (), entry_ct, outward_ct)
-        named = zip(registration.markers.names, registration.markers.points_ct, strict=True)
-        markers = tuple(Landmark(f"marker {name}", point) for name, point in named)
-        return entry_facts(self.case, markers, entry_ct, outward_ct)
+        known = ((), ()) if registration is None else (registration.markers.names, registration.markers.points_ct)
+        markers = tuple(Landmark(f"marker {name}", point) for name, point in zip(*known, strict=True))
+        grid = None if self.anatomy.scan is None else self.anatomy.scan.grid
+        return entry_facts(self.case, markers, entry_ct, outward_ct, grid)
 
     def breakdown_at(self, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown | None:
         """Uncertainty breakdown of a direction (3,) at joints (6,), rad, as of a plan; None without declared errors."""
         return None if self.chance is None else uncertainty_breakdown(self.chance, outward_ct, q)
 
-    def region_ct(self, q: Floats) -> Floats | None:
-        """The tip's 95 % region about the target: x' inv(region) x <= 1, shape (3, 3), mm^2, CT axes.
+    def regions_ct(self, q: Floats) -> Floats | None:
+        """The tip's 95 % region about the target: x' inv(region) x <= 1, shape (n, 3, 3), mm^2, CT axes.
 
         Args:
-            q: Shape (6,), rad, the tip on the target; NaN where the arm does not reach it.
+            q: Shape (n, 6), rad, the tip on the target; NaN where the arm does not reach it, and then in the region.
 
         Returns:
-            None there, and without declared errors.
+            None without declared errors.
         """
-        if self.chance is None or not np.isfinite(q).all():
+        if self.chance is None:
             return None
-        error = self.chance.error
-        return np.asarray(error.fit.test.region_factor**2 * error.tip_covariance_ct(q[None])[0])
+        error, known = self.chance.error, np.isfinite(q).all(axis=1)
+        regions = np.full((len(q), 3, 3), np.nan)
+        if known.any():
+            regions[known] = error.fit.test.region_factor**2 * error.tip_covariance_ct(q[known])
+        return regions
 
     def cross_check(self, count: int) -> CrossChecked:
         """Measure random directions of the grid again with FCL.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
-from puncture_twin.planning.anatomy.structure import Structure
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.text import brief
@@ -198,7 +198,6 @@ class Explanation:
             f"  path length    {row.path.length[0]:8.2f} mm, allowed {needle.longest_path_mm:g}",
             f"  skin angle     {np.degrees(row.path.skin_angle[0]):8.2f} deg, allowed {limit:g}",
             f"  standoff       {standoff:8.2f} mm, its tip {before:.1f} mm before the skin, the flange at {flange:.1f}",
-            f"  tissue crossed {row.path.tissue[0]:8.2f} mm",
         ]
 
     @cached_property
@@ -267,7 +266,7 @@ class Explanation:
             margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
             lines.append(
                 f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.{decimals(structure)}f} {margin}"
-                + _clearance_note(float(clearances[column]), bool(short[column]))
+                + _clearance_note(structure, float(clearances[column]), bool(short[column]))
             )
         left = len(order) - len(shown)
         return [*lines, f"  and {left} more, farther away"] if left else lines
@@ -295,9 +294,10 @@ def decimals(structure: Structure) -> int:
     return 1 if structure.voxel_mm >= COARSE_VOXEL_MM else 2
 
 
-def _clearance_note(clearance_mm: float, short: bool) -> str:
-    """Text after a clearance: too close, or crossed where it is below zero."""
-    notes = ["too close"] * short + ["crossed"] * (clearance_mm < 0)
+def _clearance_note(structure: Structure, clearance_mm: float, short: bool) -> str:
+    """Text after a clearance: too close; crossed where it is below zero, and of the target's structure entered."""
+    below = "enters" if structure.role == Role.TARGET else "crossed"
+    notes = ["too close"] * short + [below] * (clearance_mm < 0)
     return f"  {', '.join(notes)}" if notes else ""
 
 

@@ -1,14 +1,16 @@
 """The skin entry in words that can be measured on the patient, and the needle's angles in the scanner."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from scipy.spatial.transform import Rotation
 
+from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.search.bedside import Landmark, entry_place, needle_planes
+from puncture_twin.planning.search.bedside import Landmark, entry_facts, entry_place, needle_planes
 from puncture_twin.planning.search.context import prepare
 from tests.case_world import write_case
 
@@ -114,3 +116,31 @@ def test_check_answers_in_the_space_that_was_typed_and_from_the_nearest_marker(t
     text = found.text()
     assert "mm RAS" in text and f"of marker {nearest}" in text and "gantry tilt" in text
     np.testing.assert_allclose(walked(summary["entry_from"]["text"], lps[nearest]), entry, atol=0.5)
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_the_slice_of_an_entry_is_counted_from_the_feet(up):
+    """Whichever way the file's slices run; a point beyond them is in none; the laser lines by their signs."""
+    T = np.diag([1.0, 1.0, 3.0 * up, 1.0])
+    T[:3, 3] = [-50.0, -60.0, 100.0 if up > 0 else 100.0 + 3.0 * 19]
+    grid = SimpleNamespace(shape=(100, 120, 20), T_ct_index=T)
+    for z, number in ((100.0, 1), (101.0, 1), (157.0, 20), (160.0, 21)):
+        facts = entry_facts(CASE, (), np.array([-29.0, 12.0, z]), HEAD, grid)
+        assert (facts.scanned.slice, facts.scanned.slices) == (number, 20)
+    rows = dict(facts.rows())
+    assert rows["slice of the entry"] == "outside of the image"
+    assert rows["laser lines"].startswith("29 mm to the right of the sagittal one, 12 mm behind the coronal one")
+
+
+@pytest.mark.parametrize(("path", "length"), [(50.0, 120.0), (95.0, 150.0), (140.0, 200.0), (160.0, np.nan)])
+def test_the_needle_to_take_is_the_shortest_that_reaches(path, length):
+    """Shafts of 70, 100 and 150 mm; 160 mm in the body is reached by none."""
+    found = entry_facts(CASE, (), np.array([0.0, 0.0, path]), HEAD)
+    assert found.needle_mm == length or (np.isnan(length) and np.isnan(found.needle_mm))
+
+
+CASE = SimpleNamespace(
+    space=Space.LPS,
+    target_ct=np.zeros(3),
+    needle=Needle(200.0, 150.0, 1.2, None, 10.0, 30.0, (200.0, 120.0, 150.0)),
+)

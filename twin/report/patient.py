@@ -107,7 +107,6 @@ def _window_fields(candidates: Candidates) -> list[Field]:
         Field("nearest structure", lambda window: nearest(window)[0].replace("_", " ") or None),
         Field("path", best(path.length), 1, "mm"),
         Field("skin angle", best(np.degrees(path.skin_angle)), 1, "°"),
-        Field("crossed tissue", best(path.tissue), 1, "mm"),
         Field("reach margin", best(candidates.arm.margin), 2),
         Field("safe cone", best(np.degrees(candidates.safe_cone)), 1, "°"),
         Field("window's area", lambda window: window.square_deg, 0, "deg²"),
@@ -143,9 +142,7 @@ def plan(
     """
     if plan is None:
         best = facts(at_patient)
-        why = Warn((f"Planning failed: {refusal}",)) if refusal else f"No plan was requested: {NOT_REQUESTED}."
-        path: list[Block] = ["Path of the best direction:", best] if best.rows else []
-        return [why, *path]
+        return [*([Warn((f"Planning failed: {refusal}",))] if refusal else []), *([best] if best.rows else [])]
     rows = [
         ("direction", f"θ {np.degrees(plan.theta):g}°, β {np.degrees(plan.beta):g}°"),
         ("arm", str(plan.model.name)),
@@ -164,11 +161,9 @@ def plan(
 
 
 def rehearsal(
-    done: Any | None, keep_away: frozenset[str], film: str | None = None, failures: Sequence[str] = ()
+    done: Any, keep_away: frozenset[str], film: str | None = None, failures: Sequence[str] = ()
 ) -> list[Block]:
     """The rehearsal's numbers; clearances of the structures that the needle must keep away from; a link to the film."""
-    if done is None:
-        return [Markup("<p>Not rehearsed.</p>")]
     touched = [
         f"{c.link} touches {c.body} at {c.time_s:.2f} s"
         f"{f' ({c.depth_mm:.2f} mm deep)' if math.isfinite(c.depth_mm) else ''}"

@@ -247,7 +247,8 @@ def write_page(path: Path, title: str, under: str, cards: Sequence[Card], sectio
 def inputs_table(inputs: Iterable[Input]) -> Markup:
     """Every input with its role and hash."""
     rows = ((one.role, one.path, Markup("<code>{}</code>").format(one.sha256)) for one in inputs)
-    return blocks_html([Table(("role", "file", "SHA-256"), tuple(rows), "")])
+    table = blocks_html([Table(("role", "file", "SHA-256"), tuple(rows), "")])
+    return Markup("<details><summary>Files, each with its SHA-256</summary>{}</details>").format(table)
 
 
 TIMES = Markup(

@@ -1,10 +1,39 @@
-"""The page on a phone, a tablet and a desk, by Playwright in headless Chromium; skipped where there is no browser."""
+"""The page on a phone, a tablet and a desk, by Playwright in headless Chromium; skipped where there is no browser.
 
+What its script cuts out of the page's block of the CT is what ``slices.png`` shows.
+"""
+
+import base64
+import io
+import re
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import report_world as world
+import scipy
 from page_browser import chromium, opened, serious_findings
+from PIL import Image
+
+from puncture_twin.planning.search.choice import Pick
+from puncture_twin.twin.report.slices.panel import PIXELS, TONES, draw_panel
+from puncture_twin.twin.report.slices.planes import needle_planes
+from puncture_twin.twin.report.slices.sheet import flat
+from puncture_twin.twin.report.slices.subject import Subject
 
 WIDTHS = [390, 900, 1440]
+GREYS = 2
+"""Of 255, in the window of 400 HU: half a step of the page's bytes (1.7 HU), and the rounding of a grey."""
+LETTERS = 46
+"""Pixels from the middle of an edge within which letters stand; the browser's are of another font."""
+SHOWN = """() => [...document.querySelectorAll("#slices-a .slice")].map((one) => {
+    const [base, over] = one.querySelectorAll("canvas"), both = document.createElement("canvas");
+    both.width = both.height = base.width;
+    const context = both.getContext("2d");
+    context.drawImage(base, 0, 0);
+    context.drawImage(over, 0, 0, base.width, base.height);
+    return [base.toDataURL(), both.toDataURL()];
+})"""
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +51,80 @@ def address(tmp_path_factory):
     return path.as_uri()
 
 
-@pytest.fixture(params=WIDTHS)
+@pytest.fixture(scope="module")
+def patient():
+    """Case, anatomy with a CT of noise, candidates."""
+    case = world.make_case()
+    anatomy = world.make_anatomy()
+    anatomy.scan = world.make_scan()
+    return case, anatomy, world.make_candidates(case)
+
+
+@pytest.fixture(scope="module", params=WIDTHS)
 def page(request, browser, address):
-    """The page, open and drawn, at one width."""
+    """The page, open and drawn, at one width; all tests of a width share it."""
     with opened(browser, address, request.param) as page:
         page.wait_for_function("document.body.dataset.ready === 'true'")
+        drawn(page)
         yield page
+
+
+def drawn(page, what=None):
+    """Wait until a row's slices, or any, are drawn; returns the row."""
+    one = "document.getElementById('slices-a').dataset.drawn"
+    page.wait_for_function(f"{one} === '{what}'" if what is not None else f"{one} !== undefined")
+    return page.evaluate(one)
+
+
+def picture(address):
+    """The pixels of a data address, RGB."""
+    content = base64.b64decode(address.partition(",")[2])
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
+
+
+def row_of(candidates, theta_deg, beta_deg):
+    """The row of two angles."""
+    same = np.isclose(candidates.theta, np.radians(theta_deg)) & np.isclose(candidates.beta, np.radians(beta_deg))
+    return int(np.flatnonzero(same)[0])
+
+
+def same_slices(page, patient, row):
+    """Every slice of a row as ``slices.png`` has it: the CT to `GREYS`, lines where its lines are."""
+    case, anatomy, candidates = patient
+    region = world.REGION if candidates.safe[row] else None
+    subject = Subject(case, anatomy, Pick(candidates, row), region)
+    planes = needle_planes(case.target_ct, subject.outward_ct, subject.path_mm)
+    wanted = [draw_panel(subject, plane) for plane in planes]
+    for (base, both), panel in zip(page.evaluate(SHOWN), wanted, strict=True):
+        grey = TONES["abdomen"].grey(panel.hu).astype(int)
+        assert (np.abs(picture(base)[..., 0] - grey) > GREYS).mean() < 1e-3, panel.plane.name
+        found, theirs = picture(both), np.asarray(flat(panel, TONES["abdomen"])).astype(int)
+        free = ~letters_and_scale()
+        for colour in ((0, 229, 255), (255, 77, 240), (224, 124, 72)):
+            mine, other = (np.abs(one - colour).max(axis=2) for one in (found, theirs))
+            for one, two in ((mine, other), (other, mine)):
+                alone = (one < 40) & free & ~widened(two < 110)
+                assert alone.sum() <= 0.02 * (one < 40).sum() + 3, (panel.plane.name, colour)
+        off = (np.abs(found - theirs).max(axis=2) > 80) & free
+        assert off.mean() < 0.005, panel.plane.name
+
+
+def widened(mask):
+    """A pixel more to every side."""
+    return scipy.ndimage.binary_dilation(mask, np.ones((3, 3)))
+
+
+def letters_and_scale():
+    """Where words stand."""
+    mask = np.zeros((PIXELS, PIXELS), bool)
+    middle, edge = (
+        slice(PIXELS // 2 - LETTERS, PIXELS // 2 + LETTERS),
+        (slice(0, LETTERS), slice(PIXELS - LETTERS, PIXELS)),
+    )
+    for one in edge:
+        mask[middle, one] = mask[one, middle] = True
+    mask[PIXELS - 60 :, :200] = True
+    return mask
 
 
 def test_axe_finds_nothing_serious(page):
@@ -59,3 +156,110 @@ def test_dates_film_and_fractions_are_there(page):
     assert "Made on 20" in said and "scan of a date that its files do not state" in said
     assert page.locator("a[href='rehearsal.mp4']").count() == 1
     assert "of solid angle" in page.locator(".mapside").inner_text()
+
+
+def test_slices_of_what_is_chosen_are_those_of_the_program(page, patient):
+    """By the map, a slider and a row of the table, safe or not: pixels of CT, needle, margin, region and outlines."""
+    candidates = patient[2]
+    box = page.locator("#map-image").bounding_box()
+    page.locator("#map-image").click(position={"x": 0.3 * box["width"], "y": 0.62 * box["height"]})
+    clicked = (
+        page.evaluate("+document.getElementById('command').textContent.match(/theta (\\S+)/)[1]"),
+        page.evaluate("+document.getElementById('command').textContent.match(/beta (\\S+)/)[1]"),
+    )
+    row = row_of(candidates, *clicked)
+    drawn(page, row)
+    same_slices(page, patient, row)
+    page.locator("#theta").focus()
+    for _ in range(6):
+        page.keyboard.press("ArrowLeft")
+    slid = row_of(candidates, clicked[0] - 30, clicked[1])
+    drawn(page, slid)
+    same_slices(page, patient, slid)
+    page.locator("button.pick").first.click()
+    best = int(page.locator("button.pick").first.get_attribute("data-row"))
+    drawn(page, best)
+    same_slices(page, patient, best)
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+def at_pixel(page, number, column, row):
+    """Point at a pixel of a slice, 480 a side; returns where that is in the window."""
+    over = page.locator("#slices-a .over").nth(number)
+    over.scroll_into_view_if_needed()
+    box = over.bounding_box()
+    place = {"x": (column + 0.5) / PIXELS * box["width"], "y": (row + 0.5) / PIXELS * box["height"]}
+    over.hover(position=place)
+    box = over.bounding_box()
+    return box["x"] + place["x"], box["y"] + place["y"]
+
+
+def plane_of(patient, row, number):
+    """A plane of ``slices.png``."""
+    case, _, candidates = patient
+    return needle_planes(case.target_ct, candidates.outward_ct[row], candidates.path.length[row])[number]
+
+
+def test_the_cursor_reads_units_and_structure(page, patient):
+    """At pixels of an axial slice: the CT's value within what is stated, and the structure that holds the point."""
+    case, anatomy, _ = patient
+    page.locator("button.pick").first.click()
+    row = int(page.locator("button.pick").first.get_attribute("data-row"))
+    drawn(page, row)
+    points = plane_of(patient, row, 0).points_ct(PIXELS).reshape(PIXELS, PIXELS, 3)
+    for column, line in ((240, 250), (200, 380), (60, 380), (20, 30)):
+        at_pixel(page, 0, column, line)
+        said, point = page.locator("#cursor").inner_text(), points[line, column]
+        hu, doubt = map(float, re.match(r"(\S+) ± (\d+) HU", said.replace("−", "-")).groups())
+        wanted = anatomy.scan.hu_at(point[None])[0]
+        assert abs(hu - wanted) <= doubt + 0.5, said
+        far = np.linalg.norm(point - case.target_ct)
+        place = "liver" if far < 39 else "in no structure" if far < 99 else "outside of the skin"
+        if np.linalg.norm(point - case.target_ct - [-70, 0, 0]) < 7:
+            place = "rib right 9"
+        assert place in said
+
+
+def test_a_scrolled_slice_is_that_of_the_place(page, patient):
+    """The wheel moves one plane along its normal; its CT is the program's there, and the others stay."""
+    _, anatomy, _ = patient
+    page.locator("button.pick").first.click()
+    row = int(page.locator("button.pick").first.get_attribute("data-row"))
+    page.locator("#slices-centre").click()
+    drawn(page, row)
+    slider = page.locator("#slices-a input[type=range]").first
+    slider.fill("20")
+    page.wait_for_function("document.querySelector('#slices-a output').textContent === '20 mm'")
+    plane = plane_of(patient, row, 0)
+    moved = replace(plane, at_ct=plane.at_ct + 20.0 * plane.normal)
+    grey = TONES["abdomen"].grey(anatomy.scan.hu_at(moved.points_ct(PIXELS)).reshape(PIXELS, PIXELS)).astype(int)
+    assert (np.abs(picture(page.evaluate(SHOWN)[0][0])[..., 0] - grey) > GREYS).mean() < 1e-3
+    assert "20 mm F of the target" in page.locator("#slices-a figcaption").first.inner_text()
+    page.locator("#slices-centre").click()
+
+
+def test_a_path_of_ones_own_has_no_verdict_of_its_own(page, patient):
+    """A dragged entry gets the nearest direction's, said to be that; a moved target none; two paths side by side."""
+    page.locator("button.pick").first.click()
+    row = int(page.locator("button.pick").first.get_attribute("data-row"))
+    page.locator("#slices-keep").click()
+    page.locator("[data-mode=move]").click()
+    drawn(page, row)
+    plane, outward = plane_of(patient, row, 1), patient[2].outward_ct[row]
+    for step, said in ((100.0 * outward, "the nearest searched direction"), (0.0 * outward, "the target was moved by")):
+        x, y = plane.place(plane.at_ct + step) - plane.centre
+        column, line = (1 + np.array([x, -y]) / plane.half_mm) * PIXELS / 2 - 0.5
+        start = at_pixel(page, 1, column, line)
+        page.mouse.down()
+        page.mouse.move(start[0] + 14, start[1] + 3, steps=2)
+        page.mouse.up()
+        text = page.locator("#slices-of").inner_text()
+        assert "not known" in text and said in text and "bad" in page.locator("#slices-of").get_attribute("class")
+    assert "rank" not in page.locator("#hover").inner_text()  # a verdict of another path stands nowhere as this one's
+    assert page.locator("#slices-numbers thead th").count() == 3 and page.locator("#slices-b .over").count() == 4
+    assert "--targets" in page.locator("#command").inner_text()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    page.locator("#slices-back").click()
+    page.locator("#slices-keep").click()
+    page.locator("[data-mode=point]").click()
+    assert drawn(page, row)

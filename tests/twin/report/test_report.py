@@ -30,8 +30,8 @@ from puncture_twin.twin.report.map.map_picture import DISC, draw_map
 from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
 from puncture_twin.twin.report.numbers import reason_counts
-from puncture_twin.twin.report.page import page as page_slices, page_scene as lighter_mesh
-from puncture_twin.twin.report.page.page import Shown, slices_data, write_page
+from puncture_twin.twin.report.page import page_scene
+from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
 from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
@@ -45,8 +45,6 @@ from puncture_twin.twin.report.scene.scene_parts import SceneBody, needle_bodies
 from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
 from puncture_twin.twin.report.scene.shapes import LIFT_MM, corridor_mouth, corridor_walls
 from puncture_twin.twin.report.scene.views import outermost, overview, up_ct
-from puncture_twin.twin.report.slices.sheet import draw_slices
-from puncture_twin.twin.report.slices.subject import Subject
 
 FRAMES = {
     "bed": ("LPS", None),
@@ -552,6 +550,37 @@ def test_the_film_has_the_frames_it_says(anatomy, case, plan, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
 
 
+def test_the_film_shows_the_patient_and_ends_with_the_result(anatomy, case, plan, tmp_path, monkeypatch):
+    """The body fills the overview, the needle is four pixels wide at least, and the end is written over it."""
+    monkeypatch.setattr(film, "film_times", lambda total: film.FilmTimes((0.0, 0.7 * total, total), 1.0, 1))
+    done = world.make_rehearsal(plan)
+    done.contacts = ()
+    _, (_, before, *_, last) = decoded(draw_film(done, plan, case, anatomy, tmp_path / "film.mp4"))
+    view = before[: film.VIEW_HEIGHT, : film.VIEW_WIDTH].astype(int)
+    reddish = view[..., 0] - view[..., 2] > 12  # skin and organs; ground and arm are grey or blue
+    assert np.ptp(np.flatnonzero(reddish.sum(axis=1) > 20)) > 0.7 * film.VIEW_HEIGHT
+    dark = (view < 70).all(axis=2)[60]
+    assert 4 <= dark.sum() <= 8 and np.ptp(np.flatnonzero(dark)) < 8
+    band = np.s_[film.VIEW_HEIGHT - 36 : film.VIEW_HEIGHT - 8, 10:400]
+    written = [(frame[band].astype(int) < 60).all(axis=2).sum() for frame in (before, last)]
+    assert written[1] > 500 > 10 * written[0]
+
+
+def test_after_a_checked_search_the_arm_is_in_the_scene(anatomy, case, candidates, plan):
+    """With the joints of the search, where the base is known; none of another direction, and none without a base."""
+    best = best_pick(candidates)
+    q = np.full((len(candidates), 6), np.nan)
+    q[best.row] = plan.insertion.q[-1]
+    reached = replace(candidates, arm=replace(candidates.arm, q_insertion=q))
+
+    def arms(pick, T_base_ct):
+        figure = page_scene.scene_figure(case, anatomy, reached, None, pick=pick, T_base_ct=T_base_ct)
+        return [trace for trace in figure["data"] if trace.get("meta", {}).get("arm")]
+
+    assert len(arms(Pick(reached, best.row), plan.T_base_ct)) > 6
+    assert not arms(Pick(reached, best.row), None) and not arms(Pick(reached, best.row + 1), plan.T_base_ct)
+
+
 def test_without_an_encoder_there_is_a_gif(anatomy, case, plan, tmp_path, monkeypatch):
     """A machine without H.264 still gets a film, and no broken MP4 beside it."""
 
@@ -640,14 +669,6 @@ def test_the_target_stands_in_the_case_s_space(anatomy, candidates, tmp_path):
     assert "at (-10.0, 20.0, 30.0) mm RAS" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
-def test_slices_beyond_the_page_s_size_are_left_out(anatomy, case, candidates, monkeypatch):
-    """The first direction always comes; each knows its angles."""
-    drawn = [draw_slices(Subject(case, anatomy, Pick(candidates, int(row)))) for row in candidates.ranked[:2]]
-    assert [one["theta_deg"] for one in slices_data(drawn)["directions"]] == [0.0, 0.0]
-    monkeypatch.setattr(page_slices, "MOST_BYTES", 1)
-    assert len(slices_data(drawn)["directions"]) == 1
-
-
 def test_what_is_unknown_is_hatched(case, candidates):
     """By a second colour, in lines: the grey alone is near the green of safe for the colour-blind."""
     reason = np.where(candidates.verdict.reason == "too_close", "unknown_region", candidates.verdict.reason)
@@ -669,7 +690,7 @@ def test_notes_are_folded_below_the_warnings(case, candidates, tmp_path):
     with_note, without = pages
     assert '<li class="bad">a warning</li>' in with_note and '<li class="bad">a &lt;note' not in with_note
     assert "<details><summary>Notes (1)</summary><ul><li>a &lt;note&gt;</li></ul></details>" in with_note
-    assert "<details" not in without
+    assert "<summary>Notes" not in without
 
 
 def test_nothing_safe_is_said_first(anatomy, case, tmp_path):
@@ -678,7 +699,9 @@ def test_nothing_safe_is_said_first(anatomy, case, tmp_path):
     write_page(Shown(case, anatomy, nothing), tmp_path / "page.html")
     text = visible((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert text.index("Nothing is safe") < text.index("Which directions are safe")
-    assert "skin angle" in text and "No plan was requested" in text
+    assert "skin angle" in text
+    for empty in ("plan", "registration", "rehearsal"):  # neither heading nor a line in the contents
+        assert f'id="{empty}"' not in text and f'href="#{empty}"' not in text
 
 
 def test_a_failed_plan_is_none_that_nobody_wanted(anatomy, case, candidates, tmp_path, monkeypatch):
@@ -695,7 +718,7 @@ def test_a_failed_plan_is_none_that_nobody_wanted(anatomy, case, candidates, tmp
     failed, searched = visible(pages["failed"]), visible(pages["searched"])
     assert failed.count("no approach was found to any of 12 candidates") == 2 and "Planning failed" in failed
     assert "not requested" not in failed and "searched only" not in failed
-    assert "not requested" in searched and "No plan was requested" in searched and "Planning failed" not in searched
+    assert "not requested" in searched and "No plan was requested" not in searched and "Planning failed" not in searched
     told = [text for text in said if "no arm is shown" in text]
     assert ["no plan was requested" in text for text in told] == [True, False] and "PLANNING FAILED" in told[1]
 
@@ -762,7 +785,7 @@ def test_lightened_meshes_are_kept(ball, tmp_path, monkeypatch):
     cache = Cache(tmp_path)
     (first,) = lightened(bodies, 2_000, cache)
     with monkeypatch.context() as patch:
-        patch.setattr(lighter_mesh.fast_simplification, "simplify", None)
+        patch.setattr(page_scene.fast_simplification, "simplify", None)
         (again,) = lightened(bodies, 2_000, cache)
         with pytest.raises(TypeError):
             lightened(bodies, 1_000, cache)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.choice import Pick
-from puncture_twin.twin.report.slices.panel import KNOTS_HU, PIXELS, TONES, draw_panel, grey_table, stored
+from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, PIXELS, TONES, draw_panel, stored
 from puncture_twin.twin.report.slices.planes import capsule, ellipse, letters, needle_planes, outline
 from puncture_twin.twin.report.slices.sheet import NO_CT, draw_slices, write_sheet
 from puncture_twin.twin.report.slices.subject import Subject
@@ -102,9 +102,9 @@ def test_the_region_is_cut_on_its_surface(direction, seed):
 def test_stored_bytes_give_every_window(name):
     """What a page makes of the stored bytes differs from the window itself by what a byte holds, at most."""
     hu = np.linspace(KNOTS_HU[0], KNOTS_HU[-1], 5000)
-    shown = np.array(grey_table(TONES[name]))[stored(hu)]
-    step = np.diff(np.interp(np.arange(256), [0, 48, 96, 152, 208, 255], KNOTS_HU)).max() / TONES[name].width
-    assert np.abs(shown - TONES[name].grey(hu) / 255).max() < step / 2 + 0.004
+    of_byte = np.interp(np.arange(256), KNOTS_BYTE, KNOTS_HU)
+    shown, wanted = (TONES[name].grey(one).astype(float) / 255 for one in (of_byte[stored(hu)], hu))
+    assert np.abs(shown - wanted).max() < np.diff(of_byte).max() / TONES[name].width / 2 + 0.004
 
 
 def subject(*, scan=None, region=None, row=None):

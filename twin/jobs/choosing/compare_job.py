@@ -411,7 +411,6 @@ FIELDS = (
     Field("expected tip error (rms)", "check.chances.expected_rms_mm", 2, "mm"),
     Field("path length", "check.path_length_mm", 1, "mm"),
     Field("skin angle", "check.skin_angle_deg", 1, "deg"),
-    Field("tissue crossed", "check.tissue_mm", 1, "mm"),
     Field("arm reaches it", _reach),
     Field("standoff", "plan.standoff_mm", 1, "mm"),
     Field("approach", "plan.approach_s", 1, "s"),

@@ -17,7 +17,6 @@ from puncture_twin.planning.registration.checks.places import touchable_points
 from puncture_twin.planning.search.choice import Pick, best_pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.jobs.patient.budget import budget_facts
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
@@ -27,7 +26,7 @@ from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Shown, Uncertainty, write_page
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
-from puncture_twin.twin.report.slices.sheet import Slices, draw_slices, write_sheet
+from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
 from puncture_twin.twin.report.slices.subject import Subject
 
 
@@ -35,7 +34,7 @@ class Drawn(NamedTuple):
     """The pictures of a search and its plan: their files, and what the page shows of them too."""
 
     files: tuple[Path, ...]
-    slices: tuple[Slices, ...]
+    subject: Subject | None
     raster: MapRaster
 
 
@@ -52,13 +51,15 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
         raster = map_raster(found, map_view(case, found))
         draw_map(found, case, out / "map.png", run.pick, raster)
     with stages.time("scene"):
-        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, failed=bool(run.refusal))
+        T_base_ct = _checked_base(run)
+        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, T_base_ct, failed=bool(run.refusal))
     with stages.time("slices"):
-        slices = _slices(run)
-        if slices:
-            write_sheet(slices[0], out / SLICES)
-    sheet = (out / SLICES,) if slices else ()
-    return Drawn((*sheet, out / "map.png", out / "scene.png"), slices, raster)
+        pick = run.pick or best_pick(found)
+        subject = None if pick is None else _subject(context, pick, run.plan)
+        if subject is not None:
+            write_sheet(draw_slices(subject), out / SLICES)
+    sheet = () if subject is None else (out / SLICES,)
+    return Drawn((*sheet, out / "map.png", out / "scene.png"), subject, raster)
 
 
 def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
@@ -78,7 +79,9 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
             film=film,
             uncertainty=_uncertainty(run),
             pick=run.pick,
-            slices=drawn.slices,
+            subject=drawn.subject,
+            T_base_ct=None if run.refusal else _checked_base(run),
+            regions_ct=context.regions_ct(found.arm.q_insertion),
             facts=run.facts,
             refusal=run.refusal,
             raster=drawn.raster,
@@ -87,6 +90,12 @@ def with_page(run: Run, out: Path, drawn: Drawn) -> Run:
         )
         write_page(page, out / PAGE)
     return run.with_files(*drawn.files, out / PAGE)
+
+
+def _checked_base(run: Run) -> Floats | None:
+    """Where the patient is for an arm that was checked; None where it was not."""
+    placement = run.context.placement
+    return placement.T_base_ct if placement is not None and run.candidates.arm_checked else None
 
 
 def _registration(context: CaseContext) -> dict[str, Any] | None:
@@ -126,22 +135,12 @@ def write_check_picture(context: CaseContext, explained: Explanation, path: Path
     return path
 
 
-def _slices(run: Run) -> tuple[Slices, ...]:
-    """Of the plan, else of the best direction, then of the best of each other window; none where nothing is safe."""
-    found = run.candidates
-    pick = run.pick or best_pick(found)
-    if pick is None:
-        return ()
-    bests = [window.best for window in find_windows(found).windows[:MOST_WINDOWS]]
-    others = [Pick(found, row) for row in bests if found.at(row) != pick.candidates.at(pick.row)]
-    subjects = [_subject(run.context, pick, run.plan), *(_subject(run.context, other) for other in others)]
-    return tuple(map(draw_slices, subjects))
-
-
 def _subject(context: CaseContext, pick: Pick, plan: Plan | None = None) -> Subject:
     """A direction, with the region of its tip as planned or as the search reaches it."""
     q = pick.candidates.arm.q_insertion[pick.row] if plan is None else plan.insertion.q[-1]
-    return Subject(context.case, context.anatomy, pick, context.region_ct(q))
+    regions = context.regions_ct(q[None])
+    known = regions is not None and np.isfinite(regions).all()
+    return Subject(context.case, context.anatomy, pick, regions[0] if known and regions is not None else None)
 
 
 def _uncertainty(run: Run) -> Uncertainty | None:

@@ -1,12 +1,7 @@
-"""``report.html``: everything about a run on one page that needs no network.
-
-The page's slices: CT and overlay apart, so that a page can show the CT in every window.
-"""
+"""``report.html``: everything about a run on one page that needs no network."""
 
 from __future__ import annotations
 
-import base64
-import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,11 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
-from PIL import Image
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import Severity
-from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.formats.dicom.storage import is_dicom_file
 from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.bedside import EntryFacts
@@ -42,11 +36,12 @@ from puncture_twin.twin.report.numbers import (
     reason_counts,
     target_text,
 )
-from puncture_twin.twin.report.page.page_map import map_data
+from puncture_twin.twin.report.page.page_map import map_data, picked_row
 from puncture_twin.twin.report.page.page_scene import scene_figure
+from puncture_twin.twin.report.page.page_slices import slices_data
 from puncture_twin.twin.report.page.template import (
     Card,
-    image_address,
+    base64_text,
     plotly_script,
     script_json,
     write_html,
@@ -62,8 +57,8 @@ from puncture_twin.twin.report.present import (
     percent,
     picture,
 )
-from puncture_twin.twin.report.slices.panel import TONES, Panel, grey_table, stored
-from puncture_twin.twin.report.slices.sheet import Slices
+from puncture_twin.twin.report.slices.panel import TONES
+from puncture_twin.twin.report.slices.subject import Subject
 
 
 class Uncertainty(NamedTuple):
@@ -96,7 +91,9 @@ class Shown:
         film: Name of the rehearsal's film, which lies beside the page and is linked; None without one.
         uncertainty: What there is to say of chances and rooms; None where the case declares no errors.
         pick: The planned candidate, or the one to be shown; None shows the best.
-        slices: What is shown in the CT, the first at once, the others where they are chosen.
+        subject: What the slices show first; None where there is no direction at all.
+        T_base_ct: Shape (4, 4), mm, where the arm was checked; else None.
+        regions_ct: Shape (n, 3, 3), mm^2: of the tip, as `CaseContext.regions_ct`; None without declared errors.
         facts: How the planned or shown path is found at the patient.
         refusal: Why there is no plan although one was requested; "" where none was.
         raster: The map's pixels where somebody has them already.
@@ -113,7 +110,9 @@ class Shown:
     film: str | None = None
     uncertainty: Uncertainty | None = None
     pick: Pick | None = None
-    slices: Sequence[Slices] = ()
+    subject: Subject | None = None
+    T_base_ct: Floats | None = None
+    regions_ct: Floats | None = None
     facts: EntryFacts | None = None
     refusal: str = ""
     raster: MapRaster | None = None
@@ -138,8 +137,7 @@ def write_page(shown: Shown, path: Path) -> None:
         stands=_location(case),
         dates=dates_text(case),
         needle=needle_text(case),
-        sliced=bool(shown.slices),
-        tones=SHOWN_TONES if shown.slices and shown.slices[0].panels[0].hu is not None else (),
+        tones=() if shown.anatomy.scan is None else tuple(TONES),
         methods=methods_text(case, shown.anatomy, found),
         notice=TRUTH_IS_BELIEF if done is not None and done.truth_is_belief else "",
         refused=_refused(found),
@@ -147,34 +145,39 @@ def write_page(shown: Shown, path: Path) -> None:
         counts=blocks_html(patient.counts(found)),
         best=blocks_html(patient.windows(found)),
         plan=blocks_html(patient.plan(plan, at_patient, shown.refusal, declared=declared, notes=shown.notes)),
-        registration=blocks_html(patient.registration(shown.registration)),
-        rehearsal=blocks_html(_rehearsed(done, demanding(shown.anatomy), shown.film, shown.failures)),
+        planned="Plan" if plan is not None or shown.refusal else "The best path at the patient",
+        registration=blocks_html(patient.registration(shown.registration)) if shown.registration else "",
+        rehearsal="" if done is None else blocks_html(_rehearsed(done, shown)),
+        study=scan_date(case),
         warnings=_doubts(found, shown.anatomy),
         inputs=inputs_table(case.inputs),
         origin=origin_section(case.rehearsal.seed if plan is None else plan.seed),
-        data=script_json(_drawn(shown)),
+        **_drawn(shown),
         plotly=plotly_script(),
         **_uncertain_sections(shown.uncertainty, shown.registration),
     )
 
 
 def _drawn(shown: Shown) -> dict[str, Any]:
-    """What the page's script draws: map, scene and slices."""
-    case, pick = shown.case, shown.chosen
-    return {
-        "map": map_data(case, shown.candidates, pick, shown.raster),
-        "scene": scene_figure(case, shown.anatomy, shown.candidates, shown.plan, user_cache(), pick),
-        "slices": slices_data(shown.slices),
+    """What the page's scripts draw: map, scene and slices."""
+    case, pick, found = shown.case, shown.chosen, shown.candidates
+    subject = shown.subject or Subject(case, shown.anatomy, pick or Pick(found, 0))
+    slices, ct, surfaces = slices_data(subject, found, picked_row(found, pick), shown.regions_ct)
+    data = {
+        "map": map_data(case, found, pick, shown.raster),
+        "scene": scene_figure(case, shown.anatomy, found, shown.plan, user_cache(), pick, shown.T_base_ct),
+        "slices": slices,
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
     }
+    return {"data": script_json(data), "ct": base64_text(ct), "surfaces": base64_text(surfaces)}
 
 
-def _rehearsed(rehearsal: Any | None, away: frozenset[str], film: str | None, failures: Sequence[str]) -> list[Block]:
+def _rehearsed(rehearsal: Any, shown: Shown) -> list[Block]:
     """The rehearsal's numbers, and its curves over time."""
-    alt = "True tip to true target, and true needle to true structures, over time"
-    curves = [] if rehearsal is None else [picture(rehearsal_png(rehearsal, away), alt)]
-    return [*patient.rehearsal(rehearsal, away, film, failures), *curves]
+    alt, away = "True tip to true target, and true needle to true structures, over time", demanding(shown.anatomy)
+    curves = picture(rehearsal_png(rehearsal, away), alt)
+    return [*patient.rehearsal(rehearsal, away, shown.film, shown.failures), curves]
 
 
 def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -353,49 +356,3 @@ def scan_date(case: Any) -> str:
             if found is not None and found.is_slice:
                 return found.date
     return ""
-
-
-MOST_BYTES = 2_900_000
-"""Of all slices on a page: the directions beyond it are left out, the last windows first."""
-
-QUALITY, COLOURS = 72, 128
-"""Of the CT as JPEG, and of the overlay's palette: both were looked at."""
-
-OVERLAY_LEVEL = 6
-"""How hard overlays are packed: at 9 they take seven times as long and are a fifteenth smaller."""
-
-SHOWN_TONES = ("abdomen", "lung", "bone")
-
-
-def slices_data(shown: Sequence[Slices]) -> dict[str, Any]:
-    """What the page's script shows, of as many directions as `MOST_BYTES` takes; the first always."""
-    directions: list[dict[str, Any]] = []
-    size = 0
-    for one in shown:
-        data = _direction(one)
-        size += sum(len(part) for panel in data["panels"] for part in (panel["ct"], panel["over"])) + len(data["units"])
-        if directions and size > MOST_BYTES:
-            break
-        directions.append(data)
-    return {"directions": directions, "tones": {name: grey_table(TONES[name]) for name in SHOWN_TONES}}
-
-
-def _direction(one: Slices) -> dict[str, Any]:
-    pick = one.subject.pick
-    return {
-        **({} if pick is None else pick.candidates.at(pick.row)),
-        "panels": [_panel(panel) for panel in one.panels],
-        "units": "" if one.units is None else image_address(one.units.quantize(COLOURS), OVERLAY_LEVEL),
-        "legend": [[name.replace("_", " "), css(colour)] for name, colour in one.legend],
-        "notes": list(one.notes),
-    }
-
-
-def _panel(panel: Panel) -> dict[str, str]:
-    ct = ""
-    if panel.hu is not None:
-        stream = io.BytesIO()
-        Image.fromarray(stored(panel.hu)).save(stream, format="JPEG", quality=QUALITY)
-        ct = "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-    over = image_address(Image.fromarray(panel.overlay).quantize(COLOURS), OVERLAY_LEVEL)
-    return {"name": panel.plane.name, "ct": ct, "over": over}

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from puncture_twin.planning.base.arrays import Ints
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.search.candidates import NOT_SEEN, Candidates
 from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.map.map_raster import PIXELS as FINE, MapRaster, map_raster, shown_front
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.template import image_address
 from puncture_twin.twin.report.palette import PNG_LEVEL, reason_of
+from puncture_twin.twin.report.slices.subject import MOST_NEAR, NEAR_MM
 
 PIXELS = FINE // 2
 """Side of the map on the page, CSS pixels; the picture is twice as fine for sharp screens."""
@@ -34,11 +38,22 @@ DETAIL_UNITS = {
 """What ``Candidates.verdict.amount`` is, by reason."""
 
 
+def picked_row(candidates: Candidates, pick: Pick | None) -> int:
+    """The row of a pick; one beyond the last for one that the search has no row of, -1 without any."""
+    if pick is None:
+        return -1
+    if pick.candidates is candidates:
+        return pick.row
+    theta, beta = pick.candidates.theta[pick.row], pick.candidates.beta[pick.row]
+    same = np.flatnonzero(np.isclose(candidates.theta, theta) & np.isclose(candidates.beta, beta))
+    return int(same[0]) if len(same) else len(candidates)
+
+
 def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRaster | None = None) -> dict[str, Any]:
     """What the page's script needs to draw the map and answer the pointer; plain values, degrees and mm.
 
     The pixel-to-row table is stored run by run, row after row of the picture: ``runs`` is [candidate, length, ...],
-    candidate -1 outside the grid.
+    candidate -1 outside the grid. A pick that the search has no row of is one row more.
 
     Args:
         case: The case.
@@ -48,75 +63,108 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
     """
     view, windows = map_view(case, candidates), find_windows(candidates)
     raster = map_raster(candidates, view) if raster is None else raster
-    rows = map_raster_rows(raster.rows[::2, ::2])
-    structures = sorted({*map(str, candidates.verdict.named), *candidates.clearance.structures})
-    front = shown_front(candidates, view)
-    reasons = [str(r) for r in np.unique(candidates.verdict.reason)]
+    front, picked = shown_front(candidates, view), picked_row(candidates, pick)
+    parts = [(candidates, np.arange(len(candidates)), windows.of_row)]
+    if pick is not None and picked == len(candidates):
+        parts.append((pick.candidates, np.array([pick.row]), np.zeros(len(pick.candidates), int)))
     return {
         "size": PIXELS,
         "image": image_address(Image.fromarray(raster.rgba), PNG_LEVEL),
-        "runs": rows,
+        "runs": map_raster_rows(raster.rows[::2, ::2]),
         "theta_max_deg": round(float(np.degrees(view.theta_max)), 4),
         "turn_deg": round(float(np.degrees(view.turn)), 4),
         "rim": [{"text": label.text, "angle_deg": float(np.degrees(label.angle))} for label in view.rim],
         "centre": view.centre,
-        "structures": structures,
-        "reasons": [REASON_TEXT[reason_of(r)] for r in reasons],
         "safe": candidates.safe_text,
         "arm": candidates.arm_note,
-        "codes": [r or "safe" for r in reasons],
-        "details": [DETAIL_UNITS.get(reason_of(r), ("", "")) for r in reasons],
-        **_directions(candidates, structures, reasons),
+        **_directions(parts),
         "outcome": "plan" if candidates.arm_checked else "check",
         "file": _typed(case.path),
-        "picked": -1 if pick is None or pick.candidates is not candidates else pick.row,
+        "space": str(case.space),
+        "picked": picked,
+        "first": picked if picked >= 0 else closest_miss(candidates) or 0,
         "best": [window.best for window in windows.windows[:MOST_WINDOWS]],
-        "window": windows.of_row.tolist(),
-        "safe_cone": _rounded(np.degrees(candidates.safe_cone), 1),
-        "chosen": None if pick is None else pick.candidates.at(pick.row),
         "pareto": front.rows.tolist(),
         "front": front.text,
         "not_seen": NOT_SEEN,
-        **_chances(candidates),
     }
 
 
-def _directions(candidates: Candidates, structures: list[str], reasons: list[str]) -> dict[str, Any]:
-    """What is said of each direction, a list a column; structures, reasons and sentences by their places."""
-    index = {name: i for i, name in enumerate(structures)}
-    nearest, amounts = _nearest(candidates)
-    sentences, sentence = np.unique(candidates.verdict.detail, return_inverse=True)
+def _directions(parts: Sequence[tuple[Candidates, Ints, Ints]]) -> dict[str, Any]:
+    """What is said of each direction, a list a column; structures, reasons and sentences by their places.
+
+    Args:
+        parts: Candidates, which rows of them, and the window of each of all their rows.
+    """
+    verdicts = [found.verdict.of(rows) for found, rows, _ in parts]
+    named = {str(name) for one in verdicts for name in one.named}
+    structures = sorted(named.union(*(found.clearance.structures for found, *_ in parts)))
+    reasons = sorted({str(reason) for one in verdicts for reason in one.reason})
+    sentences = sorted({str(text) for one in verdicts for text in one.detail})
+    columns = [_columns(*part, structures, reasons, sentences) for part in parts]
     return {
-        "theta": _rounded(np.degrees(candidates.theta), 3),
-        "beta": _rounded(np.degrees(candidates.beta), 3),
-        "reason": [reasons.index(str(r)) for r in candidates.verdict.reason],
-        "structure": [index[str(s)] for s in candidates.verdict.named],
-        "sentences": [str(s) for s in sentences],
-        "sentence": sentence.tolist(),
-        "depth": _rounded(candidates.verdict.depth, 1),
-        "amount": _rounded(candidates.verdict.amount, 2),
-        "nearest": [index[name] if name else -1 for name in nearest],
-        "clearance": _rounded(amounts, 2),
-        "path": _rounded(candidates.path.length, 1),
-        "skin_angle": _rounded(np.degrees(candidates.path.skin_angle), 1),
-        "rank": candidates.ranking.rank.tolist(),
-        "reachable": candidates.arm.reachable.tolist(),
-        "outward": _rounded(candidates.outward_ct.ravel(), 5),
+        "structures": structures,
+        "reasons": [REASON_TEXT[reason_of(r)] for r in reasons],
+        "codes": [r or "safe" for r in reasons],
+        "details": [DETAIL_UNITS.get(reason_of(r), ("", "")) for r in reasons],
+        "sentences": sentences,
+        **{name: [value for one in columns for value in one[name]] for name in columns[0]},
     }
+
+
+def _columns(
+    found: Candidates, rows: Ints, window: Ints, structures: list[str], reasons: list[str], sentences: list[str]
+) -> dict[str, list[Any]]:
+    """The columns of some rows."""
+    verdict, path, arm = found.verdict.of(rows), found.path, found.arm
+    index = {name: i for i, name in enumerate(structures)}
+    columns = {
+        "theta": _rounded(np.degrees(found.theta[rows]), 3),
+        "beta": _rounded(np.degrees(found.beta[rows]), 3),
+        "reason": [reasons.index(str(r)) for r in verdict.reason],
+        "structure": [index[str(s)] for s in verdict.named],
+        "sentence": [sentences.index(str(text)) for text in verdict.detail],
+        "depth": _rounded(verdict.depth, 1),
+        "amount": _rounded(verdict.amount, 2),
+        "near": _near(found, rows, index),
+        "path": _rounded(path.length[rows], 3),
+        "skin_angle": _rounded(np.degrees(path.skin_angle[rows]), 1),
+        "rank": found.ranking.rank[rows].tolist(),
+        "window": window[rows].tolist(),
+        "safe_cone": _rounded(np.degrees(found.safe_cone[rows]), 1),
+        "reachable": arm.reachable[rows].tolist(),
+        "outward": _rounded(found.outward_ct[rows].ravel(), 6),
+    }
+    chances = found.chances
+    if chances is not None:  # what is not there is not spoken of
+        columns |= {
+            "p_hit": _rounded(chances.hit[rows], 9),
+            "p_touch_any": _rounded(chances.touch_any[rows], 9),
+            "touch_refined": chances.refined[rows].tolist(),
+        }
+    return columns
+
+
+def _near(found: Candidates, rows: Ints, index: dict[str, int]) -> list[list[float]]:
+    """Of every row the structures with a margin near the needle, nearest first: place, mm, place, mm, and so on.
+
+    As `Subject.near`; at least the nearest, however far it is.
+    """
+    demanding = np.flatnonzero(np.isfinite(found.clearance.margins))
+    distance = found.clearance.distance[np.ix_(rows, demanding)]
+    order = np.argsort(distance, axis=1, kind="stable")[:, :MOST_NEAR]
+    nearest = np.round(np.take_along_axis(distance, order, axis=1), 3)
+    kept = np.isfinite(nearest) & ((nearest < NEAR_MM) | (np.arange(order.shape[1]) == 0))
+    places = np.array([index[name] for name in found.clearance.structures], int)[demanding]
+    return [
+        [value for k in np.flatnonzero(keep) for value in (int(places[one[k]]), float(mm[k]))]
+        for one, mm, keep in zip(order, nearest, kept, strict=True)
+    ]
 
 
 def _typed(path: Path) -> str:
     """A file as a shell takes it, from whatever folder; a link keeps its name, for its folder is what counts."""
     return shlex.quote(str(path.parent.resolve() / path.name))
-
-
-def _chances(candidates: Candidates) -> dict[str, Any]:
-    """Chances for the pointer to read; nothing of a case without declared errors."""
-    found = candidates.chances
-    if found is None:
-        return {}
-    chances = {"p_hit": _rounded(found.hit, 9), "p_touch_any": _rounded(found.touch_any, 9)}
-    return {**chances, "touch_refined": found.refined.tolist()}
 
 
 def map_raster_rows(rows: Any) -> list[int]:
@@ -126,17 +174,6 @@ def map_raster_rows(rows: Any) -> list[int]:
     lengths = np.diff(np.append(starts, len(flat)))
     runs: list[int] = np.stack([flat[starts], lengths], axis=1).ravel().tolist()
     return runs
-
-
-def _nearest(candidates: Candidates) -> tuple[list[str], Any]:
-    """For every row the nearest structure that demands a margin, and its clearance."""
-    demanding = np.flatnonzero(np.isfinite(candidates.clearance.margins))
-    if len(demanding) == 0:
-        return [""] * len(candidates), np.full(len(candidates), np.nan)
-    clearance = candidates.clearance
-    columns = demanding[np.argmin(np.nan_to_num(clearance.distance[:, demanding], nan=np.inf), axis=1)]
-    nearest = clearance.distance[np.arange(len(candidates)), columns]
-    return [clearance.structures[column] for column in columns], nearest
 
 
 def _rounded(values: Any, digits: int) -> list[float | None]:

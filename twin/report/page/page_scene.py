@@ -27,6 +27,7 @@ from puncture_twin.twin.report.raster.render import Layer
 from puncture_twin.twin.report.scene.scene_parts import (
     ArmPicture,
     SceneBody,
+    arm_bodies,
     chosen_direction,
     needle_bodies,
     patient,
@@ -74,6 +75,7 @@ def scene_figure(
     plan: Any | None,
     cache: Cache = NO_CACHE,
     pick: Pick | None = None,
+    T_base_ct: Floats | None = None,
 ) -> dict[str, Any]:
     """A plotly figure as plain values, meshes in base64.
 
@@ -81,11 +83,12 @@ def scene_figure(
         case: The case.
         anatomy: Structures and skin.
         candidates: The search's rows.
-        plan: The plan, or None: then there is no arm.
+        plan: The plan, or None: then the arm is that of the search, if it reaches the pick.
         cache: Where lightened meshes are kept.
         pick: Whose needle is shown where there is no plan; None shows none.
+        T_base_ct: Shape (4, 4), mm, of a search whose arm was checked.
     """
-    bodies, standoff = _bodies(case, anatomy, candidates, plan, pick)
+    bodies, standoff = _bodies(case, anatomy, candidates, plan, pick, T_base_ct if plan is None else plan.T_base_ct)
     light = lightened([*bodies, *standoff], TRIANGLES, cache)
     hidden = set(range(len(bodies), len(light)))
     first = {_legend_name(body): i for i, body in reversed(list(enumerate(light))) if i not in hidden}
@@ -113,18 +116,17 @@ def lightened(bodies: Sequence[SceneBody], triangles: int, cache: Cache = NO_CAC
 
 
 def _bodies(
-    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, pick: Pick | None
+    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, pick: Pick | None, T_base_ct: Floats | None
 ) -> tuple[list[SceneBody], list[SceneBody]]:
     """What is shown at first (the needle on the target), and what the standoff pose adds."""
-    T_base_ct = None if plan is None else plan.T_base_ct
     bodies = [*patient(anatomy, case), *room(case, T_base_ct), *safe_region(candidates, case)]
     direction = chosen_direction(pick, plan)
     if direction is not None:
         bodies += needle_bodies(case.needle, case.target_ct, direction).all
+    bodies += arm_bodies(case, plan, pick, T_base_ct)
     if plan is None or direction is None:
         return bodies, []
     arm = ArmPicture(plan.model, plan.T_base_ct, case.tool)
-    bodies += arm.bodies(plan.insertion.q[-1])
     tip = case.target_ct + plan.standoff_mm * direction
     waiting = [*arm.bodies(plan.insertion.q[0]), *needle_bodies(case.needle, tip, direction).all]
     return bodies, [SceneBody(f"{b.name}, standoff", f"{b.group}-standoff", b.mesh, b.colour) for b in waiting]

@@ -86,7 +86,12 @@ def script_json(data: Any) -> Markup:
 
 def packed(text: str) -> Markup:
     """Text as gzip in base64, the same bytes every time; no tag can begin in it. ``unpack.js`` reads it."""
-    return Markup(base64.b64encode(gzip.compress(text.encode("utf-8"), PACKED, mtime=0)).decode("ascii"))
+    return base64_text(gzip.compress(text.encode("utf-8"), PACKED, mtime=0))
+
+
+def base64_text(content: bytes) -> Markup:
+    """Bytes as a script reads them."""
+    return Markup(base64.b64encode(content).decode("ascii"))
 
 
 def png_address(picture: bytes) -> str:

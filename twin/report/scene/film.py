@@ -52,6 +52,15 @@ LONGEST_S = 8.0
 STILL_S = 2.0
 SPEEDS = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 30, 40, 60, 100, 200, 500)
 INSET_RADIUS_MM = 30.0
+BODY_MM = 250.0
+"""What of the body the overview holds, about the target: the patient fills it, and the arm may leave it."""
+
+ABOVE_MM = 30.0
+"""Of the needle at standoff above its tip."""
+
+NEEDLE_PIXELS = 4.5
+"""The needle's width at least, where it stands on the target."""
+
 PLANNED: Rgb = (0, 158, 115)
 PLANNED_RADIUS_MM = 0.7
 
@@ -142,10 +151,10 @@ def _scene(rehearsal: Any, plan: Any, case: Any, anatomy: Any, speed: float) -> 
     base = arm.bodies(rehearsal.q[0])[0]
     still = [*patient(anatomy, case), *room(case, T_base_ct), arm.plate, _planned_path(plan)]
     cameras = _wide_camera(case, still, arm, rehearsal, plan), _near_camera(case, still, plan)
-    tool = _tool_layer(case)
+    wide, near = (_tool_layer(case, camera) for camera in cameras)
     views = _Views(
-        _moving_picture([*still, base], cameras[0], [*arm.layers[1:], tool]),
-        _moving_picture([b for b in still if b.group != "room"], cameras[1], [tool]),
+        _moving_picture([*still, base], cameras[0], [*arm.layers[1:], wide]),
+        _moving_picture([b for b in still if b.group != "room"], cameras[1], [near]),
     )
     words = FrameWords(FrameText(rehearsal, plan, speed, demanding(anatomy), model_note(case)), cameras, case)
     ground = np.array(words.still((WIDTH, HEIGHT)))
@@ -233,23 +242,25 @@ def _planned_path(plan: Any) -> SceneBody:
     return SceneBody("planned path", "safe", line, PLANNED)
 
 
-def _tool_layer(case: Any) -> Layer:
-    """All that the flange carries, flange frame: the needle points along +z."""
+def _tool_layer(case: Any, camera: ViewCamera) -> Layer:
+    """All that the flange carries, flange frame: the needle points along +z, at least `NEEDLE_PIXELS` wide."""
     tip = np.array([0.0, 0.0, case.needle.length_mm])
-    bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0])).all
+    mm_per_pixel = float(camera.project(case.target_ct[None])[0, 2]) / camera.scale
+    bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0]), NEEDLE_PIXELS / 2 * mm_per_pixel).all
     own = [] if case.tool is None else [Surface(case.tool.mesh, palette.HOLDER)]
     return Layer([*(Surface(b.mesh, b.colour) for b in bodies), *own])
 
 
 def _wide_camera(case: Any, still: list[SceneBody], arm: ArmPicture, rehearsal: Any, plan: Any) -> ViewCamera:
-    poses = [rehearsal.q[0], plan.insertion.q[0], rehearsal.q[-1]]
-    moving = [body for q in poses for body in arm.bodies(q)]
-    content = [b.mesh.vertices for b in [*still, *moving] if b.group in {"skin", "arm"}]
+    """The patient fills the picture, seen from the entry's side, with the needle at its standoff."""
     direction = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
     focus = plan.target_ct + np.linspace(0, plan.standoff_mm + case.needle.length_mm, 24)[:, None] * direction
-    at_work = [body for q in poses[1:] for body in arm.bodies(q)]
+    shown = focus[np.linalg.norm(focus - plan.target_ct, axis=1) < plan.standoff_mm + ABOVE_MM]
+    skin = [b.mesh.vertices for b in still if b.group == "skin"]
+    near = [v[np.linalg.norm(v - plan.target_ct, axis=1) < BODY_MM] for v in skin]
+    at_work = [body for q in (plan.insertion.q[0], rehearsal.q[-1]) for body in arm.bodies(q)]
     blockers = Layer([b.surface for b in at_work] + [b.surface for b in still if b.group == "room"])
-    return overview(case, np.concatenate(content), focus, blockers, (VIEW_WIDTH, VIEW_HEIGHT), direction)
+    return overview(case, np.concatenate([*near, shown]), focus, blockers, (VIEW_WIDTH, VIEW_HEIGHT), direction)
 
 
 def _near_camera(case: Any, still: list[SceneBody], plan: Any) -> ViewCamera:

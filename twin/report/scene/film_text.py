@@ -116,12 +116,24 @@ class FrameWords:
         return frame
 
     def over_wide(self, view: Pixels, moment: float) -> Pixels:
-        """The overview, with what touches written into it while that is news; itself where nothing does."""
+        """The overview, with what touches written into it while that is news, and at the end with the result."""
+        done = self._source.rehearsal
         fresh = [c for c in self._source.contacts(moment) if moment - c.time_s <= CONTACT_SHOWN_S]
-        if not fresh:
+        ended = moment >= done.times_s[-1]
+        if not fresh and not ended:
             return view
         image = Image.fromarray(view)
-        _alarm(ImageDraw.Draw(image), fresh)
+        draw = ImageDraw.Draw(image)
+        _alarm(draw, fresh)
+        if ended:
+            touched = (
+                f"{len(done.contacts)} contact{'' if len(done.contacts) == 1 else 's'}"
+                if done.contacts
+                else "no contact"
+            )
+            said = f"The tip ended {number(done.tip_error_mm, 2, 'mm')} from the target; {touched}"
+            ink = annotate.RED if done.contacts else annotate.INK
+            annotate.write(draw, (12, view.shape[0] - 34), said, size=20, bold=True, colour=ink, halo=4)
         return np.asarray(image)
 
     def over_near(self, view: Pixels) -> Pixels:

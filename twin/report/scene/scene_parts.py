@@ -149,15 +149,16 @@ def safe_region(candidates: Candidates, case: Any) -> tuple[SceneBody, ...]:
     return tuple(bodies)
 
 
-def needle_bodies(needle: Any, tip_ct: Floats, outward_ct: Floats) -> NeedleBodies:
+def needle_bodies(needle: Any, tip_ct: Floats, outward_ct: Floats, least_mm: float = LEAST_NEEDLE_MM) -> NeedleBodies:
     """Needle and holder with the tip at a point.
 
     Args:
         needle: With ``length_mm``, ``shaft_mm``, ``radius_mm``, ``holder_diameter_mm``.
         tip_ct: Shape (3,).
         outward_ct: Shape (3,), unit, from the tip to the flange.
+        least_mm: Its radius at least.
     """
-    radius = max(needle.radius_mm, LEAST_NEEDLE_MM)
+    radius = max(needle.radius_mm, least_mm)
     shaft, top = tip_ct + needle.shaft_mm * outward_ct, tip_ct + needle.length_mm * outward_ct
     body = SceneBody("needle", "needle", bar(tip_ct, shaft, radius), palette.NEEDLE)
     if needle.length_mm - needle.shaft_mm < 1e-6:
@@ -172,6 +173,16 @@ def chosen_direction(pick: Pick | None, plan: Any | None) -> Floats | None:
         direction = np.asarray(plan.entry_ct, dtype=float) - np.asarray(plan.target_ct, dtype=float)
         return np.asarray(direction / np.linalg.norm(direction))
     return None if pick is None else pick.candidates.outward_ct[pick.row]
+
+
+def arm_bodies(case: Any, plan: Any | None, pick: Pick | None, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
+    """The arm with the needle on the target: as it is planned, else as the search reaches it; nothing where unknown."""
+    if plan is not None:
+        return ArmPicture(plan.model, plan.T_base_ct, case.tool).bodies(plan.insertion.q[-1])
+    q = None if pick is None else pick.candidates.arm.q_insertion[pick.row]
+    if q is None or T_base_ct is None or not np.isfinite(q).all():
+        return ()
+    return ArmPicture(case.robot.model, T_base_ct, case.tool).bodies(q)
 
 
 def needle_text(needle: Any) -> str:

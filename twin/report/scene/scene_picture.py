@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Pick, best_pick
@@ -19,8 +20,8 @@ from puncture_twin.twin.report.present import number
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
 from puncture_twin.twin.report.scene.scene_parts import (
-    ArmPicture,
     SceneBody,
+    arm_bodies,
     chosen_direction,
     needle_bodies,
     needle_text,
@@ -59,6 +60,7 @@ def draw_scene(
     plan: Any | None,
     path: Path,
     pick: Pick | None = None,
+    T_base_ct: Floats | None = None,
     *,
     failed: bool = False,
 ) -> None:
@@ -68,18 +70,19 @@ def draw_scene(
         case: The case.
         anatomy: Structures and skin, CT frame.
         candidates: The search's rows; the safe ones make the corridor.
-        plan: The plan, or None: then there is no arm, and the needle is that of the best candidate.
+        plan: The plan, or None: then the needle is that of the best candidate, and the arm that of the search.
         path: The PNG to write; it appears whole or not at all.
         pick: The planned candidate, or the one to be shown; None shows the best.
+        T_base_ct: Shape (4, 4), mm, of a search whose arm was checked.
         failed: Whether a plan was requested, and there is none.
     """
     pick = pick or best_pick(candidates)
-    T_base_ct = None if plan is None else plan.T_base_ct
+    T_base_ct = T_base_ct if plan is None else plan.T_base_ct
     bodies = [*patient(anatomy, case), *safe_region(candidates, case), *room(case, T_base_ct)]
     direction = chosen_direction(pick, plan)
     if direction is not None:
         bodies.extend(needle_bodies(case.needle, case.target_ct, direction).all)
-    arm = [] if plan is None else list(ArmPicture(plan.model, plan.T_base_ct, case.tool).bodies(plan.insertion.q[-1]))
+    arm = [] if failed else arm_bodies(case, plan, pick, T_base_ct)
     image = Image.new("RGB", (WIDTH, HEIGHT), annotate.WHITE)
     draw = ImageDraw.Draw(image)
     path_ct = _path(case, pick, plan)
@@ -196,7 +199,7 @@ def _text(
     if nothing:
         text, colour = "NOTHING IS SAFE: every direction is refused; no needle is shown", annotate.RED
     else:
-        text, colour = _path_text(plan, pick, failed), annotate.RED if failed else annotate.FAINT
+        text, colour = _path_text(plan, pick, failed, arm), annotate.RED if failed else annotate.FAINT
     annotate.write(draw, (18, 50), text, size=18, bold=nothing, colour=colour)
     items = [("target", palette.TARGET_POINT), (needle_text(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
@@ -204,7 +207,10 @@ def _text(
     items.append(("skin (see-through)", palette.SKIN))
     if arm:
         items += [
-            (f"arm ({plan.model.name})" if plan is not None else "arm", palette.ARM),
+            (
+                f"arm ({plan.model.name})" if plan is not None else "arm, as the search reaches this direction",
+                palette.ARM,
+            ),
             ("needle holder", palette.HOLDER),
             ("where its base stands", palette.TABLE),
         ]
@@ -220,7 +226,7 @@ def _see_through(body: SceneBody) -> str:
     return body.name + (" (see-through)" if body.alpha < 1 else "")
 
 
-def _path_text(plan: Any | None, pick: Pick | None, failed: bool) -> str:
+def _path_text(plan: Any | None, pick: Pick | None, failed: bool, arm: bool) -> str:
     if plan is not None:
         theta, beta = np.degrees(plan.theta), np.degrees(plan.beta)
         length = float(np.linalg.norm(plan.entry_ct - plan.target_ct))
@@ -231,7 +237,7 @@ def _path_text(plan: Any | None, pick: Pick | None, failed: bool) -> str:
     text = f"θ {theta:g}°, β {beta:g}°, {number(length, 1, 'mm')} in the body"
     if pick is not None:
         text += f"; {nearest_text(*pick)}"
-    if plan is not None:
+    if arm:
         return text
     return text + ("  PLANNING FAILED: no arm is shown" if failed else "  (no plan was requested: no arm is shown)")
 

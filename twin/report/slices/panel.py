@@ -87,6 +87,17 @@ def draw_panel(subject: Subject, plane: Plane) -> Panel:
     return Panel(plane, hu, pixels(figure))
 
 
+def leaning(subject: Subject, plane: Plane) -> str:
+    """How a needle lies to a plane; "" without one, and where it has no entry."""
+    if subject.pick is None or not np.isfinite(subject.path_mm):
+        return ""
+    lean = float(subject.outward_ct @ plane.normal)
+    if abs(lean) <= IN_PLANE:
+        return "Holds the needle."
+    side = letters(subject.case.space, np.sign(lean) * plane.normal)
+    return f"The skin entry is {abs(lean) * subject.path_mm:.0f} mm {side} of it."
+
+
 def _line(axes: Axes, points: Floats, width: float, colour: Rgb, style: str = "-", rim: float = 0.0) -> None:
     """A line through points (n, 2), mm, later ones over earlier ones."""
     effects = halo(width + rim, "black") if rim else None
@@ -130,15 +141,15 @@ def _beads(segments: Floats, plane: Plane) -> Floats:
 
 
 def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:
-    """The needle as thick as it is where the plane holds it, else its cut and, dotted, its shadow; the tip's region."""
+    """The cut of the needle, as thick as it is, and of its margin; the tip's region.
+
+    Nothing is drawn of a needle that is not in the plane: its shadow would cross what the needle passes by.
+    """
     outward, radius = subject.outward_ct, subject.needle_radius_mm
     shaft = subject.case.needle.shaft_mm
-    end, across = plane.place(plane.at_ct + shaft * outward), abs(float(outward @ plane.normal))
     path = subject.path_mm if np.isfinite(subject.path_mm) else shaft
     if subject.margin_mm > 0:
         _line(axes, capsule(outward, path, radius + subject.margin_mm, plane), 1.3, NEEDLE_COLOUR, "--")
-    if IN_PLANE < across < 1 - IN_PLANE:
-        _line(axes, np.stack([np.zeros(2), end]), 1.5, NEEDLE_COLOUR, ":", RIM)
     if subject.region_ct is not None:
         _line(axes, ellipse(subject.region_ct, plane), 1.7, REGION_COLOUR, rim=RIM)
     axes.fill(*capsule(outward, shaft, radius, plane).T, color=css(NEEDLE_COLOUR), linewidth=0, zorder=2)
@@ -226,9 +237,3 @@ byte there."""
 def stored(hu: Floats) -> NDArray[np.uint8]:
     """Bytes of Hounsfield units, from which a page makes any window."""
     return np.round(np.interp(np.nan_to_num(hu, nan=KNOTS_HU[0]), KNOTS_HU, KNOTS_BYTE)).astype(np.uint8)
-
-
-def grey_table(tone: Tone) -> list[float]:
-    """What a page shows, 0..1, for each of the bytes 0..255 of `stored`."""
-    hu = np.interp(np.arange(256.0), KNOTS_BYTE, KNOTS_HU)
-    return [round(float(value) / 255, 3) for value in tone.grey(hu)]

@@ -16,7 +16,16 @@ from puncture_twin.twin.report.figures import figure_of, pixels
 from puncture_twin.twin.report.numbers import target_text
 from puncture_twin.twin.report.palette import TARGET_POINT
 from puncture_twin.twin.report.present import number
-from puncture_twin.twin.report.slices.panel import NEEDLE_COLOUR, PIXELS, REGION_COLOUR, TONES, Panel, Tone, draw_panel
+from puncture_twin.twin.report.slices.panel import (
+    NEEDLE_COLOUR,
+    PIXELS,
+    REGION_COLOUR,
+    TONES,
+    Panel,
+    Tone,
+    draw_panel,
+    leaning,
+)
 from puncture_twin.twin.report.slices.planes import body_planes, needle_planes
 from puncture_twin.twin.report.slices.subject import Subject
 
@@ -54,7 +63,7 @@ class Slices:
         needle = subject.case.needle
         shown = f"Needle ⌀ {needle.diameter_mm:g} mm as thick as it is{dashed if subject.margin_mm > 0 else ''}"
         region = "" if subject.region_ct is None else "; pink: cut of the 95 % region of the tip"
-        dotted = f"Thin and dotted: the needle's shadow, where it is not in the plane.{beads}"
+        dotted = f"Of a needle that crosses a plane its cut alone is drawn.{beads}"
         bends = "" if subject.bent_mm is None else "Lime: where its bevel may take it, to either side."
         return tuple(filter(None, (ct, f"{shown}{region}.", bends, dotted)))
 
@@ -174,6 +183,7 @@ def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
     for i, panel in enumerate(slices.panels):
         left, top = GAP + (i % 2) * (PIXELS + GAP), TOP + (i // 2) * (PIXELS + CAPTION + GAP)
         write(draw, (left, top), panel.plane.name, size=16, bold=True)
+        write(draw, (left + PIXELS, top + 3), leaning(subject, panel.plane), anchor="ra", size=13, colour=FAINT)
         sheet.paste(flat(panel, TONES[tone]), (left, top + CAPTION - 6))
     if slices.units is not None:
         sheet.paste(slices.units, (GAP, bottom))

@@ -14,7 +14,7 @@
   }
   document.getElementById("map-image").src = map.image;
   const svg = document.getElementById("map-lines");
-  const half = map.size / 2, cx = LEFT + half, cy = TOP + half;
+  const radiusPx = map.size / 2, cx = LEFT + radiusPx, cy = TOP + radiusPx;
 
   function draw(tag, attributes, text) {
     const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
@@ -30,26 +30,26 @@
     }, text);
   }
   function placeAt(theta, beta) {
-    const angle = (beta + map.turn_deg) * RAD, radius = theta / map.theta_max_deg * half;
+    const angle = (beta + map.turn_deg) * RAD, radius = theta / map.theta_max_deg * radiusPx;
     return [cx + radius * Math.cos(angle), cy - radius * Math.sin(angle)];
   }
   const place = (row) => placeAt(map.theta[row], map.beta[row]);
-  draw("circle", { cx, cy, r: half, fill: "none", stroke: "#000", "stroke-width": 1.2 });
+  draw("circle", { cx, cy, r: radiusPx, fill: "none", stroke: "#000", "stroke-width": 1.2 });
   const spacing = map.theta_max_deg <= 100 ? 15 : 30;
   for (let beta = 0; beta < 360; beta += 30) {
     const angle = (beta + map.turn_deg) * RAD, c = Math.cos(angle), s = Math.sin(angle);
-    draw("line", { x1: cx, y1: cy, x2: cx + half * c, y2: cy - half * s, stroke: "#000", "stroke-opacity": 0.25 });
-    label(cx + (half + 22) * c, cy - (half + 14) * s, `β ${beta}°`, { fill: "#444" });
+    draw("line", { x1: cx, y1: cy, x2: cx + radiusPx * c, y2: cy - radiusPx * s, stroke: "#000", "stroke-opacity": 0.25 });
+    label(cx + (radiusPx + 22) * c, cy - (radiusPx + 14) * s, `β ${beta}°`, { fill: "#444" });
   }
   for (let theta = spacing; theta <= map.theta_max_deg; theta += spacing) {
-    const r = theta / map.theta_max_deg * half, thick = theta === 90 && map.theta_max_deg > 92 ? 2 : 0.8;
+    const r = theta / map.theta_max_deg * radiusPx, thick = theta === 90 && map.theta_max_deg > 92 ? 2 : 0.8;
     draw("circle", { cx, cy, r, fill: "none", stroke: "#000", "stroke-opacity": 0.4, "stroke-width": thick });
-    const at = Math.min(r, RIM_LABEL * half); // a ring's angle at the rim stands within it
+    const at = Math.min(r, RIM_LABEL * radiusPx); // a ring's angle at the rim stands within it
     label(cx + at * Math.cos(67.5 * RAD), cy - at * Math.sin(67.5 * RAD), `θ ${theta}°`, {});
   }
   for (const rim of map.rim) {
     const c = Math.cos(rim.angle_deg * RAD), s = Math.sin(rim.angle_deg * RAD);
-    const x = cx + (half + 52) * c, y = cy - (half + 40) * s;
+    const x = cx + (radiusPx + 52) * c, y = cy - (radiusPx + 40) * s;
     const side = Math.abs(c) > 0.8 && rim.text.length > 3;
     const turn = side ? { transform: `rotate(${c < 0 ? -90 : 90} ${x} ${y})` } : {};
     label(x, y, rim.text, { "font-size": 16, "font-weight": 700, ...turn });
@@ -63,8 +63,8 @@
     const [x, y] = place(row);
     draw("circle", { cx: x, cy: y, r: 4.5, fill: "none", stroke: "#000", "stroke-width": 1.2 });
   }
-  if (map.chosen) {
-    const [x, y] = placeAt(map.chosen.theta_deg, map.chosen.beta_deg);
+  if (map.picked >= 0) {
+    const [x, y] = place(map.picked);
     label(x, y, "★", { "font-size": 26, fill: "#fff", stroke: "#000", "stroke-width": 2.5 });
   }
   const marker = draw("circle", { cx: -9, cy: -9, r: 7, fill: "none", stroke: "#d6001e", "stroke-width": 2.5 });
@@ -75,7 +75,6 @@
     const y = Math.floor((event.clientY - box.top) / box.height * map.size);
     return x < 0 || y < 0 || x >= map.size || y >= map.size ? -1 : rows[y * map.size + x];
   }
-  const words = (name) => name.replaceAll("_", " ");
   const shown = (value, digits, unit) => value === null ? "–" : `${value.toFixed(digits)}${unit === "°" ? "" : " "}${unit}`.replace("-", "−");
 
   function chanceWords(chance) { // what is not sure never reads as 0 or 1
@@ -94,6 +93,11 @@
       panel.appendChild(element);
     };
     if (row < 0) { panel.textContent = "Point at the map."; return; }
+    if (own && row === chosen) { // what was searched is another path
+      add("b", own.title, "verdict bad");
+      add("div", own.verdict);
+      return;
+    }
     const code = map.codes[map.reason[row]], safe = code === "safe";
     add("div", `θ ${+map.theta[row].toFixed(3)}°, β ${+map.beta[row].toFixed(3)}°`);
     add("b", safe ? `${map.safe}${map.rank[row] > 0 ? `, rank ${map.rank[row]}` : ""}` : `rejected: ${map.reasons[map.reason[row]]}`,
@@ -113,9 +117,9 @@
       const cone = map.safe_cone[row] === null ? "" : `; safe cone ${shown(map.safe_cone[row], 1, "°")}`;
       add("div", `window ${map.window[row]}${cone}`);
     }
-    if (map.nearest[row] >= 0) {
-      const name = words(map.structures[map.nearest[row]]);
-      add("div", map.clearance[row] < 0 ? `crosses ${name}` : `least clearance ${shown(map.clearance[row], 1, "mm")} (${name})`);
+    if (map.near[row].length) {
+      const [place, mm] = map.near[row], name = words(map.structures[place]);
+      add("div", mm < 0 ? `crosses ${name}` : `least clearance ${shown(mm, 1, "mm")} (${name})`);
     }
     add("div", `path in the body ${shown(map.path[row], 1, "mm")}; skin angle ${shown(map.skin_angle[row], 0, "°")}`);
     if (map.p_hit && map.p_hit[row] !== null)
@@ -129,7 +133,6 @@
 
   // ---- choosing ------------------------------------------------------------------------------------------------
   let chosen = -1;
-  const byId = (id) => document.getElementById(id);
   const sliders = { theta: byId("theta"), beta: byId("beta") };
   for (const [name, input] of Object.entries(sliders)) {
     const values = [...new Set(map[name])].sort((a, b) => a - b);
@@ -148,9 +151,10 @@
     }
     return best;
   }
-  function choose(row) {
+  function choose(row, { needle } = {}) {
     if (row < 0) return;
     chosen = row;
+    own = needle ?? null;
     const [theta, beta] = [+map.theta[row].toFixed(3), +map.beta[row].toFixed(3)];
     sliders.theta.value = theta;
     sliders.beta.value = beta;
@@ -162,7 +166,7 @@
       button.setAttribute("aria-pressed", String(+button.dataset.row === row));
     explain(row);
     probe(row);
-    showSlices(theta, beta);
+    present(own ?? needleOf(row));
   }
   for (const button of document.querySelectorAll("button.pick"))
     button.addEventListener("click", () => choose(+button.dataset.row));
@@ -178,62 +182,137 @@
   });
 
   // ---- the slices ----------------------------------------------------------------------------------------------
-  const slices = data.slices.directions;
-  const make = (tag, attributes = {}, ...children) => {
-    const element = document.createElement(tag);
-    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-    element.append(...children);
-    return element;
-  };
-  let shownSlices = -1;
-  function showSlices(theta, beta) {
-    if (!slices.length) return;
-    const same = (one) => Math.abs(one.theta_deg - theta) < 2e-3 && Math.abs(one.beta_deg - beta) < 2e-3;
-    const found = slices.findIndex(same), which = found < 0 ? Math.max(shownSlices, 0) : found;
-    const one = slices[which], place = `θ ${+one.theta_deg.toFixed(3)}°, β ${+one.beta_deg.toFixed(3)}°`;
-    const line = byId("slices-of");
-    line.classList.toggle("bad", found < 0);
-    line.replaceChildren(make("b", {}, place));
-    if (found < 0) line.append(make("br"), `Not of the direction that you chose (θ ${theta}°, β ${beta}°): slices come with the page for the planned or best direction and the best of each window. For yours: `,
-      make("code", {}, `run-twin check ${map.file} --theta ${theta} --beta ${beta} --picture slices.png`));
-    if (which === shownSlices) return;
-    shownSlices = which;
-    byId("slices-panels").replaceChildren(...one.panels.map((panel) => make("figure", {},
-      make("figcaption", {}, panel.name),
-      make("div", { class: "slice" },
-        ...(panel.ct ? [make("img", { class: "ct", src: panel.ct, alt: "" })] : []),
-        make("img", { class: "over", src: panel.over, alt: `${panel.name}: needle, outlines and target, ${place}` })))));
-    byId("slices-units").hidden = !one.units;
-    if (one.units) byId("slices-units").src = one.units;
-    byId("slices-legend").replaceChildren(...one.legend.map(([name, colour]) => {
+  const slices = data.slices, { NEAR_MM } = slicing;
+  const outwardOf = (row) => [0, 1, 2].map((k) => map.outward[3 * row + k]);
+  const anglesOf = (row) => `θ ${+map.theta[row].toFixed(3)}°, β ${+map.beta[row].toFixed(3)}°`;
+  const nearOf = (row) => Array.from({ length: map.near[row].length / 2 }, (_, k) => ({ name: map.structures[map.near[row][2 * k]], mm: map.near[row][2 * k + 1] }));
+  const verdictOf = (row) => map.codes[map.reason[row]] === "safe" ? map.safe : `rejected: ${map.reasons[map.reason[row]]}`;
+  function needleOf(row) {
+    const strong = nearOf(row).filter((one) => one.mm < NEAR_MM).map((one) => one.name);
+    return {
+      key: String(row), at: ORIGIN, outward: outwardOf(row), path: map.path[row] ?? NaN, strong: new Set(strong), row,
+      margin: Math.max(0, ...strong.map((name) => slices.margins[name])), region: slices.regions[row], bent: slices.bent[row], title: anglesOf(row),
+    };
+  }
+  const readout = (text) => { byId("cursor").textContent = text || "Point at a slice: Hounsfield units, structure, place."; };
+  const view = new slicing.View(byId("slices-a"), { readout, moved: moveNeedle });
+  let beside = null, kept = -1, own = null;
+  function present(needle) {
+    view.show(needle);
+    byId("slices-of").replaceChildren(make("b", {}, needle.title), ` · ${needle.verdict ?? verdictOf(needle.row)}`);
+    byId("slices-of").classList.toggle("bad", Boolean(needle.verdict) || map.codes[map.reason[needle.row]] !== "safe");
+    byId("slices-back").hidden = !own;
+    slicing.drawUnits(byId("slices-units"), needle);
+    showNumbers(needle);
+    const named = nearOf(needle.row).filter((one, k) => !k || one.mm < NEAR_MM);
+    const colourOf = Object.fromEntries(slicing.parts.map((part) => [part.name, part.colour]));
+    const target = slicing.parts.find((part) => part.target);
+    byId("slices-legend").replaceChildren(...[
+      ["needle", "#00e5ff"], ["target", "#d6001e"], ...(needle.region ? [["95 % region of the tip", "#ff4df0"]] : []),
+      ...(needle.bent ? [["where its bevel may take it", "#b6ff00"]] : []), ...(target ? [[words(target.name), target.colour]] : []),
+      ...(own ? [] : named.map((one) => [`${words(one.name)}: ${clearanceText(one.mm)}, margin ${slices.margins[one.name]}`, colourOf[one.name] ?? "#80808c"])),
+    ].map(([name, colour]) => {
       const patch = make("span", { class: "patch" });
       patch.style.backgroundColor = colour;
       return make("li", {}, patch, name);
     }));
-    byId("slices-notes").replaceChildren(...one.notes.map((note) => make("div", {}, note)));
+    byId("slices-notes").replaceChildren(...[
+      slicing.voxelNote, slicing.surfaceNote,
+      `Needle as thick as it is; dashed: with the greatest margin near it${needle.margin ? `, ${needle.margin} mm` : ""}. Beads: the edge of what is unknown.`,
+      Object.keys(slices.bent).length && !needle.bent ? "Where the bevel may take the needle is drawn for the planned or best direction alone." : "",
+    ].filter(Boolean).map((note) => make("div", {}, note)));
   }
-  const filters = byId("tone-filters");
-  for (const [name, values] of Object.entries(filters ? data.slices.tones : {})) {
-    const svgNode = (tag, attributes) => {
-      const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
-      for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
-      return element;
-    };
-    const filter = svgNode("filter", { id: `tone-${name}`, "color-interpolation-filters": "sRGB" });
-    const transfer = svgNode("feComponentTransfer", {});
-    for (const channel of "RGB") transfer.append(svgNode(`feFunc${channel}`, { type: "table", tableValues: values.join(" ") }));
-    filter.append(transfer);
-    filters.append(filter);
+  const { halfVoxel } = slicing; // lengths have the digits that a voxel can carry
+  const doubted = (mm) => halfVoxel === null ? `${mm.toFixed(1)} mm` : halfVoxel < 1 ? `${mm.toFixed(1)} ± ${halfVoxel.toFixed(1)} mm` : `${mm.toFixed(0)} ± ${Math.ceil(halfVoxel)} mm`;
+  const clearanceText = (mm) => mm < 0 ? "crossed" : doubted(mm);
+  function placesOf(needle) { // of a path, for whoever stands at the scanner
+    const entry = plus(needle.at, needle.outward, needle.path), [left, back, head] = needle.outward, degrees = (radians) => `${Math.abs(radians / RAD).toFixed(1)}°`;
+    const rows = [["skin entry", Number.isFinite(needle.path) ? slicing.placeText(entry) : "none"], ["path in the body", Number.isFinite(needle.path) ? doubted(needle.path) : "–"]];
+    const reaching = slices.catalogue.find(([, longest]) => longest >= needle.path);
+    if (slices.catalogue.length && Number.isFinite(needle.path)) rows.push(["needle to take", reaching ? `${reaching[0]} mm, the shortest that reaches` : "none reaches"]);
+    if (map.space === "local") return rows;
+    if (slices.numbers && Number.isFinite(needle.path)) {
+      const [[a, b, c, d], count] = slices.numbers, [x, y, z] = plus(entry, data.target), number = Math.round(a * x + b * y + c * z + d);
+      rows.push(
+        ["slice of the entry", number >= 1 && number <= count ? `${number} of ${count} from the feet, ${count + 1 - number} from the head` : "outside of the image"],
+        ["table position", `z = ${z.toFixed(1)} mm, as DICOM has it`.replace("-", "−")],
+        ["laser lines", `${Math.abs(x).toFixed(0)} mm to the ${x > 0 ? "left" : "right"} of the sagittal one, ${Math.abs(y).toFixed(0)} mm ${y > 0 ? "behind" : "in front of"} the coronal one, if x = y = 0 is the isocentre`]);
+    }
+    const inPlane = Math.atan2(left, -back), out = Math.asin(head), side = (angle, one, other) => Math.abs(angle) < 0.05 * RAD ? "" : angle > 0 ? one : other;
+    return [...rows,
+      ["in-plane angle", Math.hypot(left, back) > 1e-6 ? `${degrees(inPlane)} from the front${side(inPlane, ", hub to the left", ", hub to the right")}` : "none: the needle runs along the patient"],
+      ["out-of-plane angle", degrees(out) + side(out, ", hub toward the head", ", hub toward the feet")]];
   }
-  for (const button of document.querySelectorAll("#tones button"))
-    button.addEventListener("click", () => {
-      byId("slices-panels").dataset.tone = button.dataset.tone;
-      for (const other of document.querySelectorAll("#tones button"))
-        other.setAttribute("aria-pressed", String(other === button));
-    });
+  function numbersOf(needle) {
+    const { row } = needle, near = nearOf(row)[0];
+    if (needle.verdict) return [["verdict", needle.verdict], ...placesOf(needle)];
+    return [["verdict", verdictOf(row)], ["rank", map.rank[row] > 0 ? String(map.rank[row]) : "–"], ["window", map.window[row] > 0 ? String(map.window[row]) : "–"],
+      ["nearest structure", near ? `${words(near.name)}: ${clearanceText(near.mm)}` : "–"],
+      ...(map.p_hit && map.p_hit[row] !== null ? [["chance to hit", chanceWords(map.p_hit[row])], ["chance to touch, at most", chanceWords(map.p_touch_any[row])]] : []),
+      ["safe cone", shown(map.safe_cone[row], 1, "°")], ["angle at the skin", shown(map.skin_angle[row], 0, "°")], ...placesOf(needle)];
+  }
+  function showNumbers(needle) {
+    const columns = [...(kept >= 0 ? [["A, kept", needleOf(kept)]] : []), [kept >= 0 ? "B, chosen" : "chosen", needle]];
+    const texts = columns.map(([, one]) => new Map(numbersOf(one))), names = [...new Set(texts.flatMap((one) => [...one.keys()]))];
+    const row = (tag, first, cells) => make("tr", {}, make(tag, {}, first), ...cells.map((text) => make(tag === "th" ? "th" : "td", {}, text)));
+    byId("slices-numbers").replaceChildren(
+      make("thead", {}, row("th", "", columns.map(([name, one]) => `${name}: ${one.title}`))),
+      make("tbody", {}, ...names.map((name) => row("td", name, texts.map((one) => one.get(name) ?? "–")))));
+  }
+  function toward(outward) { // the searched direction nearest to another
+    let best = 0, most = -2;
+    for (let row = 0; row < map.theta.length; row++) {
+      const along = map.outward[3 * row] * outward[0] + map.outward[3 * row + 1] * outward[1] + map.outward[3 * row + 2] * outward[2];
+      if (along > most) [best, most] = [row, along];
+    }
+    return [best, Math.acos(Math.min(1, most)) / RAD];
+  }
+  function moveNeedle({ at, outward, path, frame, what }) {
+    const moved = Math.sqrt(dot(at, at)), length = what === "entry" ? slicing.pathFrom(at, outward) : path;
+    const [row, away] = toward(outward), strong = nearOf(row).filter((one) => one.mm < NEAR_MM).map((one) => one.name);
+    const entry = slicing.placeText(plus(at, outward, length));
+    const verdict = moved > 0.05
+      ? `not known: the target was moved by ${slicing.lengthText(moved)} to ${slicing.placeText(at)}, and nothing was searched for it`
+      : `not known for this path; the nearest searched direction (${anglesOf(row)}, ${away.toFixed(1)}° away) is ${verdictOf(row)}`;
+    choose(row, { needle: { key: `own ${at} ${outward}`, at, outward, path: length, frame, row, strong: new Set(strong), margin: Math.max(0, ...strong.map((name) => slices.margins[name])), title: `your path from ${entry}`, verdict } });
+    const command = byId("command"), plain = (point) => point.map((mm, k) => (k < 2 && map.space === "RAS" ? -mm : mm).toFixed(1)).join(",");
+    command.textContent = moved > 0.05
+      ? `run-twin check ${map.file} --targets FILE.csv  # name,x_mm,y_mm,z_mm: moved,${plain(plus(at, data.target))}`
+      : `run-twin check ${map.file} --entry=${plain(plus(plus(at, outward, length), data.target))}`;
+  }
+  byId("slices-back").addEventListener("click", () => choose(chosen));
+  byId("slices-centre").addEventListener("click", () => { for (const one of [view, beside]) if (one) { one.point = one.ruler = null; one.later(); } });
+  byId("slices-keep").addEventListener("click", () => {
+    kept = kept >= 0 ? -1 : chosen;
+    byId("slices-keep").textContent = kept >= 0 ? "let go of path A" : "keep this path beside the next";
+    byId("slices-kept").hidden = kept < 0;
+    byId("slices-paths").classList.toggle("both", kept >= 0);
+    if (kept >= 0) {
+      beside ??= new slicing.View(byId("slices-b"), { readout, moved: null });
+      beside.show(needleOf(kept));
+      byId("slices-kept-of").textContent = `A: ${anglesOf(kept)} · ${verdictOf(kept)}`;
+    }
+    showNumbers(view.needle);
+  });
+  const pressed = (group, act) => {
+    for (const button of document.querySelectorAll(`#${group} button[aria-pressed]`))
+      button.addEventListener("click", () => {
+        for (const other of document.querySelectorAll(`#${group} button[aria-pressed]`)) other.setAttribute("aria-pressed", String(other === button));
+        act(button.dataset);
+        view.later();
+        beside?.later();
+      });
+  };
+  pressed("tones", ({ tone }) => slicing.setTone(tone));
+  pressed("modes", ({ mode }) => {
+    slicing.shared.mode = mode;
+    byId("slices-paths").dataset.mode = mode;
+  });
+  readout("");
 
   // ---- the scene -----------------------------------------------------------------------------------------------
   const scene = byId("scene");
+  let probing = null, probed = null, inSight = false;
   const probeTrace = data.scene.data.length - 1;
   function hasWebgl() {
     const canvas = document.createElement("canvas");
@@ -244,18 +323,10 @@
   const middle = ranges.map(([low, high]) => (low + high) / 2);
   const unit = Math.cbrt(ranges.reduce((product, [low, high]) => product * (high - low), 1)); // plotly's, in mm
   const whole = axes.camera;
-  const dot = (a, b) => a.reduce((sum, value, i) => sum + value * b[i], 0);
-  const plus = (a, b, times) => a.map((value, i) => value + times * b[i]);
-  const normed = (a) => plus([0, 0, 0], a, 1 / Math.sqrt(dot(a, a)));
   const xyz = (a) => ({ x: a[0], y: a[1], z: a[2] });
   const VIEWS = { axial: [[0, 0, -1], [0, -1, 0]], coronal: [[0, -1, 0], [0, 0, 1]], sagittal: [[1, 0, 0], [0, 0, 1]] };
   const SEEN_MM = 420, PER_MM = 1 / 0.83; // plotly's lens shows 0.83 of its distance
-  const outwardOf = (row) => [0, 1, 2].map((k) => map.outward[3 * row + k]);
-  const firstOutward = chosenOutward();
-  function chosenOutward() {
-    const row = map.picked >= 0 ? map.picked : map.chosen ? nearest(map.chosen.theta_deg, map.chosen.beta_deg) : -1;
-    return row < 0 ? null : outwardOf(row);
-  }
+  const firstOutward = map.picked >= 0 ? outwardOf(map.picked) : null;
   function cameraOf(view) {
     const outward = chosen >= 0 ? outwardOf(chosen) : firstOutward;
     if (view === "all" || (!outward && !VIEWS[view])) return whole;
@@ -298,14 +369,22 @@
     marker.setAttribute("cx", x);
     marker.setAttribute("cy", y);
     if (!drawn) return;
-    const end = plus(data.target, outwardOf(row), data.probe_mm);
-    Plotly.restyle(scene, {
-      x: [[data.target[0], end[0]]], y: [[data.target[1], end[1]]], z: [[data.target[2], end[2]]],
-    }, [probeTrace]);
+    const { at, outward } = own ?? { at: ORIGIN, outward: outwardOf(row) }, tip = plus(data.target, at), hub = plus(tip, outward, data.probe_mm);
+    probed = { x: [[tip[0], hub[0]]], y: [[tip[1], hub[1]]], z: [[tip[2], hub[2]]] };
+    follow();
   }
+  function follow() { // the scene is drawn again when it is in sight and the pointer rests: the slices follow at once
+    clearTimeout(probing);
+    if (inSight && probed) probing = setTimeout(() => { Plotly.restyle(scene, probed, [probeTrace]); probed = null; }, 60);
+  }
+  new IntersectionObserver((entries) => { inSight = entries.at(-1).isIntersecting; follow(); }).observe(scene);
   const traces = (wanted) => data.scene.data.flatMap((trace, i) => trace.meta && wanted(trace.meta) ? [i] : []);
   const poses = { none: byId("pose-none"), target: byId("pose-target"), standoff: byId("pose-standoff") };
   byId("poses").hidden = traces((meta) => meta.arm).length === 0;
+  if (!traces((meta) => meta.pose === "standoff").length) { // after a search: of one direction, and its motion is not planned
+    byId("pose-standoff").hidden = true;
+    byId("pose-target").textContent = `needle on the target, ${anglesOf(map.first)}`;
+  }
   for (const [pose, button] of Object.entries(poses))
     button.addEventListener("click", () => {
       for (const other of Object.values(poses)) other.setAttribute("aria-pressed", String(other === button));
@@ -315,8 +394,7 @@
       show(pose !== "standoff", (meta) => meta.pose === "target" && !meta.arm);
       show(pose === "target", (meta) => meta.pose === "target" && meta.arm);
     });
-  if (slices.length) showSlices(slices[0].theta_deg, slices[0].beta_deg);
-  if (map.picked >= 0) choose(map.picked);
+  choose(map.first);
 
   document.body.dataset.ready = "true";
 })();

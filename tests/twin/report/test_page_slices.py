@@ -1,0 +1,181 @@
+"""The page's block of the CT, its surfaces and its rows, without a browser."""
+
+import gzip
+
+import numpy as np
+import pytest
+import report_world as world
+from hypothesis import given, strategies as st
+
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.choice import Pick
+from puncture_twin.twin.report.page import page_slices
+from puncture_twin.twin.report.page.page_map import map_data, picked_row
+from puncture_twin.twin.report.page.page_slices import block_box, ct_block, surfaces
+from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU
+
+
+def unpacked_ct(block):
+    """Hounsfield units of a block, and its map of an index to mm."""
+    nx, ny, nz = block.facts["shape"]
+    differences = np.frombuffer(gzip.decompress(block.content), np.uint8).reshape(nz, ny, nx)
+    values = np.zeros((nz + 1, ny + 1, nx + 1), int)
+    for k in range(nz):
+        for j in range(ny):
+            for i in range(nx):
+                before = values[k + 1, j + 1, i] + values[k + 1, j, i + 1] + values[k, j + 1, i + 1]
+                values[k + 1, j + 1, i + 1] = (differences[k, j, i] + before // 3) % 256
+    T = np.vstack([np.reshape(block.facts["T"], (3, 4)), [0, 0, 0, 1]])
+    return np.interp(values[1:, 1:, 1:], KNOTS_BYTE, KNOTS_HU).transpose(2, 1, 0), T
+
+
+def oblique(shape, spacing):
+    """An image of random soft tissue whose axes are a little turned, and its map."""
+    turn = np.linalg.qr(np.eye(3) + 0.1 * np.random.default_rng(1).normal(size=(3, 3)))[0]
+    T = np.eye(4)
+    T[:3, :3] = turn * np.sign(np.diag(turn)) * spacing
+    T[:3, 3] = [-20.0, 30.0, 5.0]
+    return np.random.default_rng(2).integers(-160, 240, shape).astype(np.int16), T
+
+
+def test_a_block_holds_the_voxels_where_they_lie():
+    """Every voxel in the box, at its place, to half a step of the table; the image's ends are where they were."""
+    hu, T = oblique((12, 10, 8), (2.0, 2.5, 3.0))
+    middle = (T @ [6, 5, 4, 1])[:3]
+    block = ct_block(hu, T, np.stack([middle - 4, middle + 4]))
+    found, T_block = unpacked_ct(block)
+    assert found.size < hu.size
+    for index in np.ndindex(*found.shape):
+        at = np.linalg.solve(T, T_block @ [*index, 1])[:3]
+        assert np.allclose(at, np.round(at)) and abs(found[index] - hu[tuple(np.round(at).astype(int))]) <= 1.7
+    ends = [np.linalg.solve(T, T_block @ [*end, 1])[:3] for end in block.facts["image"]]
+    assert np.allclose(ends, [[-0.5] * 3, np.array(hu.shape) - 0.5])
+
+
+def test_too_many_voxels_become_means():
+    """The finest axis first, until the block takes no more than it may; means lie at the middle of their voxels."""
+    hu, T = oblique((24, 20, 16), (1.0, 1.5, 3.0))
+    hu[:] = np.arange(24)[:, None, None]
+    box = np.stack([T[:3, 3] - 100, T[:3, 3] + 100])
+    whole = ct_block(hu, T, box)
+    assert whole.facts["shown_mm"] == whole.facts["voxel_mm"] == [1.0, 1.5, 3.0]
+    less = ct_block(hu, T, box, most=len(whole.content) - 1)
+    assert less.facts["shown_mm"] == [2.0, 1.5, 3.0] and len(less.content) < len(whole.content)
+    found, T_block = unpacked_ct(less)
+    place = np.linalg.solve(T, T_block @ [3, 4, 5, 1])
+    assert np.allclose(place[:3], [6.5, 4, 5]) and found[3, 4, 5] == pytest.approx(6.5, abs=0.8)
+
+
+def test_fine_voxels_become_a_millimetre_at_most():
+    """0.4 mm: two of them."""
+    hu, T = oblique((30, 30, 10), (0.4, 0.4, 2.0))
+    assert ct_block(hu, T, np.stack([T[:3, 3] - 50, T[:3, 3] + 50])).facts["shown_mm"] == [0.8, 0.8, 2.0]
+
+
+def unpacked_surfaces(packed):
+    """Corners, mm from the target, and triangles of every part."""
+    content, at, found = gzip.decompress(packed.content), 0, []
+    for part in packed.facts["parts"]:
+        steps = np.frombuffer(content, "<i2", 3 * part["corners"], at).reshape(3, -1)
+        found.append([np.cumsum(steps, axis=1, dtype=np.int16).T * packed.facts["unit_mm"]])
+        at += 6 * part["corners"]
+    for one, part in zip(found, packed.facts["parts"], strict=True):
+        one.append(np.cumsum(np.frombuffer(content, "<i4", 3 * part["triangles"], at)).reshape(-1, 3))
+        at += 12 * part["triangles"]
+    return found
+
+
+def test_surfaces_are_kept_to_what_is_said_of_them(monkeypatch):
+    """Corners within 0.87 units, and every edge of an even number of triangles; coarser where there are too many."""
+    target, ball = world.TARGET, world._ball(40, world.TARGET + 5, 4)
+    box = np.stack([target - 100, target + 100])
+    for most, unit in ((page_slices.MOST_TRIANGLES, 1 / 16), (1500, 8.0)):
+        monkeypatch.setattr(page_slices, "MOST_TRIANGLES", most)
+        packed = surfaces([("ball", "avoid", ball)], target, box)
+        ((corners, faces),) = unpacked_surfaces(packed)
+        assert packed.facts["unit_mm"] == unit and len(faces) <= most
+        far = np.abs(np.linalg.norm(corners - 5, axis=1) - 40)
+        assert far.max() <= 0.87 * unit + 0.01
+        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()
+
+
+def test_far_surfaces_are_left_out_and_farther_corners_wrap():
+    """Only what reaches the box; corners 4 m apart come back although a difference fits no 16 bits."""
+    target = np.zeros(3)
+    wall = TriangleMesh(
+        np.array([[-2200.0, -2000, 10], [2100, -2000, 10], [0, 2100, 10]]), np.array([[0, 1, 2]], np.int32)
+    )
+    far = TriangleMesh(wall.vertices + [0, 0, 500.0], wall.faces)
+    packed = surfaces([("wall", "unknown", wall), ("far", "avoid", far)], target, np.array([[-50.0] * 3, [50.0] * 3]))
+    ((corners, _),) = unpacked_surfaces(packed)
+    assert [one["name"] for one in packed.facts["parts"]] == ["wall"] and np.allclose(corners, wall.vertices)
+
+
+def test_the_block_holds_target_and_safe_entries():
+    """With room about them; where nothing is safe, all entries."""
+    case = world.make_case()
+    for safe in (True, False):
+        candidates = world.make_candidates(case, safe=safe)
+        low, high = block_box(case.target_ct, candidates)
+        entries = candidates.path.entry_ct[candidates.safe if safe else slice(None)]
+        points = np.concatenate([entries, case.target_ct[None]])
+        assert np.allclose([low, high], [points.min(axis=0) - 60, points.max(axis=0) + 60])
+
+
+@given(st.integers(0, 1367), st.floats(0.3, 2.0))
+def test_a_pick_beside_the_grid_is_a_row_more(row, off_deg):
+    """One on the grid is its row; of another all columns have one more, with its own angles."""
+    case = world.make_case()
+    candidates = world.make_candidates(case)
+    same, apart = world.make_candidates(case), world.make_candidates(case)
+    assert picked_row(candidates, Pick(same, row)) == row and picked_row(candidates, None) == -1
+    apart.theta.setflags(write=True)
+    apart.theta[row] += np.radians(off_deg)
+    assert picked_row(candidates, Pick(apart, row)) == len(candidates)
+
+
+def test_the_row_more_has_all_columns():
+    """Also where the search names other structures than the check."""
+    case = world.make_case()
+    candidates, apart = world.make_candidates(case), world.make_candidates(case)
+    apart.theta.setflags(write=True)
+    apart.theta[5] += 0.01
+    data = map_data(case, candidates, Pick(apart, 5))
+    count = len(candidates) + 1
+    columns = ("theta", "beta", "reason", "structure", "sentence", "depth", "amount", "near", "path", "rank", "window")
+    assert data["picked"] == data["first"] == count - 1 and {len(data[name]) for name in columns} == {count}
+    assert len(data["outward"]) == 3 * count and data["theta"][-1] == pytest.approx(
+        np.degrees(apart.theta[5]), abs=1e-3
+    )
+    assert data["structures"][data["near"][-1][0]] == "rib_right_9" and data["near"][-1][1] == pytest.approx(
+        apart.clearance.distance[5, 0], abs=1e-3
+    )
+
+
+@given(st.integers(0, 200))
+def test_inside_stays_inside_of_a_surface_that_the_box_cuts(seed):
+    """Rays from points in the box, to every side, cross what is kept as oddly as the whole; little is kept beyond."""
+    rng = np.random.default_rng(seed)
+    centre, radius = rng.uniform(-60, 60, 3), rng.uniform(30, 200)
+    ball = world._ball(radius, centre)
+    box = np.stack([rng.uniform(-60, -20, 3), rng.uniform(20, 60, 3)])
+    packed = surfaces([("ball", "avoid", ball)], np.zeros(3), box)
+    points = rng.uniform(box[0], box[1], (20, 3))
+    points = points[np.abs(np.linalg.norm(points - centre, axis=1) - radius) > 3]
+    inside = np.linalg.norm(points - centre, axis=1) < radius
+    for (corners, faces), part in zip(unpacked_surfaces(packed), packed.facts["parts"], strict=True):
+        assert part["drawn"] <= part["triangles"] == len(faces) <= part["drawn"] + 800
+        for toward in rng.normal(size=(3, 3)):
+            assert (crossed(corners[faces], points, toward) == inside).all()
+    assert packed.facts["parts"] or not inside.any()
+
+
+def crossed(triangles, points, toward):
+    """Whether a ray from each point crosses triangles (m, 3, 3) an odd number of times, by signed volumes."""
+    a, b, c = (triangles[:, k][None] - points[:, None] for k in range(3))
+    sides = [np.einsum("nmk,k->nm", np.cross(p, q), toward) > 0 for p, q in ((a, b), (b, c), (c, a))]
+    ahead = (
+        np.einsum("nmk,nmk->nm", a, np.cross(b - a, c - a)) * np.einsum("nmk,k->nm", np.cross(b - a, c - a), toward) > 0
+    )
+    return ((sides[0] == sides[1]) & (sides[1] == sides[2]) & ahead).sum(axis=1) % 2 == 1

@@ -1,0 +1,258 @@
+"""The page's slices: one block of the CT about target and entries, the surfaces in it, and how to draw a needle there.
+
+A script of the page (``slices.js``) cuts both in any plane, as `slices.panel` does for ``slices.png``.
+"""
+
+from __future__ import annotations
+
+import gzip
+import itertools
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.reasons import css
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.search.bedside import slice_numbers
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report.palette import SKIN
+from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, TONES, stored
+from puncture_twin.twin.report.slices.planes import letters
+from puncture_twin.twin.report.slices.subject import BESIDE, Subject
+
+AROUND_MM = 60.0
+"""What the block holds beyond target and entries, to every side."""
+
+FINE_MM = 1.0
+"""Voxels finer than this are averaged up to it: their noise would take most of the page."""
+
+MOST_CT, MOST_TRIANGLES = 1_600_000, 250_000
+"""Bytes of the packed CT, and triangles of the surfaces: in base64 they take 2.1 and at most 0.9 MB of the page."""
+
+LEAST_UNIT_MM = 1 / 16
+"""To which the surfaces' corners are rounded; the unit is doubled until there are no more triangles than that."""
+
+MOST_UNITS = 32_000
+"""A corner's coordinates fit 16 bits."""
+
+COARSE_MM = 32.0
+"""How coarse surfaces beyond the box are, and how far beyond: they are not drawn."""
+
+LEVEL = 6
+"""Of gzip's."""
+
+
+class Packed(NamedTuple):
+    """What the page carries: facts as plain values, and bytes that are unpacked by a script."""
+
+    facts: dict[str, Any]
+    content: bytes
+
+
+def slices_data(
+    subject: Subject, candidates: Candidates, picked: int, regions_ct: Floats | None
+) -> tuple[dict[str, Any], bytes, bytes]:
+    """What the page's slices are made of: facts, and the bytes of CT and surfaces.
+
+    Args:
+        subject: The direction that is shown first.
+        candidates: Of the search; their entries say how far the block reaches.
+        picked: The row of that direction on the page.
+        regions_ct: Shape (n, 3, 3), mm^2, of the tip, NaN where it is not known; None without declared errors.
+    """
+    case, anatomy = subject.case, subject.anatomy
+    box = block_box(case.target_ct, candidates)
+    ct = None
+    if anatomy.scan is not None:
+        hu, T_ct_index = anatomy.scan.measured
+        ct = ct_block(hu, T_ct_index, box)
+    skin = ("skin", "skin", anatomy.skin.mesh)
+    shapes = surfaces([*((one.name, str(one.role), one.mesh) for one in anatomy.checked), skin], case.target_ct, box)
+    colours = {**subject.colours, "skin": SKIN}
+    for one in shapes.facts["parts"]:
+        one |= {"colour": css(colours[one["name"]]), "target": one["name"] == case.target_structure}
+    bent = None if picked < 0 or subject.bent_mm is None else np.round(subject.bent_mm, 2).tolist()
+    facts = {
+        "ct": None if ct is None else ct.facts,
+        "surfaces": shapes.facts,
+        "knots": [KNOTS_HU, KNOTS_BYTE],
+        "tones": dict(TONES),
+        "letters": [[letters(case.space, np.array(axis)), axis] for axis in _axes()],
+        "needle": {"shaft": case.needle.shaft_mm, "radius": case.needle.radius_mm},
+        "numbers": None if anatomy.scan is None else _numbers(*slice_numbers(anatomy.scan.grid)),
+        "catalogue": [[mm, case.needle.of_length(mm).longest_path_mm] for mm in sorted(case.needle.lengths_mm)],
+        "names": {name: text for name, (text, _) in BESIDE.items()},
+        "bent": {} if bent is None else {picked: bent},
+        "regions": {} if regions_ct is None else _regions(regions_ct, picked, subject.region_ct),
+        "margins": {
+            name: float(mm)
+            for name, mm in zip(candidates.clearance.structures, candidates.clearance.margins, strict=True)
+            if np.isfinite(mm)
+        },
+    }
+    return facts, b"" if ct is None else ct.content, shapes.content
+
+
+def _regions(regions_ct: Floats, picked: int, of_picked: Floats | None) -> dict[int, list[float]]:
+    """The upper triangle of each direction's region, mm^2; of the picked one as it is planned."""
+    upper = np.triu_indices(3)
+    known = np.flatnonzero(np.isfinite(regions_ct).all(axis=(1, 2)))
+    found = dict(zip(known.tolist(), np.round(regions_ct[known][:, *upper], 3).tolist(), strict=True))
+    return found if of_picked is None else found | {picked: np.round(of_picked[upper], 3).tolist()}
+
+
+def _numbers(of_point: Floats, count: int) -> list[Any]:
+    return [of_point.tolist(), count]
+
+
+def _axes() -> Iterator[list[float]]:
+    """The six directions along the axes."""
+    for axis, sign in itertools.product(range(3), (1.0, -1.0)):
+        yield [sign if k == axis else 0.0 for k in range(3)]
+
+
+def block_box(target_ct: Floats, candidates: Candidates) -> Floats:
+    """What the block holds, shape (2, 3), mm: the target, the entries of safe directions, and `AROUND_MM` about them.
+
+    Where nothing is safe, the entries of all directions.
+    """
+    entries = candidates.path.entry_ct[candidates.safe if candidates.safe.any() else slice(None)]
+    points = np.concatenate([np.asarray(target_ct)[None], entries[np.isfinite(entries).all(axis=1)]])
+    return np.stack([points.min(axis=0) - AROUND_MM, points.max(axis=0) + AROUND_MM])
+
+
+def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = MOST_CT) -> Packed:
+    """The CT in a box, in bytes of `stored`, packed: its own voxels, or where they are too many means of some.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units.
+        T_ct_index: Shape (4, 4), voxel index to LPS mm.
+        box_ct: Shape (2, 3), mm.
+        most: Bytes; the voxels grow until the block takes no more.
+    """
+    corners = np.array(list(itertools.product(*box_ct.T)))
+    index = apply(np.linalg.inv(T_ct_index), corners)
+    low = np.clip(np.floor(index.min(axis=0)), 0, hu.shape).astype(int)
+    high = np.clip(np.ceil(index.max(axis=0)) + 1, 0, hu.shape).astype(int)
+    part = hu[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
+    factor = np.maximum(1, np.floor(FINE_MM / spacing + 1e-6)).astype(int)
+    while True:
+        values = _means(part, np.minimum(factor, np.maximum(1, part.shape)))
+        content = gzip.compress(_differences(stored(values)), LEVEL, mtime=0)
+        if len(content) <= most:
+            break
+        factor[np.argmin(spacing * factor)] += 1
+    T_index_block = np.diag([*factor.astype(float), 1.0])
+    T_index_block[:3, 3] = low + (factor - 1) / 2
+    T = T_ct_index @ T_index_block
+    facts = {
+        "shape": values.shape,
+        "T": T[:3].ravel().tolist(),
+        "image": [
+            ((edge - T_index_block[:3, 3]) / factor).tolist() for edge in (np.full(3, -0.5), np.array(hu.shape) - 0.5)
+        ],
+        "voxel_mm": np.round(spacing, 3).tolist(),
+        "shown_mm": np.round(spacing * factor, 3).tolist(),
+    }
+    return Packed(facts, content)
+
+
+def _means(values: NDArray[Any], factor: NDArray[np.int64]) -> NDArray[Any]:
+    """Means of blocks of voxels; what does not fill one at the end is left out."""
+    if np.all(factor == 1):
+        return values
+    count = np.array(values.shape) // factor
+    total = np.zeros(count, np.float32)
+    for first in itertools.product(*(range(n) for n in factor)):
+        total += values[tuple(slice(f, f + n * s, s) for f, n, s in zip(first, count, factor, strict=True))]
+    return total / np.float32(factor.prod())
+
+
+def _differences(values: NDArray[np.uint8]) -> bytes:
+    """Bytes less the mean of their three neighbours before, x fastest: they pack to two thirds."""
+    wide = np.pad(values, ((1, 0),) * 3).astype(np.int16)
+    before = (wide[:-1, 1:, 1:] + wide[1:, :-1, 1:] + wide[1:, 1:, :-1]) // 3
+    return (values - before).astype(np.uint8).transpose(2, 1, 0).tobytes()
+
+
+def surfaces(parts: Iterable[tuple[str, str, TriangleMesh]], target_ct: Floats, box_ct: Floats) -> Packed:
+    """Surfaces in a box; corners from the target, in whole units, as differences.
+
+    Corners that round to one are one: so surfaces grow coarser, each of its points by less than 0.87 units, and none
+    of them vanishes but what is smaller than a unit. What lies beyond the box is only kept as far as it tells what is
+    inside of a closed surface; the first triangles of each, ``drawn`` of them, are those that reach the box.
+
+    Args:
+        parts: Name, role and mesh.
+        target_ct: Shape (3,), mm.
+        box_ct: Shape (2, 3), mm.
+    """
+    box = box_ct - target_ct
+    boxed = [
+        (name, role, mesh.closed, *_boxed(mesh.vertices - target_ct, mesh.faces, box)) for name, role, mesh in parts
+    ]
+    farthest = max((float(np.abs(one[3]).max(initial=0.0)) for one in boxed), default=0.0)
+    unit = LEAST_UNIT_MM
+    while farthest / unit > MOST_UNITS:
+        unit *= 2
+    while True:
+        rounded = [_rounded(vertices / unit, faces, drawn) for *_, vertices, faces, drawn in boxed]
+        if sum(len(faces) for _, faces, _ in rounded) <= MOST_TRIANGLES:
+            break
+        unit *= 2
+    found = zip(boxed, rounded, strict=True)
+    kept = [(one, v, f, drawn) for one, (v, f, drawn) in found if drawn or (one[2] and len(f))]
+    corners = [np.diff(v, axis=0, prepend=0).astype("<i2").T.tobytes() for _, v, _, _ in kept]
+    triangles = [np.diff(f.ravel(), prepend=0).astype("<i4").tobytes() for _, _, f, _ in kept]
+    facts = [
+        {"name": one[0], "role": one[1], "closed": one[2], "corners": len(v), "triangles": len(f), "drawn": drawn}
+        for one, v, f, drawn in kept
+    ]
+    content = gzip.compress(b"".join([*corners, *triangles]), LEVEL, mtime=0)
+    return Packed({"unit_mm": unit, "parts": facts}, content)
+
+
+def _boxed(vertices: Floats, faces: NDArray[np.int32], box: Floats) -> tuple[Floats, NDArray[np.int32], int]:
+    """Triangles that reach a box first, and their number; the corners of all others drawn near, and coarse.
+
+    Each of these others lies beyond one face of the box with all of its corners, before and after: what is inside of a
+    closed surface, for a point in the box, stays so.
+    """
+    corner = vertices[faces]
+    reach = ((corner.max(axis=1) >= box[0]) & (corner.min(axis=1) <= box[1])).all(axis=1)
+    exact = np.zeros(len(vertices), bool)
+    exact[faces[reach]] = True
+    coarse = np.clip(np.round(vertices / COARSE_MM) * COARSE_MM, *box)
+    beyond = np.where(vertices > box[1], box[1] + COARSE_MM, np.where(vertices < box[0], box[0] - COARSE_MM, coarse))
+    moved = np.where(exact[:, None], vertices, beyond)
+    return moved, np.concatenate([faces[reach], faces[~reach]]), int(reach.sum())
+
+
+def _rounded(
+    vertices: Floats, faces: NDArray[np.int32], drawn: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    """Whole corners, each once and in the order of first use; the triangles left of these, and of those to be drawn.
+
+    Of the others two in one place cancel out.
+    """
+    used, index = np.unique(faces, return_inverse=True)
+    whole = np.round(vertices[used]).astype(np.int64)
+    key = ((whole + MOST_UNITS) << np.array([32, 16, 0])).sum(axis=1)  # one number a corner: 16 bits an axis
+    _, same = np.unique(key, return_inverse=True)
+    found = same[index.reshape(-1, 3)]
+    apart = (found != np.roll(found, 1, axis=1)).all(axis=1)
+    near, others = found[:drawn][apart[:drawn]], found[drawn:][apart[drawn:]]
+    _, one, count = np.unique(np.sort(others, axis=1), axis=0, return_index=True, return_counts=True)
+    left = np.concatenate([near, others[np.sort(one[count % 2 == 1])]])
+    used, first = np.unique(left, return_index=True)
+    order = np.argsort(first)
+    place = np.zeros(len(whole), np.int64)
+    place[used[order]] = np.arange(len(order))
+    corner = np.zeros((len(whole), 3), np.int64)
+    corner[same] = whole
+    return corner[used[order]], place[left], len(near)
