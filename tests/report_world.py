@@ -16,7 +16,6 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
-from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.slices.sheet import draw_slices
 from puncture_twin.twin.report.slices.subject import Subject
@@ -235,7 +234,7 @@ def make_page(path):
     case = make_case()
     candidates, anatomy = make_candidates(case), make_anatomy()
     anatomy.scan = SimpleNamespace(hu_at=lambda points: np.where(np.abs(points).max(axis=1) < 150, 40.0, np.nan))
-    plan, slices = make_plan(case, candidates), (draw_slices(Subject(case, anatomy, best_pick(candidates))),)
+    plan, slices = make_plan(case, candidates), (draw_slices(Subject(case, anatomy, candidates.best)),)
     told = (make_rehearsal(plan), make_registration())
     write_page(Shown(case, anatomy, candidates, plan, *told, film="rehearsal.mp4", slices=slices), path)
     return candidates

@@ -32,6 +32,7 @@ from puncture_twin.planning.batch.plan import (
     relative_text,
     write_row,
 )
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.options import case_options
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext, prepare
@@ -122,7 +123,7 @@ def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
     planned, stages = task.planned, Stages()
     try:
         options = case_options(json.loads(planned.options), where=planned.case)
-        context = prepare(planned.path, arm=planned.arm, options=options, memory=memory)
+        context = prepare(load_case(planned.path, options), arm=planned.arm, memory=memory)
         stages = context.stages
         inputs = context.case.inputs
         if case_id(planned.options, planned.arm, inputs, "") != planned.id:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Columns, Floats, Ints, Ints32, Texts
-from puncture_twin.planning.base.errors import Finding
+from puncture_twin.planning.base.errors import Finding, refuse
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
 from puncture_twin.planning.base.text import Facts, brief, card, never_raises
@@ -217,6 +217,16 @@ class Candidates(Columns):
         return candidates_html(self)
 
     @property
+    def theta_deg(self) -> Floats:
+        """Puncture angle, shape (n,), degrees."""
+        return np.asarray(np.round(np.degrees(self.theta), ANGLE_DIGITS))
+
+    @property
+    def beta_deg(self) -> Floats:
+        """Azimuth, shape (n,), degrees."""
+        return np.asarray(np.round(np.degrees(self.beta), ANGLE_DIGITS))
+
+    @property
     def safe(self) -> Bools:
         """Which rows are not rejected, shape (n,)."""
         return self.verdict.reason == Reason.NONE.value
@@ -251,6 +261,22 @@ class Candidates(Columns):
         rows = np.flatnonzero(self.ranking.rank > 0)
         return rows[np.argsort(self.ranking.rank[rows], kind="stable")]
 
+    @property
+    def best(self) -> Pick | None:
+        """The best candidate; None where nothing is safe."""
+        ranked = self.ranked
+        return Pick(self, int(ranked[0])) if len(ranked) else None
+
+    def pick(self, row: int) -> Pick:
+        """One candidate by its row.
+
+        Raises:
+            InputError: There is no such row.
+        """
+        if isinstance(row, bool) or not isinstance(row, int | np.integer) or not 0 <= row < len(self):
+            refuse(f"row {row!r}", "pick", f"a row number from 0 to {len(self) - 1}", "out_of_range")
+        return Pick(self, int(row))
+
     def counts(self) -> dict[str, int]:
         """Number of candidates by reason, most frequent first; "safe" among them."""
         counted = Counter(self.verdict.reason.tolist()).most_common()
@@ -258,10 +284,24 @@ class Candidates(Columns):
 
     def at(self, row: int) -> dict[str, float]:
         """The angles of one row, degrees, rounded to what a person types."""
-        return {
-            "theta_deg": round(float(np.degrees(self.theta[row])), ANGLE_DIGITS),
-            "beta_deg": round(float(np.degrees(self.beta[row])), ANGLE_DIGITS),
-        }
+        return {"theta_deg": float(self.theta_deg[row]), "beta_deg": float(self.beta_deg[row])}
+
+
+class Pick(NamedTuple):
+    """One candidate: a row of a search, or of a check of it alone."""
+
+    candidates: Candidates
+    row: int
+
+    @property
+    def theta_deg(self) -> float:
+        """Puncture angle, degrees."""
+        return self.candidates.at(self.row)["theta_deg"]
+
+    @property
+    def beta_deg(self) -> float:
+        """Azimuth, degrees."""
+        return self.candidates.at(self.row)["beta_deg"]
 
 
 SAME_ANGLE = 1e-7

@@ -25,10 +25,8 @@ from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.progress import LOG, Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.text import brief
-from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.entry import Directions
-from puncture_twin.planning.case.options import NO_OPTIONS, CaseOptions
-from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, cross_check
@@ -79,6 +77,11 @@ class CaseContext:
     watcher: Watcher
     stages: Stages
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For another process: what was read; what answers is made there, since compiled libraries are not sent."""
+        engine = next(name for name, kind in ENGINES.items() if type(self.engine) is kind)
+        return _sent, (self.case, self.anatomy, self.placement, engine, self.reach is not None)
+
     @brief
     def __repr__(self) -> str:
         return f"case {self.case.name}, {len(self.anatomy.structures)} structures; arm {self.arm}"
@@ -89,6 +92,18 @@ class CaseContext:
         if self.reach is not None:
             return ARM_CHECKED
         return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
+
+    def require_arm(self) -> ArmReach:
+        """The checker of the arm, for what cannot do without it.
+
+        Raises:
+            InputError: Says what the case lacks, or that the arm was switched off.
+        """
+        if self.placement is None:
+            refuse(NO_BASE, self.case.path, ALLOWED_BASE, "no_base")
+        if self.reach is None:
+            refuse("the arm is switched off", self.case.path, "a case that is prepared with its arm", "no_base")
+        return self.reach
 
     @property
     def pose_error(self) -> PoseError | None:
@@ -115,8 +130,8 @@ class CaseContext:
             others = tuple(alternatives(self.case, self.anatomy, self.engine, candidates))
         return replace(candidates, arm_note=self.arm, findings=others)
 
-    def check(self, theta: float, beta: float) -> Candidates:
-        """Check a single direction (rad)."""
+    def check(self, theta: Floats | float, beta: Floats | float) -> Candidates:
+        """Check a single direction, or several, shape (n,), rad, without the grid's windows and safe cones."""
         directions = self.case.direction(theta, beta)
         candidates = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
         return replace(candidates, arm_note=self.arm)
@@ -184,24 +199,20 @@ class CaseContext:
 
 
 def prepare(
-    path: Path | str,
+    case: Case | Path | str,
     *,
     arm: bool | None = None,
     engine: str = "fast",
     watcher: Watcher | None = None,
-    target_ct: Floats | None = None,
-    options: CaseOptions = NO_OPTIONS,
     memory: Memory = NO_MEMORY,
 ) -> CaseContext:
     """Prepare a case: read it and everything that it names.
 
     Args:
-        path: Case file, or the folder that holds ``case.toml``.
+        case: A case, its file, or the folder that holds ``case.toml``.
         arm: Whether the arm is checked too; None checks it where the case says where its base is.
         engine: A name of `ENGINES`.
         watcher: Shows progress.
-        target_ct: Another target than the case's, shape (3,), mm.
-        options: What is stated in place of what the case file states.
         memory: What this process keeps from one case to the next; the answer is the same.
 
     Raises:
@@ -213,8 +224,7 @@ def prepare(
     watcher = watcher or Silent()
     stages = Stages(announce=partial(watcher.step, "stage"))
     with stages.time("case"):  # case.toml, validated, and T_base_ct from markers, a transform or a mount
-        case = load_case(path, options)
-        case = case if target_ct is None else case.aimed_at(target_ct)
+        case = case if isinstance(case, Case) else load_case(case)
         placement = load_placement(case)
     if arm and placement is None:
         refuse(NO_BASE, case.path, f"{ALLOWED_BASE}; or a check without the arm", "no_base")
@@ -226,13 +236,33 @@ def prepare(
         anatomy = _with_findings(case, anatomy, placement, cache)
         check_tissues(case, anatomy)
         case.files.release()  # image and labels are read: their memory is given back
-    with stages.time("trees"):  # what questions are answered with: clearance engine, arm's checker, model of errors
+    return _answering(case, anatomy, placement, engine, arm is not False, watcher, stages, cache)
+
+
+def _sent(case: Case, anatomy: Anatomy, placement: Placement | None, engine: str, arm: bool) -> CaseContext:
+    watcher = Silent()
+    stages = Stages(announce=partial(watcher.step, "stage"))
+    return _answering(case, anatomy, placement, engine, arm, watcher, stages, user_cache())
+
+
+def _answering(
+    case: Case,
+    anatomy: Anatomy,
+    placement: Placement | None,
+    engine: str,
+    arm: bool,
+    watcher: Watcher,
+    stages: Stages,
+    cache: Cache,
+) -> CaseContext:
+    """What questions are answered with: clearance engine, arm's checker, model of errors."""
+    with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
         cache_option = {"cache": cache} if engine == "fast" else {}
         clearance_engine = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **cache_option)
         reach = None
-        if arm is not False and placement is not None:
-            reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, memory), placement.T_base_ct)
+        if arm and placement is not None:
+            reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, cache.memory), placement.T_base_ct)
         error = None if reach is None or placement is None else pose_error(case, placement.registration)
         chance = chance_model(case, anatomy, clearance_engine, error)
     return CaseContext(case, anatomy, placement, clearance_engine, reach, chance, watcher, stages)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.search.candidates import ANGLE_DIGITS, Candidates
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.uncertainty.chance_model import Chances
 
@@ -46,8 +46,8 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
 def _path_columns(candidates: Candidates) -> dict[str, Any]:
     """Direction, verdict, and the straight path with its clearances."""
     columns: dict[str, Any] = {
-        "theta_deg": np.round(np.degrees(candidates.theta), ANGLE_DIGITS),
-        "beta_deg": np.round(np.degrees(candidates.beta), ANGLE_DIGITS),
+        "theta_deg": candidates.theta_deg,
+        "beta_deg": candidates.beta_deg,
         "verdict": np.where(candidates.safe, "safe", "rejected"),
         "reason": candidates.verdict.reason,
         "reason_structure": candidates.verdict.structure,

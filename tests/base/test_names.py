@@ -10,7 +10,7 @@ from case_world import write_case
 from refusals import refused
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.labels.naming import names_for

@@ -8,7 +8,7 @@ from case_world import ORGAN, SKIN, ball, case_text, structure, write_balls
 from refusals import refused
 
 from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.formats.labels.naming import ByName

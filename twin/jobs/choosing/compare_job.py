@@ -22,11 +22,10 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Choice, parse_choice
+from puncture_twin.planning.search.choice import Choice, explain_choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
 from puncture_twin.planning.search.windows import Window, find_windows, nearest_row
-from puncture_twin.twin.jobs.patient.answers import explain_choice
 from puncture_twin.twin.jobs.patient.main_job import is_plan
 from puncture_twin.twin.jobs.patient.summaries import plan_summary
 from puncture_twin.twin.report.present import NOTHING, Block, Field, Section, Table, facts, number, text

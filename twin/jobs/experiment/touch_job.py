@@ -18,7 +18,7 @@ from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.search.choice import Choice, choose, chosen_angles
+from puncture_twin.planning.search.choice import Choice, choose
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.touch_planner import (
     TOUCHING_PADDING_MM,
@@ -214,8 +214,7 @@ def _use(context: CaseContext, tour: Tour, truth: TouchTruth, read: NamedPoints)
 def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
     """Joints (6,) with the tip on the target, and the direction outward (3,), of the best candidate of a choice."""
     with context.stages.time("search"):
-        found = context.search() if choice.of_grid else context.check(*chosen_angles(context.case, choice))
-        chosen = choose(context, found, choice)
+        chosen = choose(context, None, choice)
     rows = [row for row in chosen.rows if np.isfinite(chosen.candidates.arm.q_insertion[row]).all()]
     if not rows:
         what = "the arm reaches no such candidate: nothing to touch the markers for"

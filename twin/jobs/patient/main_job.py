@@ -24,8 +24,9 @@ from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
-from puncture_twin.planning.search.choice import BEST, Choice, Pick, choose, choose_stated, with_file_read
-from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
+from puncture_twin.planning.search.candidates import Pick
+from puncture_twin.planning.search.choice import BEST, Choice, choose_stated, with_file_read
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
 
@@ -97,7 +98,7 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
-    _refuse_without_arm(context)
+    context.require_arm()
     choice = _stated(context, out, choice)
     with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES), read=choice.read) as draft:
         run = Run(context, context.search(), (), read=choice.read)
@@ -123,7 +124,7 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
     from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
 
-    _refuse_without_arm(context)
+    context.require_arm()
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names, read=choice.read) as draft, two_stages() as begin:
@@ -155,11 +156,6 @@ def demo_case(context: CaseContext, out: Path) -> Run:
     """`rehearse_case`, in `DEMO_ROOMS` rooms where the case declares errors and has markers."""
     rooms = None if context.chance is None else RoomCount(DEMO_ROOMS)
     return rehearse_case(context, out, rooms)
-
-
-def _refuse_without_arm(context: CaseContext) -> None:
-    if context.reach is None:
-        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
 
 
 def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
@@ -308,8 +304,7 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
     context = run.context
     try:
         with context.stages.time("plan"):
-            chosen = choose(context, run.candidates, choice)
-            plan, found, row = make_plan(context, chosen.candidates, seed=context.case.rehearsal.seed, rows=chosen.rows)
+            plan, found, row = make_plan(context, run.candidates, choice)
     except NoAnswerError as error:
         return replace(run, refusal=str(error).removeprefix(NO_PLAN))
     write_plan(plan, out / "plan.json")

@@ -14,7 +14,7 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.checks.places import touchable_points
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
@@ -129,7 +129,7 @@ def write_check_picture(context: CaseContext, explained: Explanation, path: Path
 def _slices(run: Run) -> tuple[Slices, ...]:
     """Of the plan, else of the best direction, then of the best of each other window; none where nothing is safe."""
     found = run.candidates
-    pick = run.pick or best_pick(found)
+    pick = run.pick or found.best
     if pick is None:
         return ()
     bests = [window.best for window in find_windows(found).windows[:MOST_WINDOWS]]

@@ -14,8 +14,7 @@ from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.bedside import EntryFacts
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
@@ -92,7 +91,7 @@ class Run:
         """The path of the plan, else of the best direction, for whoever stands at the patient; None without either."""
         if self.plan is not None:
             return self.context.entry_facts(self.plan.entry_ct, self.plan.outward_ct)
-        pick = self.pick or best_pick(self.candidates)
+        pick = self.pick or self.candidates.best
         if pick is None:
             return None
         found, row = pick

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from puncture_twin.planning.base.reasons import SAFE, Rgb
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report import annotate, palette
 from puncture_twin.twin.report.numbers import nearest_text, target_text
 from puncture_twin.twin.report.present import number
@@ -73,7 +72,7 @@ def draw_scene(
         pick: The planned candidate, or the one to be shown; None shows the best.
         failed: Whether a plan was requested, and there is none.
     """
-    pick = pick or best_pick(candidates)
+    pick = pick or candidates.best
     T_base_ct = None if plan is None else plan.T_base_ct
     bodies = [*patient(anatomy, case), *safe_region(candidates, case), *room(case, T_base_ct)]
     direction = chosen_direction(pick, plan)
