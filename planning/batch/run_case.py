@@ -141,7 +141,7 @@ def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
 
 def _searched(task: CaseTask, context: CaseContext, draft: Path) -> dict[str, Any]:
     candidates = context.search()
-    write_table(candidates, context.provenance(), draft / TABLE_NAME)
+    write_table(candidates, draft / TABLE_NAME)
     row = searched_row(task.planned, context, candidates)
     if task.write_page is not None:
         task.write_page(context, candidates, draft)

@@ -20,7 +20,7 @@ from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
-from puncture_twin.planning.base.text import Facts, brief, card, did_you_mean, never_raises
+from puncture_twin.planning.base.text import Facts, Shown, brief, did_you_mean
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case_file import CaseFile
@@ -63,7 +63,7 @@ ALLOWED_CASE = "a TOML case file with schema = 2, or a folder with case.toml"
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class Case(Shown):
     """What a search, a plan and a rehearsal start from. A `Case` has been validated.
 
     Attributes:
@@ -122,9 +122,11 @@ class Case:
     def __repr__(self) -> str:
         return f"{self.name}, {self.path}: target {self.target_name} in {self.target_structure}"
 
-    def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        return case_html(self)
+    def _title(self) -> str:
+        return f"Case {self.name}"
+
+    def _facts(self) -> Facts:
+        return _facts(self)
 
     def replace(self, *, target_ct: ArrayLike | None = None, **options: Mapping[str, Any]) -> Case:
         """What the case would be if its file had these values; the file stays as it is.
@@ -319,13 +321,8 @@ def _stated(axis: Axis | None, space: Space, otherwise: Floats) -> Vector:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-@never_raises
-def case_html(case: Any) -> str:
-    """A table of facts: target, needle, structures, grid, robot, and what the case leaves open."""
-    return card(f"Case {case.name}", _facts(case))
-
-
-def _facts(case: Any) -> Facts:
+def _facts(case: Case) -> Facts:
+    """Target, needle, structures, grid, robot, and what the case leaves open."""
     x, y, z = case.target_ct
     axes = "the local frame" if str(case.space) == "local" else "LPS"
     yield "target", f"{case.target_name} in {case.target_structure}: ({x:.1f}, {y:.1f}, {z:.1f}) mm in {axes}"
@@ -346,7 +343,7 @@ def _facts(case: Any) -> Facts:
         yield "warning", warning
 
 
-def _base(case: Any) -> str:
+def _base(case: Case) -> str:
     if case.registration is not None:
         return f"by registration of markers ({case.registration.method})"
     if case.robot.transform is not None:

@@ -28,7 +28,6 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, reason_text
-from puncture_twin.planning.search.windows import find_windows
 
 NEAR_ENTRY_MM = 10.0
 """How far from the skin entry of its path a point may be that is to be that entry: a hand's precision on a screen."""
@@ -107,7 +106,7 @@ def choose(context: CaseContext, candidates: Candidates | None, choice: Choice) 
         _refuse_beyond(choice.rank, len(rows), "--rank", "safe candidates")
         return Chosen(candidates, rows[choice.rank - 1 : choice.rank])
     if choice.window is not None:
-        windows = find_windows(candidates)
+        windows = candidates.windows
         _refuse_beyond(choice.window, len(windows.windows), "--window", "windows")
         return Chosen(candidates, rows[windows.of_row[rows] == choice.window])
     return Chosen(candidates, rows)

@@ -43,7 +43,6 @@ from puncture_twin.planning.search.phases import breath_warnings
 from puncture_twin.planning.search.search import organ_candidates, search
 from puncture_twin.planning.search.sides import Side, sides_of
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, uncertainty_breakdown
-from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
@@ -128,13 +127,13 @@ class CaseContext:
                 progress=partial(self.watcher.count, "directions of the arm"),
             )
             others = tuple(alternatives(self.case, self.anatomy, self.engine, candidates))
-        return replace(candidates, arm_note=self.arm, findings=others)
+        return replace(candidates, arm_note=self.arm, findings=others, provenance=self.provenance())
 
     def check(self, theta: Floats | float, beta: Floats | float) -> Candidates:
         """Check a single direction, or several, shape (n,), rad, without the grid's windows and safe cones."""
         directions = self.case.direction(theta, beta)
         candidates = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
-        return replace(candidates, arm_note=self.arm)
+        return replace(candidates, arm_note=self.arm, provenance=self.provenance())
 
     def explain(self, theta: float, beta: float) -> Explanation:
         """Check a single direction (rad), with everything it was checked against and its uncertainty."""
@@ -314,7 +313,7 @@ def _needle_catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, can
         for length in sorted(case.needle.lengths_mm)
     }
     text = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
-    best = [window.best for window in find_windows(candidates).windows]
+    best = [window.best for window in candidates.windows]
     shortest = [next((length for length, rows in safe.items() if rows[row]), np.nan) for row in best]
     fits = ", ".join(f"{length:g} mm" for length in shortest)
     numbers = {"lengths_mm": list(safe), "safe": [float(rows.sum()) for rows in safe.values()], "shortest_mm": shortest}

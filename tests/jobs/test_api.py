@@ -8,9 +8,11 @@ import tomllib
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import tomlkit
 from case_world import coarse_carton
+from PIL import Image
 from refusals import refused
 
 import puncture_twin as pt
@@ -18,6 +20,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import prepare
+from puncture_twin.run_twin import main
 
 HEAVY = ("numba", "pybullet", "matplotlib", "trimesh", "scipy", "ompl", "fcl", "pyarrow", "SimpleITK", "plotly")
 
@@ -326,3 +329,36 @@ def test_a_context_goes_to_other_processes_and_is_used_by_threads(arm_context):
         sent = pool.submit(pt.check_many, arm_context, *angles[1]).result()
     assert all(same_candidates(a, b) for a, b in zip(expected, threads, strict=True))
     assert same_candidates(sent, expected[1])
+
+
+def test_the_table_is_the_commands_table(context, tmp_path):
+    """As a DataFrame, and as a file: what `run-twin search` writes, its provenance too."""
+    candidates = pt.search(context)
+    assert main(["search", str(folder() / "carton" / "case_m.toml"), "--no-arm", "--no-pictures",
+                 "--out", str(tmp_path / "command")]) == 0  # fmt: skip
+    ours, theirs = candidates.write(tmp_path / "api"), tmp_path / "command" / "candidates.parquet"
+    assert ours.read_bytes() == theirs.read_bytes()
+    assert pt.check_folder(tmp_path / "api") == ()
+    frame = candidates.to_pandas()
+    assert frame.equals(pq.read_table(theirs).to_pandas())
+    assert np.array_equal(frame["theta_deg"], candidates.theta_deg) and frame["theta_deg"].max() > np.pi
+    for nowhere, code in ((3, "wrong_type"), (None, "wrong_type"), ("a\0b", "unwritable")):
+        with refused(code):
+            candidates.write(nowhere)
+
+
+def test_windows_and_the_best_are_the_searchs(context):
+    """By number; what is best is the first of the ranks, and lies in the first window."""
+    candidates = pt.search(context)
+    assert [window.number for window in candidates.windows] == list(range(1, len(candidates.windows) + 1))
+    assert candidates.windows[0].best == candidates.best.row == candidates.ranked[0]
+    assert sum(window.directions for window in candidates.windows) == candidates.safe.sum()
+    assert pt.rerank(candidates, -candidates.ranking.cost).best.row == candidates.ranked[-1]
+
+
+def test_the_map_is_a_picture(context, tmp_path):
+    """For a notebook, and as a file."""
+    shown = pt.search(context).plot_map()
+    assert "<img" in shown._repr_html_()
+    with Image.open(shown.write(tmp_path / "map.png")) as picture:
+        assert picture.width == picture.height > 300

@@ -25,7 +25,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, explain_choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
-from puncture_twin.planning.search.windows import Window, find_windows, nearest_row
+from puncture_twin.planning.search.windows import Window, nearest_row
 from puncture_twin.twin.jobs.patient.main_job import is_plan
 from puncture_twin.twin.jobs.patient.summaries import plan_summary
 from puncture_twin.twin.report.present import NOTHING, Block, Field, Section, Table, facts, number, text
@@ -178,7 +178,7 @@ def _on_grid(candidates: Candidates, outward_ct: Floats, *, safe: bool) -> OnGri
     row = nearest_row(candidates, outward_ct)
     if row is None or not (safe and candidates.safe[row]):
         return OnGrid(None, float("nan"), None)
-    windows = find_windows(candidates)
+    windows = candidates.windows
     window = windows.windows[int(windows.of_row[row]) - 1]
     if np.linalg.norm(candidates.outward_ct[row] - outward_ct) > SAME_DIRECTION:
         return OnGrid(None, float("nan"), window)

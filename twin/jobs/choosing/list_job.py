@@ -30,7 +30,6 @@ from puncture_twin.planning.search.choice import (
 )
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, finite
-from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.twin.jobs.patient.candidates_export import csv_text
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
@@ -185,7 +184,7 @@ def check_targets(context: CaseContext, listed: ReadList, aimed: Callable[[Liste
     def outcome(row: Listed) -> Outcome:
         there = aimed(row)
         found = there.search()
-        windows = len(find_windows(found).windows)
+        windows = len(found.windows)
         counts = int(found.safe.sum()), windows
         try:
             explained = explain_choice(there, row.choice, found)

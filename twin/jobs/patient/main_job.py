@@ -315,7 +315,7 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
 def _with_table(run: Run, out: Path) -> Run:
     path = out / "candidates.parquet"
     with run.context.stages.time("table"):
-        write_table(run.candidates, run.context.provenance(), path)
+        write_table(run.candidates, path)
     return run.with_files(path)
 
 

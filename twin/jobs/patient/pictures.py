@@ -17,7 +17,7 @@ from puncture_twin.planning.registration.checks.places import touchable_points
 from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
+from puncture_twin.planning.search.windows import MOST_WINDOWS
 from puncture_twin.twin.jobs.patient.budget import budget_facts
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
@@ -132,7 +132,7 @@ def _slices(run: Run) -> tuple[Slices, ...]:
     pick = run.pick or found.best
     if pick is None:
         return ()
-    bests = [window.best for window in find_windows(found).windows[:MOST_WINDOWS]]
+    bests = [window.best for window in found.windows[:MOST_WINDOWS]]
     others = [Pick(found, row) for row in bests if found.at(row) != pick.candidates.at(pick.row)]
     subjects = [_subject(run.context, pick, run.plan), *(_subject(run.context, other) for other in others)]
     return tuple(map(draw_slices, subjects))

@@ -19,7 +19,7 @@ from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
 from puncture_twin.planning.search.sides import sides_text
-from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
+from puncture_twin.planning.search.windows import MOST_WINDOWS
 from puncture_twin.twin.jobs.patient.summaries import (
     plan_summary,
     rehearsal_failures,
@@ -112,7 +112,7 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""
         found, provenance = self.candidates, self.context.provenance()
-        found_windows = find_windows(found)
+        found_windows = found.windows
         windows, largest = found_windows.windows, found_windows.largest
         at_patient = {} if self.facts is None else self.facts.summary()
         return {
@@ -171,7 +171,7 @@ class Run:
         looked = f", looked from: {sides_text(sides, searched=True)}" if sides else ""
         warned = (*needle_warnings(self.context.case, found), *(one.sentence for one in found.findings))
         return [
-            Section(f"case {self.context.case.name}: {find_windows(found).headline}", []),
+            Section(f"case {self.context.case.name}: {found.windows.headline}", []),
             Section(f"{len(found)} direction{'s' if len(found) != 1 else ''}{looked}", patient.counts(found)),
             *(Section(one, []) for one in warned),
             Section("the best of each window", patient.windows(found)) if found.safe.any() else self._nothing_safe(),
