@@ -11,7 +11,8 @@ import inspect
 import math
 import numbers
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec, TypeVar
@@ -26,9 +27,11 @@ if TYPE_CHECKING:
     from puncture_twin.planning.case.case import Case
     from puncture_twin.planning.certify.certificate import Certificate
     from puncture_twin.planning.certify.checker import Verification
+    from puncture_twin.planning.export.exporter import Exported
     from puncture_twin.planning.formats.points import NamedPoints
     from puncture_twin.planning.formats.volumes.volume_files import Volume
     from puncture_twin.planning.geometry.mesh import TriangleMesh
+    from puncture_twin.planning.place.search import PlaceSearch
     from puncture_twin.planning.plan.plan import Plan
     from puncture_twin.planning.registration.method import Method
     from puncture_twin.planning.registration.registration import Registration
@@ -38,6 +41,11 @@ if TYPE_CHECKING:
     from puncture_twin.planning.search.explain import Explanation
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+    from puncture_twin.twin.jobs.batch.jobs import Merged
+    from puncture_twin.twin.jobs.choosing.compare_job import Comparison
+    from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
+    from puncture_twin.twin.jobs.patient.candidates_export import ExportedTable
+    from puncture_twin.twin.jobs.patient.export_jobs import SlicerExport
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
     Points = NamedPoints | Mapping[str, ArrayLike]
@@ -46,9 +54,19 @@ if TYPE_CHECKING:
 
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
+Word = TypeVar("Word", bound=StrEnum)
 
 RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {"seed": (0, 2**31 - 1), "seeds": (1, 1_000_000), "jobs": (1, 1024), "size_deg": (0.05, 10), "fle_mm": (0.001, 1e3)}
+    {
+        "seed": (0, 2**31 - 1),
+        "seeds": (1, 1_000_000),
+        "jobs": (1, 1024),
+        "size_deg": (0.05, 10),
+        "fle_mm": (0.001, 1e3),
+        "physics": (0, 10_000),
+        "touch": (0, 1),
+        "tolerance_mm": (0, 1e3),
+    }
 )
 """Least and greatest of an argument, by its name."""
 
@@ -121,6 +139,7 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
         "Path": Kind("a path", _is_path),
         "Method": Kind("rigid or triad", lambda value: isinstance(value, str)),
         "ArrayLike": Kind("an array", lambda value: value is not None),
+        "Sequence[str]": Kind("a list of texts", lambda value: isinstance(value, list | tuple)),
         "Points": Kind("points by their names", lambda value: isinstance(value, Mapping) or _is("NamedPoints", value)),
     }
 )
@@ -132,8 +151,71 @@ def _short(value: object) -> str:
 
 
 @_public
+def init_case(
+    folder: Path | str,
+    target: ArrayLike | None = None,
+    *,
+    target_label: str | None = None,
+    hit_radius_mm: float | None = None,
+    region: str | None = None,
+    space: str | None = None,
+    naming: str | None = None,
+    unit: str | None = None,
+    up: str | None = None,
+    ct: str | None = None,
+    segmentation: str | None = None,
+    skin: str | None = None,
+    ignore: Sequence[str] = (),
+    unknown: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    force: bool = False,
+) -> Case:
+    """Write FOLDER/case.toml from what is in the folder, a CT and its segmentation, and return the case.
+
+    Args:
+        folder: With a CT and a segmentation.
+        target: Shape (3,), mm, in `space`.
+        target_label: Or the deepest point of this structure.
+        hit_radius_mm: The target is a ball of its own, in no structure.
+        region: What the CT shows; else inferred from the organs.
+        space: ``LPS`` or ``RAS``: of the target, of the case, and of meshes; LPS by default.
+        naming: Of labels: ``totalsegmentator-v1``, ``-v2``, or a table.
+        unit: Of meshes: ``mm``, ``cm`` or ``m``; else inferred from their extent.
+        up: Axis of meshes that is up: ``y`` or ``z``.
+        ct: Which file, where the folder holds several CTs.
+        segmentation: Which file or folder, where it holds several.
+        skin: Structure that is the skin; else the CT's body.
+        ignore: Structures or files to be left out.
+        unknown: Structures that no path may cross.
+        settings: Keys of the case, such as ``ct.arms=none`` or ``search.trust_labels=true``.
+        force: Replace a case.toml that is there.
+
+    Raises:
+        InputError: Everything that keeps the case from being searched, in one line; nothing is written then.
+    """
+    from puncture_twin.planning.base.progress import Silent
+    from puncture_twin.planning.geometry.spaces import Space, Unit, Up
+    from puncture_twin.planning.init.finder import Wanted
+    from puncture_twin.planning.init.overrides import overrides_of
+    from puncture_twin.planning.init.start import Request
+    from puncture_twin.twin.jobs.patient.init_job import init_case
+
+    for name, texts in (("ignore", ignore), ("unknown", unknown), ("settings", settings)):
+        if not all(isinstance(text, str) for text in texts):
+            refuse(f"{name} holds what is no text", "init_case", "a list of texts", "wrong_type")
+    words = _words(Space, space), _words(Unit, unit), _words(Up, up)
+    overrides = overrides_of(skin, list(ignore), list(unknown), list(settings))
+    wanted = Wanted(words[0] or Space.LPS, naming, words[1], ct, segmentation, words[2], overrides)
+    point = None if target is None else _typed(target, "init_case: target")
+    request = Request(Path(folder), point, target_label, region, wanted, space is not None, hit_radius_mm)
+    return load_case(init_case(request, force=force, watcher=Silent()).path)
+
+
+@_public
 def load_case(path: Path | str) -> Case:
     """A validated case, without what its files hold. `prepare` reads those too.
+
+    ``case.replace(target_ct=..., mount=..., needle=...)`` is what the case would be if its file had these values.
 
     Args:
         path: Case file, or the folder that holds ``case.toml``.
@@ -230,7 +312,7 @@ def rerank(candidates: Candidates, cost: ArrayLike) -> Candidates:
     """
     from puncture_twin.planning.search.ranking import ranked_by
 
-    return ranked_by(candidates, np.asarray(cost))
+    return ranked_by(candidates, _numbers(cost, "rerank", f"{len(candidates)} numbers, shape (n,)"))
 
 
 @_public
@@ -262,16 +344,21 @@ def register(
 
 
 @_public
-def certify(context: CaseContext, *, size_deg: float = 0.25) -> Certificate:
+def certify(context: CaseContext, *, size_deg: float = 0.25, touch: float | None = None) -> Certificate:
     """The map between the grid points: cells of directions that are proven safe for the organs, or rejected.
 
     Args:
         context: From `prepare`.
         size_deg: Cells are halved down to this size.
+        touch: No structure is touched more often than this, 0 to 1, in a safe cell; None proves margins alone.
+
+    Raises:
+        InputError: A chance without declared errors, or a case that cannot have a certificate.
     """
     from puncture_twin.planning.certify.subdivision import certify
 
-    return certify(context.case, context.anatomy, size=float(np.radians(size_deg)))
+    error = context.pose_error
+    return certify(context.case, context.anatomy, size=float(np.radians(size_deg)), touch=touch, error=error)
 
 
 @_public
@@ -283,7 +370,7 @@ def verify(certificate: Certificate, context: CaseContext) -> Verification:
     """
     from puncture_twin.planning.certify.checker import verify
 
-    return verify(certificate, context.case, context.anatomy)
+    return verify(certificate, context.case, context.anatomy, error=context.pose_error)
 
 
 @_public
@@ -388,14 +475,8 @@ def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS", up: str
     from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
     from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
-    try:
-        known, axis = (Unit(unit), Space(space)), None if up is None else Up(up)
-    except ValueError as error:
-        allowed = "mm, cm or m; LPS, RAS or local; y or z"
-        raise InputError(
-            f"unit {unit!r}, space {space!r}, up {up!r}", where=str(path), allowed=allowed, code="unknown_choice"
-        ) from error
-    return read_mesh(Path(path), unit=known[0], space=known[1], up=axis)
+    known = _words(Unit, unit) or Unit.MM, _words(Space, space) or Space.LPS
+    return read_mesh(Path(path), unit=known[0], space=known[1], up=_words(Up, up))
 
 
 @_public
@@ -464,24 +545,202 @@ def write_plan(plan: Plan, path: Path | str) -> None:
 
 
 @_public
-def rehearse(context: CaseContext, plan: Plan, *, seed: int | None = None) -> Rehearsal:
+def rehearse(
+    context: CaseContext, plan: Plan, *, seed: int | None = None, seeds: int | None = None, physics: int = 0
+) -> Rehearsal:
     """Execute a plan in the twin, where the ground truth differs from the belief.
 
     Args:
         context: The plan's case.
         plan: From `plan` or `read_plan`.
         seed: What the ground truth is drawn from; the case's by default.
+        seeds: Draw so many rooms: the median one is executed, and ``distribution`` holds all.
+        physics: So many of them are executed in the simulator too.
 
     Raises:
-        InputError: The extra ``twin`` is not installed.
+        InputError: Many rooms of a case without declared errors or markers, or the extra ``twin`` is not installed.
+        NoAnswerError: The arm reaches the target in none of the rooms.
     """
     from puncture_twin.planning.base.errors import require_extra
 
     require_extra("twin", "rehearse")
-    from puncture_twin.twin.rehearsal.plan_truth import plan_truth
-    from puncture_twin.twin.rehearsal.rehearsal import rehearse
+    from puncture_twin.twin.jobs.patient.rehearsed import rehearse_once
+    from puncture_twin.twin.jobs.patient.run import room_count
 
-    return rehearse(plan, context.case, context.anatomy, plan_truth(context, plan, seed))
+    return rehearse_once(context, plan, room_count(seeds, physics), seed)
+
+
+@_public
+def touch(
+    context: CaseContext,
+    *,
+    theta_deg: float | None = None,
+    beta_deg: float | None = None,
+    candidate: Pick | None = None,
+    window: int | None = None,
+    entry: ArrayLike | None = None,
+    seed: int = 0,
+) -> TouchRun:
+    """Plan how the markers are touched for a puncture, and touch them in the twin; ``points`` are what was read.
+
+    Args:
+        context: From `prepare`, with the arm, declared errors and markers.
+        theta_deg: Of the puncture, as in `plan`; without a choice the best.
+        beta_deg: As in `plan`.
+        candidate: As in `plan`.
+        window: As in `plan`.
+        entry: As in `plan`.
+        seed: Of the motions and of the truth.
+
+    Raises:
+        InputError: The case declares no errors or has no markers, or the extra ``twin`` is not installed.
+        NoAnswerError: Nothing is safe, or too few markers can be touched.
+    """
+    from puncture_twin.planning.base.errors import require_extra
+
+    require_extra("twin", "touch")
+    from puncture_twin.twin.jobs.experiment.touch_job import touch
+
+    return touch(context, _choice("touch", theta_deg, beta_deg, candidate, window, entry), seed)
+
+
+@_public
+def place(context: CaseContext, *, jobs: int = 2) -> PlaceSearch:
+    """Where the arm should stand to reach most of the directions that the organs allow; ``rated`` has the best first.
+
+    ``prepare(context.case.replace(mount=dict(found.rated[0].mount)))`` is the case with the arm there.
+
+    Args:
+        context: From `prepare`.
+        jobs: Processes; the answer is the same.
+
+    Raises:
+        InputError: Bounds that contradict the case.
+        NoAnswerError: No direction is safe for the organs.
+    """
+    from puncture_twin.twin.jobs.patient.place_job import find_places
+
+    return find_places(context, jobs).found
+
+
+@_public
+def compare(
+    context: CaseContext,
+    one: Explanation | Plan | Pick,
+    other: Explanation | Plan | Pick,
+    *,
+    candidates: Candidates | None = None,
+) -> Comparison:
+    """Two paths of a case side by side: numbers, and why one is not safe. ``text()`` is the command's table.
+
+    Args:
+        context: From `prepare`.
+        one: From `check` or `plan`, or a candidate such as ``candidates.best``.
+        other: Another.
+        candidates: From `search`, for ranks and windows; None searches.
+
+    Raises:
+        InputError: A plan that does not hold in this case.
+    """
+    from puncture_twin.planning.search.candidates import Pick
+    from puncture_twin.twin.jobs.choosing.compare_job import compare_paths
+
+    paths = [check(context, candidate=path) if isinstance(path, Pick) else path for path in (one, other)]
+    found = context.search() if candidates is None else candidates
+    return compare_paths(context, found, *zip(("one", "other"), paths, strict=True))
+
+
+@_public
+def export(
+    source: Plan | Candidates | Explanation, format_name: str, folder: Path | str, *, context: CaseContext | None = None
+) -> Exported | ExportedTable | SlicerExport:
+    """Write a plan for a robot, the table of candidates, or a direction for 3D Slicer; read back before it is shown.
+
+    Args:
+        source: A plan (``urscript``, ``ros2``, ``csv``, ``moveit``, or another package's format; ``plan.json`` is
+            written beside it), candidates (``candidates-csv``, ``candidates-json``), or a checked direction
+            (``slicer``).
+        format_name: One of these.
+        folder: Where the files go; made where it is missing.
+        context: The plan is checked again against this case, and corners are rounded where that is free; ``moveit`` and
+            ``slicer`` need it.
+
+    Raises:
+        InputError: A format that is not of this source, or a plan that breaks a limit of the arm or does not hold.
+    """
+    from puncture_twin.twin.jobs.patient.export_jobs import export_value
+
+    return export_value(source, format_name, folder, context)
+
+
+@_public
+def report(
+    context: CaseContext,
+    candidates: Candidates,
+    folder: Path | str,
+    *,
+    plan: Plan | None = None,
+    rehearsal: Rehearsal | None = None,
+) -> Path:
+    """Write the page and the pictures of a search, and of a plan and its rehearsal, and return the page's path.
+
+    Args:
+        context: From `prepare`.
+        candidates: From `search`.
+        folder: Where they go; made where it is missing.
+        plan: From `plan`, shown as the chosen path.
+        rehearsal: From `rehearse`, of this plan.
+
+    Raises:
+        InputError: A folder that cannot be written to, or a rehearsal without its plan.
+    """
+    from puncture_twin.planning.base.files import check_writable
+    from puncture_twin.twin.jobs.patient.main_job import report_case
+    from puncture_twin.twin.jobs.patient.run import PAGE, Run
+
+    if rehearsal is not None and plan is None:
+        refuse("a rehearsal without its plan", "report", "plan=... beside it", "missing_option")
+    pick = None if plan is None else context.check(plan.theta, plan.beta).pick(0)
+    distribution = None if rehearsal is None else rehearsal.distribution
+    out = check_writable(folder)
+    report_case(Run(context, candidates, (), plan, rehearsal=rehearsal, distribution=distribution, pick=pick), out)
+    return out / PAGE
+
+
+@_public
+def batch(
+    cohort: Path | str,
+    folder: Path | str,
+    *,
+    jobs: int = 1,
+    arm: bool | None = None,
+    expect: Path | str | None = None,
+    tolerance_mm: float = 0.01,
+) -> Merged:
+    """Search every case of a cohort, and merge them: what `batch plan`, `batch run` and `batch merge` do.
+
+    What has its result in the folder already is not searched again.
+
+    Args:
+        cohort: A folder of cases, a CSV with the column ``case``, or a ``cohort.toml``.
+        folder: The cohort's results.
+        jobs: Processes.
+        arm: Whether a candidate must be reachable too; None asks it where a case says where the robot's base is.
+        expect: An earlier ``cases.parquet``, or its folder; ``changed`` then lists what differs.
+        tolerance_mm: By so much a best clearance may differ from it.
+
+    Raises:
+        InputError: No cohort, or a folder that cannot be written to. A case that cannot be read is a row that says so.
+    """
+    from puncture_twin.planning.base.files import check_writable
+    from puncture_twin.planning.base.progress import Silent
+    from puncture_twin.planning.batch.workers import NO_LIMITS
+    from puncture_twin.twin.jobs.batch.jobs import Where, merge_cohort, plan_cohort, run_part
+
+    out, watcher = check_writable(folder), Silent()
+    plan_cohort(Path(cohort), out, arm=arm, dry=False, watcher=watcher)
+    run_part(out, Where("1/1", None, jobs, pages=False, limits=NO_LIMITS), watcher)
+    return merge_cohort(out, None if expect is None else Path(expect), tolerance_mm, watcher)
 
 
 def _choice(
@@ -502,16 +761,37 @@ def _choice(
     for name, angle, most in (("theta_deg", theta_deg, 180.0), ("beta_deg", beta_deg, 360.0)):
         if angle is not None:
             _angles([angle], most, f"{where}: {name}")
-    if entry is not None and not isinstance(entry, str | Path):
-        point = _named({"entry": entry}, f"{where}: entry").points[0]
-        entry = ",".join(map(repr, point.tolist()))
-    stated = parse_choice(theta_deg, beta_deg, None, window, None if entry is None else str(entry))
+    if entry is not None:
+        entry = str(entry) if isinstance(entry, str | Path) else _typed(entry, f"{where}: entry")
+    stated = parse_choice(theta_deg, beta_deg, None, window, entry)
     if candidate is None:
         return stated
     if stated != Choice():
         refuse("a candidate beside another choice", where, "one of them", "conflicting_options")
     found, row = candidate
     return Choice(angles=(float(found.theta[row]), float(found.beta[row])))
+
+
+def _typed(point: ArrayLike, where: str) -> str:
+    """A point, shape (3,), mm, as it is typed on a command line.
+
+    Raises:
+        InputError: It is not three finite numbers.
+    """
+    return ",".join(map(repr, _named({"point": point}, where).points[0].tolist()))
+
+
+def _words(kind: type[Word], word: str | None) -> Word | None:
+    """One of a few words; None for none.
+
+    Raises:
+        InputError: Another word.
+    """
+    try:
+        return None if word is None else kind(word)
+    except ValueError as error:
+        allowed = ", ".join(kind)
+        raise InputError(f"{word!r}", where=kind.__name__.lower(), allowed=allowed, code="unknown_choice") from error
 
 
 def _angles(angles_deg: ArrayLike, most: float, where: str) -> Floats:
@@ -521,17 +801,29 @@ def _angles(angles_deg: ArrayLike, most: float, where: str) -> Floats:
         InputError: Another shape, none, or what is no such number.
     """
     allowed = f"numbers of degrees from 0 to {most:g}, shape (n,)"
+    given = _numbers(angles_deg, where, allowed)
+    if not len(given):
+        refuse("no angle", where, allowed, "empty")
+    wrong = ~((given >= 0.0) & (given <= most))  # NaN too
+    if wrong.any():
+        refuse(f"{given[wrong][0]:g}", where, allowed, "out_of_range")
+    return given
+
+
+def _numbers(values: ArrayLike, where: str, allowed: str) -> Floats:
+    """Real numbers, shape (n,).
+
+    Raises:
+        InputError: Another shape, or values that are no real numbers.
+    """
     try:
-        given = np.asarray(angles_deg)
+        given = np.asarray(values)
     except ValueError as error:
         raise InputError("rows of different length", where=where, allowed=allowed, code="wrong_shape") from error
     if given.dtype.kind not in "iuf":
         refuse(f"values of type {given.dtype}", where, allowed, "wrong_type")
-    if given.ndim != 1 or not len(given):
+    if given.ndim != 1:
         refuse(f"shape {given.shape}", where, allowed, "wrong_shape")
-    wrong = ~((given >= 0.0) & (given <= most))  # NaN too
-    if wrong.any():
-        refuse(f"{given[wrong][0]:g}", where, allowed, "out_of_range")
     return np.asarray(given, dtype=np.float64)
 
 

@@ -158,6 +158,10 @@ class Shown:
     def _picture(self) -> str:
         return ""
 
+    @brief
+    def __repr__(self) -> str:
+        return ", ".join(f"{name} {value}" for name, value in self._facts() if len(value) <= SHORT)
+
     def _repr_html_(self) -> str:
         """HTML for a notebook."""
         try:
@@ -165,6 +169,9 @@ class Shown:
         except Exception as error:  # a notebook must not lose the value to its picture
             return f"<pre>{escape(object.__repr__(self))}\n{escape(type(error).__name__)}</pre>"
 
+
+SHORT = 40
+"""Characters of a fact that stands in the one line."""
 
 UNITS = (("_mm", "mm"), ("_cm2", "cm²"), ("_deg", "°"), ("_s", "s"), ("_n", "N"))
 """Endings of names, and the unit that they say."""
@@ -181,4 +188,6 @@ def _plain(value: object) -> str | None:
     if isinstance(value, list | tuple):
         texts = [_plain(one) for one in value]
         return None if None in texts else first_few([str(one) for one in texts]) or "none"
+    if (shape := getattr(value, "shape", None)) is not None:
+        return f"an array of shape {shape}"
     return str(value) if isinstance(value, Path) else None

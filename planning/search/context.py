@@ -24,7 +24,7 @@ from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Cache, Memo
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.progress import LOG, Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.base.text import brief
+from puncture_twin.planning.base.text import Facts, Shown, brief, first_few
 from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import ClearanceEngine
@@ -41,7 +41,7 @@ from puncture_twin.planning.search.constraints import ArmReach
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import breath_warnings
 from puncture_twin.planning.search.search import organ_candidates, search
-from puncture_twin.planning.search.sides import Side, sides_of
+from puncture_twin.planning.search.sides import Side, sides_of, sides_text
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, uncertainty_breakdown
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
@@ -57,7 +57,7 @@ ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]"
 
 
 @dataclass(frozen=True, eq=False)
-class CaseContext:
+class CaseContext(Shown):
     """A prepared case: everything that questions about it need, read once.
 
     Attributes:
@@ -75,6 +75,16 @@ class CaseContext:
     chance: ChanceModel | None
     watcher: Watcher
     stages: Stages
+
+    def _title(self) -> str:
+        return f"Case {self.case.name}, prepared"
+
+    def _facts(self) -> Facts:
+        yield "structures", first_few([one.name for one in self.anatomy.structures])
+        yield "arm", self.arm
+        yield "sides", sides_text(self.sides) or "of no body"
+        for warning in self.anatomy.warnings:
+            yield "warning", warning
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process: what was read; what answers is made there, since compiled libraries are not sent."""

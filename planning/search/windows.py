@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.case.entry import AngleGrid
 
 SQUARE_DEGREES = float(np.degrees(1.0) ** 2)
@@ -19,8 +20,8 @@ MOST_WINDOWS = 10
 """Windows that are listed to people."""
 
 
-@dataclass(frozen=True)
-class Window:
+@dataclass(frozen=True, repr=False)
+class Window(Shown):
     """One connected set of safe directions.
 
     Attributes:
@@ -50,8 +51,8 @@ class Window:
         return f"{self.entry_cm2:.1f} cm2 on the skin, {self.wide_deg:.0f} deg wide"
 
 
-@dataclass(frozen=True, eq=False)
-class Windows:
+@dataclass(frozen=True, eq=False, repr=False)
+class Windows(Shown):
     """All windows of a search.
 
     Attributes:

@@ -3,10 +3,10 @@
 import base64
 import io
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 from PIL import Image
+from whole_html import Whole
 
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.reasons import css
@@ -14,33 +14,6 @@ from puncture_twin.planning.base.text import Shown, card
 
 LEGEND = (Entry("safe", (0, 158, 115)), Entry("too close", (213, 94, 0)), Entry("undecided", (255, 255, 255)))
 HOSTILE = '</td><script>alert("1")</script>&'
-
-
-class Whole(HTMLParser):
-    """Complains where a tag is closed that is not the last one opened."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.open, self.tags = [], []
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        """No part of it comes from outside, none acts."""
-        if tag != "img":
-            self.open.append(tag)
-        self.tags.append(tag)
-        assert not any(name in ("href", "onload", "onclick") for name, _ in attrs)
-        assert all(value.startswith("data:") for name, value in attrs if name == "src")
-
-    def handle_startendtag(self, tag, attrs):
-        """An element without a content."""
-        self.tags.append(tag)
-
-    def handle_endtag(self, tag):
-        """The last one opened is closed first."""
-        assert self.open.pop() == tag
 
 
 def grid(step=5.0, last=30.0):

@@ -282,6 +282,13 @@ def export(
     return replace(done, path=draft.final((done.path,))[0], inputs=inputs)
 
 
+def report_case(run: Run, out: Path) -> Run:
+    """Write the pictures and the page of what is known."""
+    with _writing(out, "report", run.context, PICTURES) as draft:
+        run = _with_pictures(run, draft.folder)
+    return _final(run, draft)
+
+
 def _certified(run: Run, wanted: CertifyOptions, out: Path) -> Run:
     """Certify the cap to a cell size, and a chance to touch, and rank again with the safe cones."""
     from puncture_twin.planning.certify.certificate import with_safe_cone, write_certificate

@@ -132,7 +132,7 @@ def _slices(run: Run) -> tuple[Slices, ...]:
     pick = run.pick or found.best
     if pick is None:
         return ()
-    bests = [window.best for window in found.windows[:MOST_WINDOWS]]
+    bests = [window.best for window in found.windows.windows[:MOST_WINDOWS]]
     others = [Pick(found, row) for row in bests if found.at(row) != pick.candidates.at(pick.row)]
     subjects = [_subject(run.context, pick, run.plan), *(_subject(run.context, other) for other in others)]
     return tuple(map(draw_slices, subjects))

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from puncture_twin.planning.place.search import (
     write_place_document,
     write_placements,
 )
-from puncture_twin.planning.search.candidates import ARM_CHECKED
+from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.constraints import ArmReach, with_reach
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
@@ -80,8 +80,20 @@ def place_case(context: CaseContext, out: Path, *, jobs: int, pictures: bool = T
     return replace(run, files=draft.final(run.files))
 
 
-def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> PlaceRun:
-    """Search, and write everything into a folder."""
+class Places(NamedTuple):
+    """The directions that the organs allow, and where the arm should stand to reach them."""
+
+    candidates: Candidates
+    found: PlaceSearch
+
+
+def find_places(context: CaseContext, jobs: int) -> Places:
+    """Search for a place to stand the arm.
+
+    Raises:
+        InputError: Bounds that contradict the case.
+        NoAnswerError: No direction is safe for the organs.
+    """
     case, stages = context.case, context.stages
     with stages.time("organs"):
         candidates = organ_candidates(case, context.anatomy, context.engine, case.directions())
@@ -94,6 +106,13 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> Place
             jobs=jobs,
             progress=context.watcher.count,
         )
+    return Places(candidates, found)
+
+
+def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool) -> PlaceRun:
+    """Search, and write everything into a folder."""
+    case, stages = context.case, context.stages
+    candidates, found = find_places(context, jobs)
     document = place_document(found, context.provenance() | {"arm": ARM_CHECKED})
     write_placements(found, out / "placements.csv")
     write_place_document(document, out / "place.json")
