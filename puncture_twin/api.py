@@ -724,7 +724,8 @@ def batch(
     Args:
         cohort: A folder of cases, a CSV with the column ``case``, or a ``cohort.toml``.
         folder: The cohort's results.
-        jobs: Processes.
+        jobs: 1 searches in this process; more start so many others, and a script then needs Python's usual
+            ``if __name__ == "__main__":``.
         arm: Whether a candidate must be reachable too; None asks it where a case says where the robot's base is.
         expect: An earlier ``cases.parquet``, or its folder; ``changed`` then lists what differs.
         tolerance_mm: By so much a best clearance may differ from it.
@@ -734,12 +735,13 @@ def batch(
     """
     from puncture_twin.planning.base.files import check_writable
     from puncture_twin.planning.base.progress import Silent
-    from puncture_twin.planning.batch.workers import NO_LIMITS
-    from puncture_twin.twin.jobs.batch.jobs import Where, merge_cohort, plan_cohort, run_part
+    from puncture_twin.planning.batch.run import Request, run_cohort
+    from puncture_twin.planning.batch.run_case import run_here
+    from puncture_twin.twin.jobs.batch.jobs import merge_cohort, plan_cohort
 
     out, watcher = check_writable(folder), Silent()
     plan_cohort(Path(cohort), out, arm=arm, dry=False, watcher=watcher)
-    run_part(out, Where("1/1", None, jobs, pages=False, limits=NO_LIMITS), watcher)
+    run_cohort(out, Request(jobs=jobs), watcher, run_here if jobs == 1 else None)
     return merge_cohort(out, None if expect is None else Path(expect), tolerance_mm, watcher)
 
 

@@ -7,13 +7,13 @@ import multiprocessing
 import os
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.progress import Stages
@@ -166,6 +166,14 @@ def _committed(
     timings = {"seconds": {name: round(spent, 3) for name, spent in seconds.items()}, "attempt": task.attempt}
     commit(draft, task.out, task.planned.id, inputs, timings)
     return CaseEnd(task.planned.id, row["exit_code"], row["reason"])
+
+
+def run_here(tasks: Sequence[CaseTask], limits: object) -> Generator[CaseEnd, None, None]:
+    """Run cases in this process, which no limit holds for; yields how each ended."""
+    del limits
+    memory = Memory(MEMORY_BYTES)
+    for task in tasks:
+        yield run_case(task, memory)
 
 
 def work(connection: Connection, memory_bytes: int) -> None:
