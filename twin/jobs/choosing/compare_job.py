@@ -15,19 +15,17 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, explain_choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
 from puncture_twin.planning.search.windows import Window, nearest_row
-from puncture_twin.twin.jobs.patient.main_job import is_plan
+from puncture_twin.twin.jobs.patient.main_job import is_plan, read_noted_plan
 from puncture_twin.twin.jobs.patient.summaries import plan_summary
 from puncture_twin.twin.report.present import NOTHING, Block, Field, Section, Table, facts, number, text
 
@@ -104,7 +102,7 @@ def compare_source(
     if plans is None:
         choices = parse_two(*stated)
         return compare_choices(prepare(source, arm=arm, watcher=watcher), choices)
-    return compare_plans(plans, None if case is None else prepare(case, watcher=watcher))
+    return compare_plans(plans, None if case is None else prepare(case, watcher=watcher), watcher.note)
 
 
 def compare_choices(context: CaseContext, choices: tuple[Choice, Choice]) -> Comparison:
@@ -139,13 +137,13 @@ def compare_paths(context: CaseContext, found: Candidates, *paths: Titled) -> Co
     return Comparison(context.case.name, (*read, *context.case.inputs), a, b, tuple(context.anatomy.warnings))
 
 
-def compare_plans(paths: tuple[Path, Path], context: CaseContext | None) -> Comparison:
+def compare_plans(paths: tuple[Path, Path], context: CaseContext | None, note: Callable[[str], None]) -> Comparison:
     """Two plans; with their case each is checked again.
 
     Raises:
         InputError: A plan that cannot be used, or does not hold any more.
     """
-    read = [_read(path) for path in paths]
+    read = [read_noted_plan(path, note) for path in paths]
     inputs = tuple(source for source, _ in read)
     plans = [plan for _, plan in read]
     if context is None:
@@ -166,11 +164,6 @@ def _differing(a: Plan, b: Plan) -> tuple[str, ...]:
         return ()
     more = f" and {len(roles) - MOST_ROLES} more" if len(roles) > MOST_ROLES else ""
     return (f"the plans were not made from the same files ({', '.join(roles[:MOST_ROLES])}{more}): is it one case?",)
-
-
-def _read(path: Path) -> tuple[Input, Plan]:
-    found = read_output(path, max_bytes=MAX_PLAN_BYTES)
-    return found.input("plan"), parse_plan(found.data, path)
 
 
 def _explained_side(candidates: Candidates, title: str, explained: Explanation) -> Side:

@@ -13,7 +13,6 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic, check_writable
-from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Silent, Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
@@ -23,10 +22,10 @@ from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_na
 from puncture_twin.planning.export.slicer import NAMES, SLICER, SceneContent, entry_area, slicer_files
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import with_case_arm
-from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
+from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import BEST, Choice, choose, choose_stated, with_file_read
+from puncture_twin.planning.search.choice import Choice, choose, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.twin.jobs.patient.candidates_export import (
@@ -36,7 +35,7 @@ from puncture_twin.twin.jobs.patient.candidates_export import (
     export_candidates,
     table_of,
 )
-from puncture_twin.twin.jobs.patient.main_job import case_of, export, export_case, is_plan, plan_case, search_case
+from puncture_twin.twin.jobs.patient.main_job import case_of, export, is_plan, plan_case, read_noted_plan, search_case
 from puncture_twin.twin.jobs.patient.summaries import export_summary
 from puncture_twin.twin.report.present import Section, Warn, text
 
@@ -48,27 +47,14 @@ NOTES = (
 )
 
 
-def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, choice: Choice) -> Exported:
-    """Check a plan against its case again, or make it; write the four files.
-
-    Args:
-        context: The case.
-        plan_path: The plan; None plans what is chosen, into the same folder.
-        out: Where they go.
-        choice: Of the candidate, where there is no plan yet.
+def export_to_moveit(context: CaseContext, plan_path: Path, out: Path) -> Exported:
+    """Check a plan against its case again; write the four files.
 
     Raises:
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
-        NoAnswerError: No plan.
     """
     note = context.watcher.note
-    if plan_path is None:
-        plan_case(context, out, choice)
-        plan_path = out / "plan.json"
-    found = read_output(plan_path, max_bytes=MAX_PLAN_BYTES)
-    if found.note:
-        note(f"warning: {found.note}")
-    source, plan = found.input("plan"), parse_plan(found.data, plan_path)
+    source, plan = read_noted_plan(plan_path, note)
     check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     plan = with_case_arm(plan, context.case)
     names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
@@ -108,7 +94,7 @@ def export_value(
         write_plan(source, draft.folder / "plan.json")
     if format_name == MOVEIT:
         assert context is not None
-        return export_to_moveit(context, out / "plan.json", out, BEST)
+        return export_to_moveit(context, out / "plan.json", out)
     return export(out / "plan.json", format_name, out, context, note)
 
 
@@ -164,12 +150,14 @@ def export_source(
     if format_name == MOVEIT and planned_case is None:
         refuse("moveit's scene is the case's", source, "export plan.json --case CASE", "missing_option")
     context = None if planned_case is None else prepare(planned_case, watcher=watcher)
+    plan_path = source
+    if context is not None and not is_plan(source):
+        plan_case(context, out, choice)
+        plan_path = out / "plan.json"
     if format_name == MOVEIT and context is not None:
-        done = export_to_moveit(context, source if is_plan(source) else None, out, choice)
-    elif context is None or is_plan(source):
-        done = export(source, format_name, out, context, watcher.note)
+        done = export_to_moveit(context, plan_path, out)
     else:
-        done = export_case(context, format_name, out, choice)
+        done = export(plan_path, format_name, out, context, watcher.note)
     return Export(done, export_summary(done, context is not None), export_text(done, context is not None))
 
 

@@ -227,7 +227,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
-    source, plan = _read_plan(plan_path, context.watcher.note)
+    source, plan = read_noted_plan(plan_path, context.watcher.note)
     with context.stages.time("plan"):
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     plan = with_case_arm(plan, context.case)
@@ -240,24 +240,13 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     return _final(run, draft)
 
 
-def _read_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
+def read_noted_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
     """A plan of a whole set, or with a warning from outside of any, and the hash of the bytes that it was read from."""
     found = read_output(path, max_bytes=MAX_PLAN_BYTES)
     plan = parse_plan(found.data, path)
     if found.note:
         note(f"warning: {found.note}")
     return found.input("plan"), plan
-
-
-def export_case(context: CaseContext, format_name: str, out: Path, choice: Choice) -> Exported:
-    """Plan what is chosen, write everything that `plan_case` writes, and the plan for a robot beside it.
-
-    Raises:
-        InputError: See `plan_case`, `export`.
-        NoAnswerError: No plan.
-    """
-    plan_case(context, out, choice)
-    return export(out / "plan.json", format_name, out, context, context.watcher.note)
 
 
 def export(
@@ -271,7 +260,7 @@ def export(
     from puncture_twin.planning.export.exporter import export_name, export_plan
     from puncture_twin.planning.plan.recheck import check_plan
 
-    source, plan = _read_plan(plan_path, note)
+    source, plan = read_noted_plan(plan_path, note)
     if context is not None:
         check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     checker = None if context is None or context.reach is None else context.reach.checker
