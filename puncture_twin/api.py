@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.registration.registration import Registration
     from puncture_twin.planning.search.candidates import Candidates, Pick
     from puncture_twin.planning.search.choice import Choice
-    from puncture_twin.planning.search.context import CaseContext
+    from puncture_twin.planning.search.context import CaseContext, EngineChoice
     from puncture_twin.planning.search.explain import Explanation
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
@@ -138,6 +138,10 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
         "str": Kind("text", _is_path),
         "Path": Kind("a path", _is_path),
         "Method": Kind("rigid or triad", lambda value: isinstance(value, str)),
+        "EngineChoice": Kind(
+            "a class with measure, collides and of",
+            lambda value: isinstance(value, type) and all(hasattr(value, one) for one in ("measure", "collides", "of")),
+        ),
         "ArrayLike": Kind("an array", lambda value: value is not None),
         "Sequence[str]": Kind("a list of texts", lambda value: isinstance(value, list | tuple)),
         "Points": Kind("points by their names", lambda value: isinstance(value, Mapping) or _is("NamedPoints", value)),
@@ -229,13 +233,14 @@ def load_case(path: Path | str) -> Case:
 
 
 @_public
-def prepare(case: Case | Path | str, *, arm: bool | None = None, engine: str = "fast") -> CaseContext:
+def prepare(case: Case | Path | str, *, arm: bool | None = None, engine: str | EngineChoice = "fast") -> CaseContext:
     """Read a case and all that it names: structures, registration, arm. It can be pickled, and used in threads.
 
     Args:
         case: A case, such as ``load_case(...).replace(...)``, its file, or the folder that holds ``case.toml``.
         arm: Whether a candidate must be reachable too; None asks it where the case says where the robot's base is.
-        engine: ``fast``, or ``fcl``, the plain reference.
+        engine: Who measures clearance: ``fast``, ``fcl`` (the plain reference), or a class of your own that keeps the
+            protocol `puncture_twin.planning.clearance.engine.ClearanceEngine`.
 
     Raises:
         InputError: Anything in the case that cannot be used.

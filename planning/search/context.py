@@ -49,6 +49,9 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Clearance engines by name: the fast exact engine, and FCL alone as the plain reference."""
 
+EngineChoice = str | Callable[..., ClearanceEngine]
+"""A name of `ENGINES`, or a class of one's own that is made of (meshes, progress) and keeps `ClearanceEngine`."""
+
 COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
 """The unit of each engine's progress."""
 
@@ -88,7 +91,8 @@ class CaseContext(Shown):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process: what was read; what answers is made there, since compiled libraries are not sent."""
-        engine = next(name for name, kind in ENGINES.items() if type(self.engine) is kind)
+        kind = type(self.engine)
+        engine = next((name for name, known in ENGINES.items() if kind is known), kind)
         return _sent, (self.case, self.anatomy, self.placement, engine, self.reach is not None)
 
     @brief
@@ -211,7 +215,7 @@ def prepare(
     case: Case | Path | str,
     *,
     arm: bool | None = None,
-    engine: str = "fast",
+    engine: EngineChoice = "fast",
     watcher: Watcher | None = None,
     memory: Memory = NO_MEMORY,
 ) -> CaseContext:
@@ -220,7 +224,7 @@ def prepare(
     Args:
         case: A case, its file, or the folder that holds ``case.toml``.
         arm: Whether the arm is checked too; None checks it where the case says where its base is.
-        engine: A name of `ENGINES`.
+        engine: Who measures clearance.
         watcher: Shows progress.
         memory: What this process keeps from one case to the next; the answer is the same.
 
@@ -228,7 +232,7 @@ def prepare(
         InputError: Anything in the case that cannot be used, an unknown engine, or an arm that is to be checked in a
             case that does not say where its base is.
     """
-    if engine not in ENGINES:
+    if isinstance(engine, str) and engine not in ENGINES:
         refuse(f"engine '{engine}' is not known", "--engine", ", ".join(ENGINES), "unknown_engine")
     watcher = watcher or Silent()
     stages = Stages(announce=partial(watcher.step, "stage"))
@@ -248,7 +252,7 @@ def prepare(
     return _answering(case, anatomy, placement, engine, arm is not False, watcher, stages, cache)
 
 
-def _sent(case: Case, anatomy: Anatomy, placement: Placement | None, engine: str, arm: bool) -> CaseContext:
+def _sent(case: Case, anatomy: Anatomy, placement: Placement | None, engine: EngineChoice, arm: bool) -> CaseContext:
     watcher = Silent()
     stages = Stages(announce=partial(watcher.step, "stage"))
     return _answering(case, anatomy, placement, engine, arm, watcher, stages, user_cache())
@@ -258,7 +262,7 @@ def _answering(
     case: Case,
     anatomy: Anatomy,
     placement: Placement | None,
-    engine: str,
+    engine: EngineChoice,
     arm: bool,
     watcher: Watcher,
     stages: Stages,
@@ -267,8 +271,9 @@ def _answering(
     """What questions are answered with: clearance engine, arm's checker, model of errors."""
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
+        maker, unit = (ENGINES[engine], COUNTED[engine]) if isinstance(engine, str) else (engine, "structures")
         cache_option = {"cache": cache} if engine == "fast" else {}
-        clearance_engine = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **cache_option)
+        clearance_engine = maker(meshes, partial(watcher.count, unit), **cache_option)
         reach = None
         if arm and placement is not None:
             reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, cache.memory), placement.T_base_ct)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -18,6 +19,7 @@ from refusals import refused
 import puncture_twin as pt
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.processes import process_pool
+from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
@@ -362,3 +364,25 @@ def test_the_map_is_a_picture(context, tmp_path):
     assert "<img" in shown._repr_html_()
     with Image.open(shown.write(tmp_path / "map.png")) as picture:
         assert picture.width == picture.height > 300
+
+
+class WaryEngine(FastEngine):
+    """Measures 1 mm less than there is."""
+
+    def measure(self, target_ct, outward_ct, length, *, shown=True):
+        """Of every axis from every structure."""
+        axes = super().measure(target_ct, outward_ct, length, shown=shown)
+        return replace(axes, distance=np.maximum(axes.distance - 1.0, 0.0))
+
+
+def test_an_engine_of_ones_own_measures_everything(context):
+    """The search by it is the search with margins that are as much wider; its context is sent with it."""
+    case = context.case
+    mine = pt.prepare(case, arm=False, engine=WaryEngine)
+    found, wider = pt.search(mine), pt.search(pt.prepare(case.replace(margins={"add_mm": 1.0}), arm=False))
+    bolts = np.isin(found.clearance.structures, ("bolt_l", "bolt_h"))
+    assert np.array_equal(found.clearance.distance[:, bolts] < 2.0, wider.clearance.distance[:, bolts] < 3.0)
+    assert same_candidates(pt.search(pickle.loads(pickle.dumps(mine))), found)
+    for wrong in (int, "exact", FastEngine([])):
+        with refused("wrong_type" if wrong != "exact" else "unknown_engine"):
+            pt.prepare(case, arm=False, engine=wrong)
