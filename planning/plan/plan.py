@@ -72,10 +72,20 @@ class Plan(Shown):
     warnings: tuple[str, ...]
     speeds: SpeedLimits = DEFAULT_SPEEDS
 
+    @property
+    def theta_deg(self) -> float:
+        """Puncture angle, degrees."""
+        return float(np.degrees(self.theta))
+
+    @property
+    def beta_deg(self) -> float:
+        """Azimuth, degrees."""
+        return float(np.degrees(self.beta))
+
     @brief
     def __repr__(self) -> str:
         return (
-            f"case {self.case_name}, theta {np.degrees(self.theta):g} deg, beta {np.degrees(self.beta):g} deg, "
+            f"case {self.case_name}, theta {self.theta_deg:g} deg, beta {self.beta_deg:g} deg, "
             f"{self.model.name}, approach {self.approach.duration_s:.1f} s, insertion {self.insertion.duration_s:.1f} s"
         )
 
@@ -98,7 +108,7 @@ CLEARANCE_TEXT = MappingProxyType(
 
 def _facts(plan: Plan) -> Facts:
     """Direction, entry and target, motion, and the least distances that were found."""
-    yield "direction", f"θ {np.degrees(plan.theta):g}°, β {np.degrees(plan.beta):g}°"
+    yield "direction", f"θ {plan.theta_deg:g}°, β {plan.beta_deg:g}°"
     yield "skin entry, CT (LPS or local)", _point(plan.entry_ct)
     yield "target, CT", _point(plan.target_ct)
     yield "depth, skin to target", f"{np.linalg.norm(plan.entry_ct - plan.target_ct):.1f} mm"

@@ -63,7 +63,8 @@ class Explanation(Shown):
         for line in self.head()[1:]:
             yield "why", line.strip()
         yield "arm", self.candidates.arm_note
-        yield "path", f"{self.candidates.path.length[0]:.1f} mm"
+        if np.isfinite(length := self.candidates.path.length[0]):
+            yield "path", f"{length:.1f} mm"
         yield from self.facts.rows()
         for name, clearance in sorted(self.clearances().items(), key=lambda one: one[1])[:NEAREST]:
             yield f"clearance to {name}", f"{clearance:.2f} mm"

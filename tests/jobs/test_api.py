@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import tomlkit
-from case_world import coarse_carton
+from case_world import coarse_carton, write_case
 from PIL import Image
 from refusals import refused
 
@@ -228,6 +228,14 @@ def test_a_value_that_no_case_file_could_have_is_refused(options, code):
         case.replace(**options)
 
 
+def test_a_case_is_prepared_as_often_as_one_likes(tmp_path):
+    """What it let go of is read again: a CT and its labels too."""
+    case = pt.load_case(write_case(tmp_path))
+    one, other = (pt.search(pt.prepare(case, arm=False)) for _ in range(2))
+    assert same_candidates(one, other)
+    assert same_candidates(one, pt.search(pt.prepare(case.replace(target_ct=case.target_ct), arm=False)))
+
+
 def test_a_case_whose_files_have_changed_is_not_made_into_another(tmp_path):
     """It would be one half of each."""
     shutil.copytree(folder() / "carton", tmp_path / "carton")
@@ -295,9 +303,9 @@ def test_a_plan_is_of_what_was_chosen(arm_context):
     candidates = pt.search(arm_context)
     other = candidates.pick(int(candidates.ranked[1]))
     mine = pt.plan(arm_context, candidate=other)
-    assert np.allclose(np.degrees((mine.theta, mine.beta)), (other.theta_deg, other.beta_deg))
+    assert np.allclose((mine.theta_deg, mine.beta_deg), (other.theta_deg, other.beta_deg))
     best = pt.plan(arm_context, candidates)
-    assert np.allclose(np.degrees((best.theta, best.beta)), (candidates.best.theta_deg, candidates.best.beta_deg))
+    assert np.allclose((best.theta_deg, best.beta_deg), (candidates.best.theta_deg, candidates.best.beta_deg))
     rejected = candidates.pick(int(np.flatnonzero(~candidates.safe)[0]))
     with refused("direction_rejected", by=pt.NoAnswerError):
         pt.plan(arm_context, candidate=rejected)
