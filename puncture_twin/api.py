@@ -651,8 +651,7 @@ def compare(
     from puncture_twin.twin.jobs.choosing.compare_job import compare_paths
 
     paths = [check(context, candidate=path) if isinstance(path, Pick) else path for path in (one, other)]
-    found = context.search() if candidates is None else candidates
-    return compare_paths(context, found, *zip(("one", "other"), paths, strict=True))
+    return compare_paths(context, context.own(candidates), *zip(("one", "other"), paths, strict=True))
 
 
 @_public
@@ -708,7 +707,9 @@ def report(
     pick = None if plan is None else context.check(plan.theta, plan.beta).pick(0)
     distribution = None if rehearsal is None else rehearsal.distribution
     out = check_writable(folder)
-    report_case(Run(context, candidates, (), plan, rehearsal=rehearsal, distribution=distribution, pick=pick), out)
+    report_case(
+        Run(context, context.own(candidates), (), plan, rehearsal=rehearsal, distribution=distribution, pick=pick), out
+    )
     return out / PAGE
 
 

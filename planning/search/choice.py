@@ -98,7 +98,7 @@ def choose(context: CaseContext, candidates: Candidates | None, choice: Choice) 
     """
     if not choice.of_grid:
         return choose_stated(context, choice)
-    candidates = context.search() if candidates is None else candidates
+    candidates = context.own(candidates)
     rows = candidates.ranked
     if not len(rows):
         raise NoAnswerError("no candidate is safe", counts=candidates.counts(), code="no_safe_direction")

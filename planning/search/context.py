@@ -23,7 +23,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Cache, Memory, user_cache
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.progress import LOG, Silent, Stages, Watcher
-from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.provenance import differing_input, inputs_document, read_inputs
 from puncture_twin.planning.base.text import Facts, Shown, brief, first_few
 from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.entry import Directions
@@ -117,6 +117,21 @@ class CaseContext(Shown):
         if self.reach is None:
             refuse("the arm is switched off", self.case.path, "a case that is prepared with its arm", "no_base")
         return self.reach
+
+    def own(self, candidates: Candidates | None) -> Candidates:
+        """The candidates, if they are this case's; None searches.
+
+        Raises:
+            InputError: They are of another case, or of its files before a change: what is safe there says nothing here.
+        """
+        if candidates is None:
+            return self.search()
+        stated = candidates.provenance.get("inputs")
+        name = None if stated is None else differing_input(read_inputs(stated), self.case.inputs)
+        if name is not None:
+            what = f"input '{name}' is not the one that the candidates were searched with"
+            refuse(what, self.case.path, "a search of this case", "input_changed")
+        return candidates
 
     @property
     def pose_error(self) -> PoseError | None:

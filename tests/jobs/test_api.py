@@ -394,3 +394,15 @@ def test_an_engine_of_ones_own_measures_everything(context):
     for wrong in (int, "exact", FastEngine([])):
         with refused("wrong_type" if wrong != "exact" else "unknown_engine"):
             pt.prepare(case, arm=False, engine=wrong)
+
+
+def test_candidates_of_another_case_are_not_planned_nor_shown(context, arm_context, tmp_path):
+    """What is safe there says nothing here: a target 0.4 mm aside is another case."""
+    other = pt.search(pt.prepare(context.case.replace(target_ct=context.case.target_ct + (0.4, 0.0, 0.0)), arm=False))
+    with refused("input_changed"):
+        pt.plan(arm_context, other)
+    with refused("input_changed"):
+        pt.report(context, other, tmp_path / "page")
+    with refused("input_changed"):
+        pt.compare(context, other.best, other.best, candidates=other)
+    assert not (tmp_path / "page").exists()
