@@ -206,9 +206,9 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Explain one candidate in full, the best where none is named; or check a list, a row a row."""
+    from puncture_twin.planning.search.choice import explain_choice
     from puncture_twin.planning.search.explain import NEAREST
     from puncture_twin.twin.jobs.choosing.list_job import check_list, lists_of
-    from puncture_twin.twin.jobs.patient.answers import check_candidate
 
     if lists_of(entries, targets, choice, picture=picture, out_dir=out_dir):
         with progress_display() as progress:
@@ -216,7 +216,7 @@ def check(
         finish("check", listed, listed.summary(), listed.text(), as_json)
         return
     with prepared(case, arm=arm) as context:
-        explained = check_candidate(context, choice)
+        explained = explain_choice(context, choice)
         if picture is not None:
             from puncture_twin.twin.jobs.patient.pictures import write_check_picture
 
@@ -342,7 +342,7 @@ def pivot(
     as_json: JsonOption = False,
 ) -> None:
     """Find the needle's tip on the flange: from touches of one place, or executed in the twin; 1 if they contradict."""
-    from puncture_twin.planning.case.read_case import load_case
+    from puncture_twin.planning.case.case import load_case
     from puncture_twin.twin.jobs.experiment import pivot_job
 
     if joints is not None:
@@ -395,7 +395,7 @@ def mirror(
 ) -> None:
     """Show a running arm's needle in the CT: tip, distance to the target. Writes nothing to the robot."""
     from puncture_twin.planning.base.provenance import inputs_document
-    from puncture_twin.planning.case.read_case import load_case
+    from puncture_twin.planning.case.case import load_case
     from puncture_twin.twin.jobs.robot.mirror import Mirror, mirror_text, readings_of
     from puncture_twin.twin.jobs.terminal import ended_by_ctrl_c
 

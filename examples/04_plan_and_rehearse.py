@@ -17,7 +17,7 @@ def main() -> None:
     case = sys.argv[1] if len(sys.argv) > 1 else folder() / "abdomen"
     context = pt.prepare(case)
     try:
-        plan = pt.make_plan(context, pt.search(context))
+        plan = pt.plan(context)
     except pt.NoAnswerError as error:
         sys.exit(f"no plan: {error}")
     with tempfile.TemporaryDirectory() as scratch:

@@ -36,5 +36,5 @@ DEGREES = Exporter(".degrees.txt", write, read, notes=("the insertion is for the
 
 if __name__ == "__main__":
     context = pt.prepare(sys.argv[1] if len(sys.argv) > 1 else folder() / "abdomen")
-    plan = pt.make_plan(context, pt.search(context))
+    plan = pt.plan(context)
     print(write(plan, case_checked=True))

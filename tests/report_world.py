@@ -17,7 +17,6 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
-from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.slices.subject import Subject
 
@@ -241,7 +240,7 @@ def make_page(path):
     case = make_case()
     candidates, anatomy = make_candidates(case), make_anatomy()
     anatomy.scan = make_scan()
-    plan, subject = make_plan(case, candidates), Subject(case, anatomy, best_pick(candidates), REGION)
+    plan, subject = make_plan(case, candidates), Subject(case, anatomy, candidates.best, REGION)
     regions = np.where(candidates.safe[:, None, None], REGION, np.nan)
     told = (make_rehearsal(plan), make_registration())
     shown = Shown(case, anatomy, candidates, plan, *told, film="rehearsal.mp4", subject=subject, regions_ct=regions)

@@ -10,8 +10,8 @@ from places import ROOT
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import farthest_from_singular
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.errors import error_model
-from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.tables import ErrorsSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space

@@ -176,6 +176,7 @@ MODULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "mirror": ("rtde_receive",),
         "dask": ("distributed",),
         "hdf5": ("h5py",),
+        "pandas": ("pandas",),
     }
 )
 """Extra to the modules that it installs: the simulator, the cameras' pictures, the film; a running robot; and so on."""

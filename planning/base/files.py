@@ -99,15 +99,19 @@ def atomic(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def check_writable(folder: Path) -> Path:
+def check_writable(folder: Path | str) -> Path:
     """Refuse a folder into which nothing can be written, before any work is done; nothing is created.
 
     Raises:
         InputError: The name cannot be used, something else stands there, or it may not be written to.
     """
     allowed = "a folder that may be written to, or the name of a new one"
+    if not isinstance(folder, str | Path):
+        refuse(f"a {type(folder).__name__} is no path", "output folder", allowed, "wrong_type")
+    folder = Path(folder)
     try:
-        str(folder).encode("utf-8")
+        if b"\0" in str(folder).encode("utf-8"):
+            raise ValueError("embedded null byte")
         nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists() or place.is_symlink())
         usable = nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) and _names_fit(nearest, folder)
     except (OSError, ValueError) as error:

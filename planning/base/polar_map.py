@@ -9,12 +9,16 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Sequence
+from dataclasses import dataclass
 from io import BytesIO
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints, Pixels
+from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.base.files import atomic, check_writable
 from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.planning.base.text import escape
 
@@ -55,8 +59,44 @@ class Entry(NamedTuple):
     colour: Rgb
 
 
-def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) -> str:
-    """The map with its legend, as HTML: a picture, and a line for each verdict that occurs; "" without cells.
+@dataclass(frozen=True)
+class PolarMap:
+    """A map with its legend: what a notebook shows, and a file.
+
+    Attributes:
+        png: The picture; no bytes where nothing is mapped.
+        under: Below it, HTML: what is drawn, and a line for each verdict that occurs.
+    """
+
+    png: bytes
+    under: str
+
+    def _repr_html_(self) -> str:
+        """HTML for a notebook; "" where nothing is mapped."""
+        address = b64encode(self.png).decode("ascii")
+        image = f'<img width="{SIZE}" height="{SIZE}" alt="Verdict by direction" src="data:image/png;base64,{address}">'
+        return f"<div>{image}{self.under}</div>" if self.png else ""
+
+    def write(self, path: Path | str) -> Path:
+        """Write the picture, a PNG without the legend, whole or not at all.
+
+        Raises:
+            InputError: Nothing is mapped, or a place that cannot be written to.
+        """
+        if not self.png:
+            refuse("nothing is mapped", "plot_map", "a search with directions", "empty")
+        path = Path(path)
+        check_writable(path.parent)
+        with atomic(path) as draft:
+            draft.write_bytes(self.png)
+        return path
+
+
+NO_MAP = PolarMap(b"", "")
+
+
+def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) -> PolarMap:
+    """The map with its legend; empty without cells.
 
     Args:
         cells: What is mapped.
@@ -65,7 +105,7 @@ def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) 
     """
     rim = float(cells.theta.max(initial=0.0))
     if rim <= 0.0:
-        return ""
+        return NO_MAP
     bins = _painted(cells, rim, max(bin_rad, FINEST))
     lines = "".join(
         f'<div><span style="color:{css(entry.colour)};-webkit-text-stroke:.6px #5a616b">■</span> '
@@ -76,9 +116,7 @@ def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) 
     said = (
         f"θ from 0 in the middle to {np.degrees(rim):g}° at the rim, a circle every {RING_DEG:g}°; β from the right, up"
     )
-    address = b64encode(_png(_drawn(bins, legend, rim))).decode("ascii")
-    image = f'<img width="{SIZE}" height="{SIZE}" alt="Verdict by direction" src="data:image/png;base64,{address}">'
-    return f"<div>{image}<div>{said}</div>{lines}</div>"
+    return PolarMap(_png(_drawn(bins, legend, rim)), f"<div>{said}</div>{lines}")
 
 
 def _drawn(bins: Ints, legend: Sequence[Entry], rim: float) -> Pixels:

@@ -11,7 +11,7 @@ import posixpath
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import absence, is_plain_file, read_input
@@ -91,6 +91,13 @@ class InputFiles:
         self._folder = folder
         self._inputs: dict[tuple[str, str], Input] = {}
         self._held: dict[str, bytes] = {}
+        self._known: dict[str, str] = {}
+
+    def again(self) -> InputFiles:
+        """The same files to be read for another result: those that have changed since are refused."""
+        files = InputFiles(self._folder)
+        files._held, files._known = dict(self._held), {one.path: one.sha256 for one in self.inputs if one.path}
+        return files
 
     @property
     def inputs(self) -> tuple[Input, ...]:
@@ -98,8 +105,14 @@ class InputFiles:
         return tuple(self._inputs.values())
 
     def add(self, role: str, name: str, content: bytes) -> bytes:
-        """List bytes that were read already, and keep them."""
-        self._inputs[role, name] = content_input(role, name, content)
+        """List bytes that were read already, and keep them.
+
+        Raises:
+            InputError: They are not those that were read `again`.
+        """
+        one = self._inputs[role, name] = content_input(role, name, content)
+        if self._known.get(name, one.sha256) != one.sha256:
+            self._refuse_changed(name)
         self._held[name] = content
         return content
 
@@ -126,6 +139,10 @@ class InputFiles:
             content = read_input(self._existing(name, key, where), max_bytes=max_bytes, where=str(self._folder / name))
         return self.add(role, name, content)
 
+    def held(self, name: str) -> bytes | None:
+        """The bytes of a file that are still in memory."""
+        return self._held.get(name)
+
     def content(self, name: str) -> bytes:
         """The bytes of a file that was read; one that was let go of is read again and must be the same.
 
@@ -137,8 +154,11 @@ class InputFiles:
         known = self.sha256(name)
         content = read_input(self._folder / name, max_bytes=1 << 40, where=str(self._folder / name))
         if content_input("", name, content).sha256 != known:
-            refuse("has changed since it was read", self._folder / name, "start again", "input_changed")
+            self._refuse_changed(name)
         return content
+
+    def _refuse_changed(self, name: str) -> NoReturn:
+        refuse("has changed since it was read", self._folder / name, "start again", "input_changed")
 
     def sha256(self, name: str) -> str:
         """The hash of a file that was read."""

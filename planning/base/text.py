@@ -143,14 +143,51 @@ def card(title: str, facts: Facts, picture: str = "") -> str:
     return f'<div style="{STYLE}"><div style="flex:1 1 320px">{head}{table}</div>{picture}</div>'
 
 
-def never_raises(make: Callable[[Value], str]) -> Callable[[Value], str]:
-    """Decorator for a notebook's hooks: where a value cannot be shown, its class and the error are."""
+class Shown:
+    """A value that shows itself in a notebook: by its fields, or by what a class says in place of them."""
 
-    @functools.wraps(make)
-    def shown(value: Value) -> str:
+    def _title(self) -> str:
+        return type(self).__name__
+
+    def _facts(self) -> Facts:
+        for name, value in (self.summary() if hasattr(self, "summary") else vars(self)).items():
+            if (text := _plain(value)) is not None:
+                end, unit = next((one for one in UNITS if name.endswith(one[0])), ("", ""))
+                yield name.removesuffix(end).replace("_", " "), f"{text} {unit}".strip()
+
+    def _picture(self) -> str:
+        return ""
+
+    @brief
+    def __repr__(self) -> str:
+        return ", ".join(f"{name} {value}" for name, value in self._facts() if len(value) <= SHORT)
+
+    def _repr_html_(self) -> str:
+        """HTML for a notebook."""
         try:
-            return make(value)
+            return card(self._title(), self._facts(), self._picture())
         except Exception as error:  # a notebook must not lose the value to its picture
-            return f"<pre>{escape(object.__repr__(value))}\n{escape(type(error).__name__)}</pre>"
+            return f"<pre>{escape(object.__repr__(self))}\n{escape(type(error).__name__)}</pre>"
 
-    return shown
+
+SHORT = 40
+"""Characters of a fact that stands in the one line."""
+
+UNITS = (("_mm", "mm"), ("_cm2", "cm²"), ("_deg", "°"), ("_s", "s"), ("_n", "N"))
+"""Endings of names, and the unit that they say."""
+
+
+def _plain(value: object) -> str | None:
+    """A value for a table of facts; None for what is no number, text or list of them."""
+    if isinstance(value, bool | None):
+        return {True: "yes", False: "no", None: "–"}[value]
+    if isinstance(value, int | str):
+        return str(value)
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        texts = [_plain(one) for one in value]
+        return None if None in texts else first_few([str(one) for one in texts]) or "none"
+    if (shape := getattr(value, "shape", None)) is not None:
+        return f"an array of shape {shape}"
+    return str(value) if isinstance(value, Path) else None

@@ -24,7 +24,6 @@ from puncture_twin.planning.base.strict_json import or_null
 from puncture_twin.planning.batch.plan import TABLE_NAME, PlannedCase, read_row
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.windows import find_windows
 
 CASES_NAME, DATASET_NAME = "cases.parquet", "candidates"
 
@@ -143,7 +142,7 @@ def searched_row(planned: PlannedCase, context: CaseContext, candidates: Candida
     safe = int(candidates.safe.sum())
     row = blank_row(planned, 0 if safe else 1, None if safe else no_safe_reason(candidates))
     row |= {"directions": len(candidates), "safe": safe, "arm": context.arm, "reach_fraction": _reach(candidates)}
-    windows = find_windows(candidates).windows
+    windows = candidates.windows
     row |= {"windows": len(windows), "safe_square_deg": sum(one.square_deg for one in windows)}
     row |= {"safe_entry_cm2": sum(one.entry_cm2 for one in windows)}
     return row | _best(candidates) if safe else row

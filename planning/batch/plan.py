@@ -38,8 +38,8 @@ from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_inp
 from puncture_twin.planning.base.strict_json import read_json
 from puncture_twin.planning.base.toml_file import find_toml, read_toml_bytes
 from puncture_twin.planning.batch.cohort import CohortCase
+from puncture_twin.planning.case.case import ALLOWED_CASE, load_case
 from puncture_twin.planning.case.options import case_options
-from puncture_twin.planning.case.read_case import ALLOWED_CASE, load_case
 
 PLAN_NAME = "plan.parquet"
 MAX_PLAN_BYTES = 2_000_000_000

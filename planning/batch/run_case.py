@@ -7,13 +7,13 @@ import multiprocessing
 import os
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory
+from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import InputError, one_line
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.progress import Stages
@@ -32,6 +32,7 @@ from puncture_twin.planning.batch.plan import (
     relative_text,
     write_row,
 )
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.options import case_options
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext, prepare
@@ -122,7 +123,7 @@ def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
     planned, stages = task.planned, Stages()
     try:
         options = case_options(json.loads(planned.options), where=planned.case)
-        context = prepare(planned.path, arm=planned.arm, options=options, memory=memory)
+        context = prepare(load_case(planned.path, options), arm=planned.arm, memory=memory)
         stages = context.stages
         inputs = context.case.inputs
         if case_id(planned.options, planned.arm, inputs, "") != planned.id:
@@ -140,7 +141,7 @@ def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
 
 def _searched(task: CaseTask, context: CaseContext, draft: Path) -> dict[str, Any]:
     candidates = context.search()
-    write_table(candidates, context.provenance(), draft / TABLE_NAME)
+    write_table(candidates, draft / TABLE_NAME)
     row = searched_row(task.planned, context, candidates)
     if task.write_page is not None:
         task.write_page(context, candidates, draft)
@@ -165,6 +166,14 @@ def _committed(
     timings = {"seconds": {name: round(spent, 3) for name, spent in seconds.items()}, "attempt": task.attempt}
     commit(draft, task.out, task.planned.id, inputs, timings)
     return CaseEnd(task.planned.id, row["exit_code"], row["reason"])
+
+
+def run_here(tasks: Sequence[CaseTask], limits: object) -> Generator[CaseEnd, None, None]:
+    """Run cases in this process, which no limit holds for; yields how each ended."""
+    del limits
+    memory = Memory(MEMORY_BYTES)
+    for task in tasks:
+        yield run_case(task, memory)
 
 
 def work(connection: Connection, memory_bytes: int) -> None:

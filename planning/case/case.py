@@ -1,4 +1,4 @@
-"""A case: a validated case file, in LPS (or local) mm and radians, with the hash of every input.
+"""A case: a case file and all that it names, read once and validated; in LPS (or local) mm and radians.
 
 The bed frame: which way is up and which way lies the bed, as a case states it or as a patient usually lies.
 
@@ -7,20 +7,28 @@ How a case shows itself in a notebook.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.provenance import Input, InputFiles
-from puncture_twin.planning.base.text import Facts, brief, card, never_raises
+from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
+from puncture_twin.planning.base.text import Facts, Shown, brief, did_you_mean
+from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, grid
-from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.case.named_files import MASK_ROLE, CaseVolumes
+from puncture_twin.planning.case.case_file import CaseFile
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, entry_frame, grid
+from puncture_twin.planning.case.errors import ErrorModel, errors_of
+from puncture_twin.planning.case.named_files import MASK_ROLE, CaseVolumes, read_named_files, robot_warnings
+from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
+from puncture_twin.planning.case.sections import bending_of, breathing_of, robot_of
 from puncture_twin.planning.case.settings import (
     Axis,
     CtSettings,
@@ -30,6 +38,10 @@ from puncture_twin.planning.case.settings import (
     RobotSettings,
     SearchSettings,
     axes_frame,
+    ct_of,
+    gantry_of,
+    obstacle_of,
+    search_of,
 )
 from puncture_twin.planning.case.tables import (
     MarkerSection,
@@ -38,15 +50,20 @@ from puncture_twin.planning.case.tables import (
     RehearsalSection,
     StructureSection,
     StructuresSection,
+    tool_of,
 )
+from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.labels.label_sources import structure_name
+from puncture_twin.planning.formats.points import parse_points
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.needle.deflection import Bending
 
+ALLOWED_CASE = "a TOML case file with schema = 2, or a folder with case.toml"
+
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class Case(Shown):
     """What a search, a plan and a rehearsal start from. A `Case` has been validated.
 
     Attributes:
@@ -65,6 +82,7 @@ class Case:
         own_target: Whether the target lies in no structure: its own is then the ball of the hit radius about it, which
             has its name.
         tool: What the flange carries beside needle and holder, or None.
+        options: What is stated in place of what the case file states.
     """
 
     path: Path
@@ -98,26 +116,41 @@ class Case:
     bending: Bending | None = None
     own_target: bool = False
     tool: ToolBody | None = None
+    options: CaseOptions = NO_OPTIONS
 
     @brief
     def __repr__(self) -> str:
         return f"{self.name}, {self.path}: target {self.target_name} in {self.target_structure}"
 
-    def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        return case_html(self)
+    def _title(self) -> str:
+        return f"Case {self.name}"
 
-    def aimed_at(self, target_ct: Floats) -> Case:
-        """This case with another target in the same structure, shape (3,), mm; the entry frame moves with it."""
-        target = read_only(target_ct)
-        return replace(self, target_ct=target, T_ct_entry=view_frame(self.T_ct_entry[:3, :3], target))
+    def _facts(self) -> Facts:
+        return _facts(self)
+
+    def replace(self, *, target_ct: ArrayLike | None = None, **options: Mapping[str, Any]) -> Case:
+        """What the case would be if its file had these values; the file stays as it is.
+
+        Args:
+            target_ct: Another target in the same structure, shape (3,), mm, LPS (or the case's local frame).
+            options: Tables of keys and values as in the file, in mm, degrees and the case's space: ``target``,
+                ``mount`` (in place of any registration), ``needle``, ``arm``, ``search``, ``errors``, ``margins``.
+
+        Raises:
+            InputError: A kind of option, a key or a value that the file could not have, or a file that has changed.
+        """
+        if target_ct is not None:
+            point = guard_points([target_ct], (self.target_name,), where="replace: target_ct")
+            options = {**options, "target": {"position_mm": to_lps(point, self.space)[0]}}
+        stated = self.options.with_(case_options(options, where="replace"))
+        return _read(self.path, self.files.again(), stated)
 
     def directions(self) -> Directions:
         """The grid of the case."""
         return grid(self.search.theta, self.search.beta, self.search.step, self.T_ct_entry[:3, :3])
 
-    def direction(self, theta: float, beta: float) -> Directions:
-        """A single direction (rad) of the case's entry frame."""
+    def direction(self, theta: Floats | float, beta: Floats | float) -> Directions:
+        """A single direction of the case's entry frame, or several, shape (n,), rad."""
         return direction(theta, beta, self.T_ct_entry[:3, :3])
 
     @property
@@ -147,6 +180,99 @@ class Case:
 def view_frame(R_ct_entry: Floats, target_ct: Floats) -> Floats:
     """T_ct_entry: the entry frame with its origin on the target, shape (4, 4), read-only."""
     return read_only(pose(R_ct_entry, target_ct))
+
+
+def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
+    """Read and validate a case file, or a folder that holds ``case.toml``.
+
+    Args:
+        path: The file or the folder.
+        options: What is stated in place of what the file states; they are an input of their own.
+
+    Raises:
+        InputError: Anything unreadable, unknown, missing or contradictory; names the key.
+    """
+    path = find_toml(path, "case.toml")
+    return _read(path, InputFiles(path.parent), options)
+
+
+def _read(path: Path, files: InputFiles, options: CaseOptions) -> Case:
+    case_volumes = CaseVolumes(files, path)
+    stated = files.add(CASE_ROLE, path.name, files.held(path.name) or read_toml_bytes(path, ALLOWED_CASE))
+    if options.sections:
+        files.state(OPTIONS_ROLE, options.text.encode())
+    change = partial(options.applied, where=path)
+    content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md", change=change)
+    whole = read_named_files(content, path, files, case_volumes)
+    return replace(case_of(content, path, files, case_volumes, whole), options=options)
+
+
+def case_of(
+    content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes, warnings: tuple[str, ...]
+) -> Case:
+    """Make a case of its file and the files that it names, in LPS (or local) mm and radians."""
+    space = Space(content.space)
+    target = _target_of(content, path, space, files)
+    robot = robot_of(content, space, path, files)
+    tool = tool_of(content.tool, files, path)
+    settings, placed = content.search, content.registration
+    return Case(
+        path=path,
+        name=content.name,
+        space=space,
+        target_ct=target,
+        target_name=content.target.name,
+        target_structure=content.target.structure or content.target.name,
+        own_target=content.target.structure is None,
+        needle=Needle(**content.needle.model_dump(include={*Needle.__dataclass_fields__})),
+        search=search_of(settings),
+        obstacles=tuple(obstacle_of(one, space) for one in content.obstacle),
+        ranking=content.ranking,
+        T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
+        structure=content.structure,
+        structures=content.structures,
+        registration=None if placed is None or placed.transform else MarkerSection(**placed.model_dump()),
+        robot=robot,
+        tool=tool,
+        rehearsal=content.rehearsal,
+        files=files,
+        volumes=case_volumes,
+        ct=ct_of(content.ct, trust_labels=settings.trust_labels),
+        gantry=None if content.gantry is None else gantry_of(content.gantry, space, path),
+        place=content.place,
+        stated_structures=content.stated_structures,
+        region=content.region,
+        warnings=(*warnings, *robot_warnings(content, robot)),
+        hit_radius_mm=content.target.hit_radius_mm,
+        errors=errors_of(content, content.errors, case_volumes, path),
+        truth_errors=errors_of(content, content.rehearsal.errors, case_volumes, path, truth=True),
+        breathing=breathing_of(content.breathing, space, path),
+        bending=bending_of(content.needle, content.tissue, path),
+    )
+
+
+def _target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:
+    """The point to reach, shape (3,), LPS (or the case's local frame) mm, read-only.
+
+    Args:
+        content: The case file.
+        path: Where it is, for errors.
+        space: The case's.
+        files: What it names, read.
+
+    Raises:
+        InputError: A list of points that cannot be read, or that lacks the target's name.
+    """
+    target = content.target
+    if target.position_mm is not None:
+        return read_only(to_lps(np.asarray([target.position_mm]), space)[0])
+    assert target.points is not None  # held by the schema
+    listed = parse_points(files.content(target.points), path.parent / target.points, default_space=space)
+    if target.name not in listed.names:
+        names = ", ".join(listed.names)
+        what = f"target.name '{target.name}' is not in {target.points}{did_you_mean(target.name, listed.names)}"
+        refuse(what, path, names, "unknown_point")
+    return read_only(listed.points[listed.names.index(target.name)].copy())
 
 
 Vector = tuple[float, float, float]
@@ -195,13 +321,8 @@ def _stated(axis: Axis | None, space: Space, otherwise: Floats) -> Vector:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-@never_raises
-def case_html(case: Any) -> str:
-    """A table of facts: target, needle, structures, grid, robot, and what the case leaves open."""
-    return card(f"Case {case.name}", _facts(case))
-
-
-def _facts(case: Any) -> Facts:
+def _facts(case: Case) -> Facts:
+    """Target, needle, structures, grid, robot, and what the case leaves open."""
     x, y, z = case.target_ct
     axes = "the local frame" if str(case.space) == "local" else "LPS"
     yield "target", f"{case.target_name} in {case.target_structure}: ({x:.1f}, {y:.1f}, {z:.1f}) mm in {axes}"
@@ -222,7 +343,7 @@ def _facts(case: Any) -> Facts:
         yield "warning", warning
 
 
-def _base(case: Any) -> str:
+def _base(case: Case) -> str:
     if case.registration is not None:
         return f"by registration of markers ({case.registration.method})"
     if case.robot.transform is not None:

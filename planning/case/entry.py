@@ -131,9 +131,10 @@ def needle_pose(target_ct: Floats, outward_ct: Floats, *, standoff: Floats | flo
     return NeedlePose(target_ct + r * outward_ct, target_ct + (r + length) * outward_ct)
 
 
-def direction(theta: float, beta: float, R_ct_entry: Floats) -> Directions:
-    """One direction."""
-    return _directions(np.array([theta], dtype=float), np.array([beta], dtype=float), R_ct_entry)
+def direction(theta: Floats | float, beta: Floats | float, R_ct_entry: Floats) -> Directions:
+    """One direction, or several, shape (n,), rad."""
+    one, other = (np.array(angles, dtype=float, ndmin=1) for angles in (theta, beta))
+    return _directions(one, other, R_ct_entry)
 
 
 def grid(

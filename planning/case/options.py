@@ -15,6 +15,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from puncture_twin.planning.base.errors import InputError, refuse
 
 OPTIONS_ROLE = "options"
@@ -53,7 +55,10 @@ class CaseOptions:
     def text(self) -> str:
         """The options as JSON: the same options give the same text."""
         return json.dumps(
-            {kind: dict(values) for kind, values in self.sections.items()}, sort_keys=True, allow_nan=False
+            {kind: dict(values) for kind, values in self.sections.items()},
+            sort_keys=True,
+            allow_nan=False,
+            default=_plain,
         )
 
     def applied(self, data: dict[str, Any], *, where: Path | str) -> dict[str, Any]:
@@ -76,6 +81,26 @@ class CaseOptions:
             else:
                 _overlay(_table(changed, TABLES[kind]), values)
         return changed
+
+    def with_(self, other: CaseOptions) -> CaseOptions:
+        """These options with others over them: a mount takes the place of a mount, in all else a key that of a key."""
+        sections = {kind: dict(values) for kind, values in self.sections.items()}
+        for kind, values in other.sections.items():
+            if kind == MOUNT:
+                sections[kind] = {}
+            _overlay(sections.setdefault(kind, {}), values)
+        return CaseOptions(sections)
+
+
+def _plain(value: object) -> Any:
+    """An array of NumPy as lists.
+
+    Raises:
+        TypeError: Anything else.
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is no value of a case file")
 
 
 NO_OPTIONS = CaseOptions()

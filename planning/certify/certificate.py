@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
+from puncture_twin.planning.base.polar_map import Entry, PolarMap, Sectors, polar_map
 from puncture_twin.planning.base.provenance import inputs_document, read_inputs
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason, Rgb
 from puncture_twin.planning.base.strict_json import (
@@ -30,7 +30,7 @@ from puncture_twin.planning.base.strict_json import (
     texts,
     whole,
 )
-from puncture_twin.planning.base.text import Facts, brief, card, never_raises
+from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
@@ -80,7 +80,7 @@ PROVED_SAFE, REJECTED, UNDECIDED = "SRU"
 
 
 @dataclass(frozen=True, eq=False)
-class Certificate:
+class Certificate(Shown):
     """A certified map: directions proven safe, proven rejected, and cells too small to decide.
 
     Attributes:
@@ -116,9 +116,14 @@ class Certificate:
         areas = ", ".join(f"{self.areas[letter]:.1f} square degrees {word}" for letter, word in words.items())
         return f"case {self.question.case_name}, {len(self.verdict):,} cells to {np.degrees(self.size):g} deg: {areas}"
 
-    def _repr_html_(self) -> str:
-        """HTML for a notebook."""
-        return certificate_html(self)
+    def _title(self) -> str:
+        return f"Certificate of {self.question.case_name}"
+
+    def _facts(self) -> Facts:
+        return _facts(self)
+
+    def _picture(self) -> str:
+        return _map(self)._repr_html_()
 
     @cached_property
     def areas(self) -> dict[str, float]:
@@ -334,14 +339,7 @@ UNDECIDED_COLOUR: Rgb = (255, 255, 255)
 """Colour of cells that are too small to decide: neither a safe colour nor a reason's."""
 
 
-@never_raises
-def certificate_html(certificate: Any) -> str:
-    """A table of facts, and the map of the cells: proven safe for the organs, rejected, undecided."""
-    title = f"Certificate of {certificate.question.case_name}"
-    return card(title, _facts(certificate), _map(certificate))
-
-
-def _facts(certificate: Any) -> Facts:
+def _facts(certificate: Certificate) -> Facts:
     summary = certificate.summary()
     for word in ("safe", "rejected", "undecided"):
         text = "proven safe for the organs" if word == "safe" else word
@@ -351,7 +349,8 @@ def _facts(certificate: Any) -> Facts:
     yield "says nothing about", "; ".join(summary["not_certified"])
 
 
-def _map(certificate: Any) -> str:
+def _map(certificate: Certificate) -> PolarMap:
+    """Map of the cells: proven safe for the organs, rejected, undecided."""
     reasons = list(REASON_COLOURS)
     legend = [
         Entry("proven safe for the organs", SAFE),

@@ -17,6 +17,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.provenance import differing_input
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.certify.plain_skin import PlainSkin, SkinFacts
@@ -41,8 +42,8 @@ SKIN_BELOW = np.radians(25)
 """The skin is looked at for cones of at most this half-angle: over a wider one nothing is proven."""
 
 
-@dataclass(frozen=True)
-class Verification:
+@dataclass(frozen=True, repr=False)
+class Verification(Shown):
     """How many cells of each verdict were proven; an undecided cell claims only its size."""
 
     safe: int

@@ -38,7 +38,7 @@ from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, reason_text
-from puncture_twin.planning.search.windows import Windows, find_windows, nearest_row
+from puncture_twin.planning.search.windows import Windows, nearest_row
 
 DIGIT = 0.1
 """Fraction of a tolerance: a rewritten number keeps the rest of it."""
@@ -123,7 +123,7 @@ def window_finding(window: WindowSection, direction: Candidates, search: Candida
         direction: The direction alone, checked.
         search: The search of the case's grid.
     """
-    windows = find_windows(search)
+    windows = search.windows
     differences = tuple(_differences(window, direction, search, windows))
     return Finding(differences, tuple(_listed(search, windows))) if differences else Finding()
 

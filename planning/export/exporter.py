@@ -22,6 +22,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.export.program import SampledMotion, check_sampled, heading, program_of, waypoint_rows
 from puncture_twin.planning.export.program_check import check_program
@@ -153,8 +154,8 @@ def read_csv(text: str, *, where: Path) -> SampledMotion:
     return SampledMotion(*(Trajectory(table[:, 0], table[:, 1:]) for table in tables))
 
 
-@dataclass(frozen=True, eq=False)
-class Exported:
+@dataclass(frozen=True, eq=False, repr=False)
+class Exported(Shown):
     """A published file.
 
     Attributes:

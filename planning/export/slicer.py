@@ -26,7 +26,6 @@ from puncture_twin.planning.geometry.rigid import inverse
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.windows import find_windows
 
 Kind = Literal["MarkupsLine", "MarkupsFiducial", "Model", "LinearTransform"]
 _STORAGE = {
@@ -256,7 +255,7 @@ class EntryArea:
 
 def entry_area(candidates: Candidates) -> EntryArea:
     """The area of a search; without triangles where no four neighbouring directions are safe."""
-    windows = find_windows(candidates).of_row
+    windows = candidates.windows.of_row
     faces = np.zeros((0, 3), np.int64) if candidates.grid is None else _faces(candidates, candidates.grid, windows)
     rows, corners = np.unique(faces, return_inverse=True)
     cones = np.nan_to_num(np.degrees(candidates.safe_cone[rows]))

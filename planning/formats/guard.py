@@ -18,6 +18,9 @@ from puncture_twin.planning.base.arrays import is_frozen
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import check_name
 
+Many = ArrayLike | Sequence[ArrayLike]
+"""An array, or a list of them."""
+
 MAX_COORDINATE_MM = 100_000.0
 """Farthest from the origin: no workcell is 100 m wide; beyond, a sentinel value or a broken float is likely."""
 ROTATION_TOLERANCE = 1e-5
@@ -57,7 +60,7 @@ def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
     return matrix
 
 
-def guard_points(points: ArrayLike, names: Sequence[str], *, where: str | Path) -> NDArray[np.float64]:
+def guard_points(points: Many, names: Sequence[str], *, where: str | Path) -> NDArray[np.float64]:
     """Named points that passed the guard: finite, near the origin, each name once.
 
     Args:
@@ -90,7 +93,7 @@ def guard_points(points: ArrayLike, names: Sequence[str], *, where: str | Path) 
     return array
 
 
-def _float_array(values: ArrayLike, *, what: str, where: str | Path, allowed: str) -> NDArray[np.float64]:
+def _float_array(values: Many, *, what: str, where: str | Path, allowed: str) -> NDArray[np.float64]:
     try:
         raw = np.asarray(values)
     except ValueError as error:  # what numpy raises for rows of different length
@@ -100,7 +103,7 @@ def _float_array(values: ArrayLike, *, what: str, where: str | Path, allowed: st
     return raw if is_frozen(raw, np.float64) else np.array(raw, dtype=np.float64, order="C")
 
 
-def points_array(points: ArrayLike, names: Sequence[str], *, what: str, where: str | Path) -> NDArray[np.float64]:
+def points_array(points: Many, names: Sequence[str], *, what: str, where: str | Path) -> NDArray[np.float64]:
     """Points (n, 3), one or more, all finite; what each is, and its name, are in the error."""
     allowed = f"three finite numbers per {what}, at least one {what}"
     array = _float_array(points, what=f"{what} list", where=where, allowed=allowed)

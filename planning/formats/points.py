@@ -29,13 +29,13 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic, decode_text, read_input
 from puncture_twin.planning.base.strict_json import parse_json
-from puncture_twin.planning.base.text import brief
+from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit, to_lps
 
 
 @dataclass(frozen=True, eq=False)
-class NamedPoints:
+class NamedPoints(Shown):
     """Points with names, as guarded: finite, at least one, every name once.
 
     Attributes:
@@ -51,6 +51,11 @@ class NamedPoints:
     space: Space | None
     kinds: tuple[str, ...] | None = None
     joints: NDArray[np.float64] | None = None
+
+    def _facts(self) -> Facts:
+        yield "space", str(self.space or "not stated")
+        for name, (x, y, z) in zip(self.names, self.points, strict=True):
+            yield name, f"({x:.2f}, {y:.2f}, {z:.2f}) mm"
 
     @brief
     def __repr__(self) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, is_frozen
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.base.text import brief
+from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.geometry.rigid import apply
 
 Faces = NDArray[np.int32]
@@ -34,7 +34,7 @@ MOST_IN_ONE = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class TriangleMesh:
+class TriangleMesh(Shown):
     """Vertices and triangles of one surface. Any instance may be trusted: the guard has passed it.
 
     Attributes:

@@ -26,6 +26,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.processes import working
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.case.case import Case, bed_frame
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import MountSection
@@ -114,8 +115,8 @@ class RatedPlacement:
         return "as in the case" if self.site is None else self.site.region.name
 
 
-@dataclass(frozen=True, eq=False)
-class PlaceSearch:
+@dataclass(frozen=True, eq=False, repr=False)
+class PlaceSearch(Shown):
     """Result of a search for placements.
 
     Attributes:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.base.text import Facts, brief, card, never_raises
+from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, least_clearance
@@ -26,7 +25,7 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(Shown):
     """One puncture, ready to be rehearsed: mm, rad, s.
 
     Attributes:
@@ -73,16 +72,28 @@ class Plan:
     warnings: tuple[str, ...]
     speeds: SpeedLimits = DEFAULT_SPEEDS
 
+    @property
+    def theta_deg(self) -> float:
+        """Puncture angle, degrees."""
+        return float(np.degrees(self.theta))
+
+    @property
+    def beta_deg(self) -> float:
+        """Azimuth, degrees."""
+        return float(np.degrees(self.beta))
+
     @brief
     def __repr__(self) -> str:
         return (
-            f"case {self.case_name}, theta {np.degrees(self.theta):g} deg, beta {np.degrees(self.beta):g} deg, "
+            f"case {self.case_name}, theta {self.theta_deg:g} deg, beta {self.beta_deg:g} deg, "
             f"{self.model.name}, approach {self.approach.duration_s:.1f} s, insertion {self.insertion.duration_s:.1f} s"
         )
 
-    def _repr_html_(self) -> str:
-        """What a notebook shows."""
-        return plan_html(self)
+    def _title(self) -> str:
+        return f"Plan of {self.case_name}"
+
+    def _facts(self) -> Facts:
+        return _facts(self)
 
 
 CLEARANCE_TEXT = MappingProxyType(
@@ -95,14 +106,9 @@ CLEARANCE_TEXT = MappingProxyType(
 """What each of a plan's clearances is of."""
 
 
-@never_raises
-def plan_html(plan: Any) -> str:
-    """A table of facts: direction, entry and target, motion, and the least distances that were found."""
-    return card(f"Plan of {plan.case_name}", _facts(plan))
-
-
-def _facts(plan: Any) -> Facts:
-    yield "direction", f"θ {np.degrees(plan.theta):g}°, β {np.degrees(plan.beta):g}°"
+def _facts(plan: Plan) -> Facts:
+    """Direction, entry and target, motion, and the least distances that were found."""
+    yield "direction", f"θ {plan.theta_deg:g}°, β {plan.beta_deg:g}°"
     yield "skin entry, CT (LPS or local)", _point(plan.entry_ct)
     yield "target, CT", _point(plan.target_ct)
     yield "depth, skin to target", f"{np.linalg.norm(plan.entry_ct - plan.target_ct):.1f} mm"
@@ -122,7 +128,7 @@ def _facts(plan: Any) -> Facts:
     yield "warnings", "; ".join(plan.warnings) or "none"
 
 
-def _point(point: Any) -> str:
+def _point(point: Floats) -> str:
     return "({:.1f}, {:.1f}, {:.1f}) mm".format(*point)
 
 

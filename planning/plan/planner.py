@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import slowed
-from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.motion.approach import plan_approach
@@ -23,8 +23,9 @@ from puncture_twin.planning.reach.reach import approach_goals
 from puncture_twin.planning.reach.survey import ReachAnswer
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.choice import BEST, Choice, choose
 from puncture_twin.planning.search.constraints import reach_request
-from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chance_model import satisfies_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
@@ -41,23 +42,26 @@ class Planned(NamedTuple):
     row: int
 
 
-def make_plan(context: CaseContext, candidates: Candidates, *, seed: int, rows: Ints | None = None) -> Planned:
-    """Plan to the best candidate for which an approach is found.
+def make_plan(
+    context: CaseContext, candidates: Candidates | None, choice: Choice = BEST, *, seed: int | None = None
+) -> Planned:
+    """Plan to the best candidate of a choice for which an approach is found.
 
     Args:
-        context: The case.
-        candidates: Its search result, with reach.
-        seed: Of the approach's planner.
-        rows: Candidates to plan to, the preferred first; None takes all in the order of their ranks.
+        context: The case, with the arm.
+        candidates: Its search result, which a choice by angles or by entry does not need; None searches.
+        choice: What is planned.
+        seed: Of the approach's planner; None takes the case's.
 
     Raises:
-        InputError: The case does not say where the arm's base is.
-        NoAnswerError: No candidate is safe, or none of the best can be approached.
+        InputError: The case does not say where the arm's base is, or there is nothing of what was chosen.
+        NoAnswerError: No candidate is safe, what was chosen is rejected, or none of the best can be approached.
     """
-    if context.reach is None:
-        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
+    context.require_arm()
+    seed = context.case.rehearsal.seed if seed is None else seed
+    candidates, rows = choose(context, candidates, choice)
     last = "no candidate is safe"
-    for row in (candidates.ranked if rows is None else rows)[:MAX_TRIES]:
+    for row in rows[:MAX_TRIES]:
         try:
             plan = _plan(context, candidates, int(row), seed)
         except NoAnswerError as error:

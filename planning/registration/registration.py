@@ -18,7 +18,7 @@ from puncture_twin.planning.arm.kinematics import away_from_singularities, error
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
-from puncture_twin.planning.base.text import brief
+from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.geometry.rigid import apply
@@ -64,7 +64,7 @@ ALLOWED_RESIDUALS = "names and readings checked, the true errors declared, or re
 
 
 @dataclass(frozen=True, eq=False)
-class Registration:
+class Registration(Shown):
     """T_base_ct from markers, and what is known of its error.
 
     Attributes:
@@ -89,6 +89,15 @@ class Registration:
     target_ct: Floats
     uncertainty: FitUncertainty | None = None
     aim: Aim | None = None
+
+    def _facts(self) -> Facts:
+        yield "method", self.method
+        yield "FRE, FLE", f"{self.fre_mm:.2f} mm, {self.fle_mm:.2f} mm: {self.fle_source}"
+        for name, residual in zip(self.markers.names, self.residual_mm, strict=True):
+            yield f"residual of {name}", f"{residual:.2f} mm"
+        yield "expected at the target", f"{self.expected_tre_mm(self.target_ct[None])[0]:.2f} mm rms"
+        for flag in self.flags:
+            yield "weak", flag.sentence
 
     @brief
     def __repr__(self) -> str:

@@ -18,7 +18,6 @@ from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.reach.standoff import case_axis_lengths
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 from puncture_twin.planning.search.ranking import ranked
-from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.uncertainty.chance_model import (
     ChanceModel,
     Chances,
@@ -157,7 +156,7 @@ def with_best_refined(candidates: Candidates, model: ChanceModel | None) -> Cand
 def _shown(candidates: Candidates) -> Ints:
     """Rows of the candidates that are shown to people and whose chances are still of first order."""
     assert candidates.chances is not None
-    best = [window.best for window in find_windows(candidates).windows]
+    best = [window.best for window in candidates.windows]
     shown = np.unique(np.append(candidates.ranked[:BEST], best)).astype(np.int64)
     return shown[~candidates.chances.refined[shown] & np.isfinite(candidates.chances.hit[shown])]
 

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import pathlib
 from collections import Counter
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Columns, Floats, Ints, Ints32, Texts
-from puncture_twin.planning.base.errors import Finding
-from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
+from puncture_twin.planning.base.errors import Finding, refuse, require_extra
+from puncture_twin.planning.base.files import check_writable
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.polar_map import NO_MAP, Entry, PolarMap, Sectors, polar_map
+from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
-from puncture_twin.planning.base.text import Facts, brief, card, never_raises
+from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.case.entry import AngleGrid
+from puncture_twin.planning.search.windows import Windows, find_windows
 from puncture_twin.planning.uncertainty.chance_model import Chances
 
 ARM_CHECKED = "checked"
@@ -160,7 +167,7 @@ class BreathingColumns(Columns):
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates(Columns):
+class Candidates(Columns, Shown):
     """Every direction of the grid: n rows in groups of columns; mm, radians, points in the CT frame.
 
     Attributes:
@@ -182,6 +189,7 @@ class Candidates(Columns):
         grid: The regular grid that the rows are; None for any others.
         cone_source: `CONE_OF_GRID` or `CONE_CERTIFIED`; "" where there are no safe cones.
         findings: What else would be safe (`planning.search.context`).
+        provenance: Case, input hashes, version, seed and step, as plain values; empty of what no case has searched.
     """
 
     theta: Floats
@@ -200,6 +208,7 @@ class Candidates(Columns):
     grid: AngleGrid | None = None
     cone_source: str = ""
     findings: tuple[Finding, ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -212,9 +221,24 @@ class Candidates(Columns):
     def _direction(self, row: int) -> str:
         return f"theta {np.degrees(self.theta[row]):g} deg, beta {np.degrees(self.beta[row]):g} deg"
 
-    def _repr_html_(self) -> str:
-        """HTML for a notebook."""
-        return candidates_html(self)
+    def _title(self) -> str:
+        return f"{len(self):,} candidates, {int(self.safe.sum()):,} {self.safe_text}"
+
+    def _facts(self) -> Facts:
+        return _facts(self)
+
+    def _picture(self) -> str:
+        return self.plot_map()._repr_html_()
+
+    @property
+    def theta_deg(self) -> Floats:
+        """Puncture angle, shape (n,), degrees."""
+        return np.asarray(np.round(np.degrees(self.theta), ANGLE_DIGITS))
+
+    @property
+    def beta_deg(self) -> Floats:
+        """Azimuth, shape (n,), degrees."""
+        return np.asarray(np.round(np.degrees(self.beta), ANGLE_DIGITS))
 
     @property
     def safe(self) -> Bools:
@@ -251,6 +275,55 @@ class Candidates(Columns):
         rows = np.flatnonzero(self.ranking.rank > 0)
         return rows[np.argsort(self.ranking.rank[rows], kind="stable")]
 
+    @property
+    def best(self) -> Pick | None:
+        """The best candidate; None where nothing is safe."""
+        ranked = self.ranked
+        return Pick(self, int(ranked[0])) if len(ranked) else None
+
+    @cached_property
+    def windows(self) -> Windows:
+        """The connected sets of safe directions, that of the best candidate first."""
+        return find_windows(self)
+
+    def to_pandas(self) -> Any:
+        """The table that `write` writes, as a pandas DataFrame: a row a direction, mm and degrees.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        require_extra("pandas", "to_pandas")
+        from puncture_twin.planning.search.table import to_table
+
+        return to_table(self).to_pandas()
+
+    def write(self, folder: pathlib.Path | str) -> pathlib.Path:
+        """Write ``candidates.parquet`` as the command ``search`` does: as a set of the folder, with its provenance.
+
+        Raises:
+            InputError: A folder that cannot be written to, or that holds another program's file of this name.
+        """
+        from puncture_twin.planning.search.table import TABLE, write_table
+
+        out = check_writable(folder)
+        with writing(out, "search", inputs=read_inputs(self.provenance.get("inputs", [])), names=(TABLE,)) as draft:
+            write_table(self, draft.folder / TABLE)
+        return out / TABLE
+
+    def plot_map(self) -> PolarMap:
+        """The map of the directions by verdict: a picture for a notebook, or to be written; θ outward, β around."""
+        return _map(self)
+
+    def pick(self, row: int) -> Pick:
+        """One candidate by its row.
+
+        Raises:
+            InputError: There is no such row.
+        """
+        if isinstance(row, bool) or not isinstance(row, int | np.integer) or not 0 <= row < len(self):
+            refuse(f"row {row!r}", "pick", f"a row number from 0 to {len(self) - 1}", "out_of_range")
+        return Pick(self, int(row))
+
     def counts(self) -> dict[str, int]:
         """Number of candidates by reason, most frequent first; "safe" among them."""
         counted = Counter(self.verdict.reason.tolist()).most_common()
@@ -258,10 +331,24 @@ class Candidates(Columns):
 
     def at(self, row: int) -> dict[str, float]:
         """The angles of one row, degrees, rounded to what a person types."""
-        return {
-            "theta_deg": round(float(np.degrees(self.theta[row])), ANGLE_DIGITS),
-            "beta_deg": round(float(np.degrees(self.beta[row])), ANGLE_DIGITS),
-        }
+        return {"theta_deg": float(self.theta_deg[row]), "beta_deg": float(self.beta_deg[row])}
+
+
+class Pick(NamedTuple):
+    """One candidate: a row of a search, or of a check of it alone."""
+
+    candidates: Candidates
+    row: int
+
+    @property
+    def theta_deg(self) -> float:
+        """Puncture angle, degrees."""
+        return self.candidates.at(self.row)["theta_deg"]
+
+    @property
+    def beta_deg(self) -> float:
+        """Azimuth, degrees."""
+        return self.candidates.at(self.row)["beta_deg"]
 
 
 SAME_ANGLE = 1e-7
@@ -274,14 +361,7 @@ MOST_ROWS = 200_000
 """Directions that are painted; the table says all that there is to say about more."""
 
 
-@never_raises
-def candidates_html(candidates: Any) -> str:
-    """A table of facts, and the map of the directions by verdict."""
-    title = f"{len(candidates):,} candidates, {int(candidates.safe.sum()):,} {candidates.safe_text}"
-    return card(title, _facts(candidates), _map(candidates))
-
-
-def _facts(candidates: Any) -> Facts:
+def _facts(candidates: Candidates) -> Facts:
     yield "arm", candidates.arm_note
     ranked = candidates.ranked
     if len(ranked):
@@ -295,9 +375,10 @@ def _facts(candidates: Any) -> Facts:
         yield text, f"{count:,}"
 
 
-def _map(candidates: Any) -> str:
+def _map(candidates: Candidates) -> PolarMap:
+    """Map of the directions by verdict."""
     if not 0 < len(candidates) <= MOST_ROWS:
-        return ""
+        return NO_MAP
     reasons = [Reason.NONE, *REASON_COLOURS]
     legend = [Entry(candidates.safe_text, SAFE), *(Entry(REASON_TEXT[r], REASON_COLOURS[r]) for r in reasons[1:])]
     number = {reason.value: row for row, reason in enumerate(reasons)}

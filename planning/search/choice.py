@@ -27,8 +27,7 @@ from puncture_twin.planning.formats.points import (
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.planning.search.windows import find_windows
+from puncture_twin.planning.search.explain import Explanation, reason_text
 
 NEAR_ENTRY_MM = 10.0
 """How far from the skin entry of its path a point may be that is to be that entry: a hand's precision on a screen."""
@@ -83,13 +82,6 @@ BEST = Choice()
 """The choice with nothing stated."""
 
 
-class Pick(NamedTuple):
-    """One candidate: a row of a search, or of a check of it alone."""
-
-    candidates: Candidates
-    row: int
-
-
 class Chosen(NamedTuple):
     """Candidates, and the rows of them that were chosen, in the order of preference."""
 
@@ -97,13 +89,8 @@ class Chosen(NamedTuple):
     rows: Ints
 
 
-def best_pick(candidates: Candidates) -> Pick | None:
-    """The best candidate of a search; None where nothing is safe."""
-    return Pick(candidates, int(candidates.ranked[0])) if len(candidates.ranked) else None
-
-
-def choose(context: CaseContext, candidates: Candidates, choice: Choice) -> Chosen:
-    """The candidates that a choice leaves, in the order of preference.
+def choose(context: CaseContext, candidates: Candidates | None, choice: Choice) -> Chosen:
+    """The candidates that a choice leaves, in the order of preference; of the grid None searches it.
 
     Raises:
         InputError: A rank or window that there is not, or a point that is no skin entry.
@@ -111,6 +98,7 @@ def choose(context: CaseContext, candidates: Candidates, choice: Choice) -> Chos
     """
     if not choice.of_grid:
         return choose_stated(context, choice)
+    candidates = context.own(candidates)
     rows = candidates.ranked
     if not len(rows):
         raise NoAnswerError("no candidate is safe", counts=candidates.counts(), code="no_safe_direction")
@@ -118,7 +106,7 @@ def choose(context: CaseContext, candidates: Candidates, choice: Choice) -> Chos
         _refuse_beyond(choice.rank, len(rows), "--rank", "safe candidates")
         return Chosen(candidates, rows[choice.rank - 1 : choice.rank])
     if choice.window is not None:
-        windows = find_windows(candidates)
+        windows = candidates.windows
         _refuse_beyond(choice.window, len(windows.windows), "--window", "windows")
         return Chosen(candidates, rows[windows.of_row[rows] == choice.window])
     return Chosen(candidates, rows)
@@ -128,9 +116,10 @@ def choose_stated(context: CaseContext, choice: Choice) -> Chosen:
     """The one candidate of a choice by angles or by entry; takes no search.
 
     Raises:
-        InputError: A point that is no skin entry.
+        InputError: A point that is no skin entry, or its file.
         NoAnswerError: It is rejected: says why.
     """
+    choice = with_file_read(context.case, choice)
     checked = context.check(*chosen_angles(context.case, choice))
     refuse_other_entry(context.case, checked, choice)
     if not checked.safe[0]:
@@ -139,6 +128,22 @@ def choose_stated(context: CaseContext, choice: Choice) -> Chosen:
         what = f"{where} is rejected: {reason_text(checked, 0)}"
         raise NoAnswerError(what, counts=checked.counts(), code="direction_rejected")
     return Chosen(checked, np.zeros(1, np.int64))
+
+
+def explain_choice(context: CaseContext, choice: Choice, candidates: Candidates | None = None) -> Explanation:
+    """Explain a choice, safe or not, with the search of the case where it is of one; None searches.
+
+    Raises:
+        InputError: See `chosen_angles`, `choose`; an entry where the path does not enter.
+        NoAnswerError: Nothing is safe, so that there are no ranks.
+    """
+    if choice.of_grid:
+        chosen, rows = choose(context, candidates, choice)
+        return context.explain(chosen.theta[rows[0]], chosen.beta[rows[0]])
+    choice = with_file_read(context.case, choice)
+    explained = context.explain(*chosen_angles(context.case, choice))
+    refuse_other_entry(context.case, explained.candidates, choice)
+    return replace(explained, read=choice.read)
 
 
 def chosen_angles(case: Case, choice: Choice) -> tuple[float, float]:

@@ -23,12 +23,10 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Cache, Memory, user_cache
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.progress import LOG, Silent, Stages, Watcher
-from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.base.text import brief
-from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.base.provenance import differing_input, inputs_document, read_inputs
+from puncture_twin.planning.base.text import Facts, Shown, brief, first_few
+from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.entry import Directions
-from puncture_twin.planning.case.options import NO_OPTIONS, CaseOptions
-from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, cross_check
@@ -43,14 +41,16 @@ from puncture_twin.planning.search.constraints import ArmReach
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import breath_warnings
 from puncture_twin.planning.search.search import organ_candidates, search
-from puncture_twin.planning.search.sides import Side, sides_of
+from puncture_twin.planning.search.sides import Side, sides_of, sides_text
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, uncertainty_breakdown
-from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
 from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Clearance engines by name: the fast exact engine, and FCL alone as the plain reference."""
+
+EngineChoice = str | Callable[..., ClearanceEngine]
+"""A name of `ENGINES`, or a class of one's own that is made of (meshes, progress) and keeps `ClearanceEngine`."""
 
 COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
 """The unit of each engine's progress."""
@@ -60,7 +60,7 @@ ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]"
 
 
 @dataclass(frozen=True, eq=False)
-class CaseContext:
+class CaseContext(Shown):
     """A prepared case: everything that questions about it need, read once.
 
     Attributes:
@@ -79,6 +79,22 @@ class CaseContext:
     watcher: Watcher
     stages: Stages
 
+    def _title(self) -> str:
+        return f"Case {self.case.name}, prepared"
+
+    def _facts(self) -> Facts:
+        yield "structures", first_few([one.name for one in self.anatomy.structures])
+        yield "arm", self.arm
+        yield "sides", sides_text(self.sides) or "of no body"
+        for warning in self.anatomy.warnings:
+            yield "warning", warning
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For another process: what was read; what answers is made there, since compiled libraries are not sent."""
+        kind = type(self.engine)
+        engine = next((name for name, known in ENGINES.items() if kind is known), kind)
+        return _sent, (self.case, self.anatomy, self.placement, engine, self.reach is not None)
+
     @brief
     def __repr__(self) -> str:
         return f"case {self.case.name}, {len(self.anatomy.structures)} structures; arm {self.arm}"
@@ -89,6 +105,33 @@ class CaseContext:
         if self.reach is not None:
             return ARM_CHECKED
         return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
+
+    def require_arm(self) -> ArmReach:
+        """The checker of the arm, for what cannot do without it.
+
+        Raises:
+            InputError: Says what the case lacks, or that the arm was switched off.
+        """
+        if self.placement is None:
+            refuse(NO_BASE, self.case.path, ALLOWED_BASE, "no_base")
+        if self.reach is None:
+            refuse("the arm is switched off", self.case.path, "a case that is prepared with its arm", "no_base")
+        return self.reach
+
+    def own(self, candidates: Candidates | None) -> Candidates:
+        """The candidates, if they are this case's; None searches.
+
+        Raises:
+            InputError: They are of another case, or of its files before a change: what is safe there says nothing here.
+        """
+        if candidates is None:
+            return self.search()
+        stated = candidates.provenance.get("inputs")
+        name = None if stated is None else differing_input(read_inputs(stated), self.case.inputs)
+        if name is not None:
+            what = f"input '{name}' is not the one that the candidates were searched with"
+            refuse(what, self.case.path, "a search of this case", "input_changed")
+        return candidates
 
     @property
     def pose_error(self) -> PoseError | None:
@@ -113,13 +156,13 @@ class CaseContext:
                 progress=partial(self.watcher.count, "directions of the arm"),
             )
             others = tuple(alternatives(self.case, self.anatomy, self.engine, candidates))
-        return replace(candidates, arm_note=self.arm, findings=others)
+        return replace(candidates, arm_note=self.arm, findings=others, provenance=self.provenance())
 
-    def check(self, theta: float, beta: float) -> Candidates:
-        """Check a single direction (rad)."""
+    def check(self, theta: Floats | float, beta: Floats | float) -> Candidates:
+        """Check a single direction, or several, shape (n,), rad, without the grid's windows and safe cones."""
         directions = self.case.direction(theta, beta)
         candidates = search(self.case, self.anatomy, self.engine, directions, reach=self.reach, chance=self.chance)
-        return replace(candidates, arm_note=self.arm)
+        return replace(candidates, arm_note=self.arm, provenance=self.provenance())
 
     def explain(self, theta: float, beta: float) -> Explanation:
         """Check a single direction (rad), with everything it was checked against and its uncertainty."""
@@ -186,37 +229,32 @@ class CaseContext:
 
 
 def prepare(
-    path: Path | str,
+    case: Case | Path | str,
     *,
     arm: bool | None = None,
-    engine: str = "fast",
+    engine: EngineChoice = "fast",
     watcher: Watcher | None = None,
-    target_ct: Floats | None = None,
-    options: CaseOptions = NO_OPTIONS,
     memory: Memory = NO_MEMORY,
 ) -> CaseContext:
     """Prepare a case: read it and everything that it names.
 
     Args:
-        path: Case file, or the folder that holds ``case.toml``.
+        case: A case, its file, or the folder that holds ``case.toml``.
         arm: Whether the arm is checked too; None checks it where the case says where its base is.
-        engine: A name of `ENGINES`.
+        engine: Who measures clearance.
         watcher: Shows progress.
-        target_ct: Another target than the case's, shape (3,), mm.
-        options: What is stated in place of what the case file states.
         memory: What this process keeps from one case to the next; the answer is the same.
 
     Raises:
         InputError: Anything in the case that cannot be used, an unknown engine, or an arm that is to be checked in a
             case that does not say where its base is.
     """
-    if engine not in ENGINES:
+    if isinstance(engine, str) and engine not in ENGINES:
         refuse(f"engine '{engine}' is not known", "--engine", ", ".join(ENGINES), "unknown_engine")
     watcher = watcher or Silent()
     stages = Stages(announce=partial(watcher.step, "stage"))
     with stages.time("case"):  # case.toml, validated, and T_base_ct from markers, a transform or a mount
-        case = load_case(path, options)
-        case = case if target_ct is None else case.aimed_at(target_ct)
+        case = case if isinstance(case, Case) else load_case(case)
         placement = load_placement(case)
     if arm and placement is None:
         refuse(NO_BASE, case.path, f"{ALLOWED_BASE}; or a check without the arm", "no_base")
@@ -228,13 +266,34 @@ def prepare(
         anatomy = _with_findings(case, anatomy, placement, cache)
         check_tissues(case, anatomy)
         case.files.release()  # image and labels are read: their memory is given back
-    with stages.time("trees"):  # what questions are answered with: clearance engine, arm's checker, model of errors
+    return _answering(case, anatomy, placement, engine, arm is not False, watcher, stages, cache)
+
+
+def _sent(case: Case, anatomy: Anatomy, placement: Placement | None, engine: EngineChoice, arm: bool) -> CaseContext:
+    watcher = Silent()
+    stages = Stages(announce=partial(watcher.step, "stage"))
+    return _answering(case, anatomy, placement, engine, arm, watcher, stages, user_cache())
+
+
+def _answering(
+    case: Case,
+    anatomy: Anatomy,
+    placement: Placement | None,
+    engine: EngineChoice,
+    arm: bool,
+    watcher: Watcher,
+    stages: Stages,
+    cache: Cache,
+) -> CaseContext:
+    """What questions are answered with: clearance engine, arm's checker, model of errors."""
+    with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
+        maker, unit = (ENGINES[engine], COUNTED[engine]) if isinstance(engine, str) else (engine, "structures")
         cache_option = {"cache": cache} if engine == "fast" else {}
-        clearance_engine = ENGINES[engine](meshes, partial(watcher.count, COUNTED[engine]), **cache_option)
+        clearance_engine = maker(meshes, partial(watcher.count, unit), **cache_option)
         reach = None
-        if arm is not False and placement is not None:
-            reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, memory), placement.T_base_ct)
+        if arm and placement is not None:
+            reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, cache.memory), placement.T_base_ct)
         error = None if reach is None or placement is None else pose_error(case, placement.registration)
         chance = chance_model(case, anatomy, clearance_engine, error)
     return CaseContext(case, anatomy, placement, clearance_engine, reach, chance, watcher, stages)
@@ -286,7 +345,7 @@ def _needle_catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, can
         for length in sorted(case.needle.lengths_mm)
     }
     text = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
-    best = [window.best for window in find_windows(candidates).windows]
+    best = [window.best for window in candidates.windows]
     shortest = [next((length for length, rows in safe.items() if rows[row]), np.nan) for row in best]
     fits = ", ".join(f"{length:g} mm" for length in shortest)
     numbers = {"lengths_mm": list(safe), "safe": [float(rows.sum()) for rows in safe.values()], "shortest_mm": shortest}

@@ -13,7 +13,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.base.text import brief
+from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.bedside import EntryFacts
@@ -39,7 +39,7 @@ UNITS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation:
+class Explanation(Shown):
     """A checked candidate with what it was checked against.
 
     Attributes:
@@ -55,6 +55,19 @@ class Explanation:
     facts: EntryFacts
     breakdown: UncertaintyBreakdown | None = None
     read: tuple[Input, ...] = ()
+
+    def _title(self) -> str:
+        return self.head()[0]
+
+    def _facts(self) -> Facts:
+        for line in self.head()[1:]:
+            yield "why", line.strip()
+        yield "arm", self.candidates.arm_note
+        if np.isfinite(length := self.candidates.path.length[0]):
+            yield "path", f"{length:.1f} mm"
+        yield from self.facts.rows()
+        for name, clearance in sorted(self.clearances().items(), key=lambda one: one[1])[:NEAREST]:
+            yield f"clearance to {name}", f"{clearance:.2f} mm"
 
     @brief
     def __repr__(self) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +13,17 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.search.candidates import ANGLE_DIGITS, Candidates
-from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.uncertainty.chance_model import Chances
 
+TABLE = "candidates.parquet"
+"""Its name in a folder."""
 
-def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
+
+def to_table(candidates: Any) -> pa.Table:
     """One row per direction, columns as DESIGN names them: `theta_deg`, `beta_deg`, `verdict`, `reason`, ...
 
     Args:
-        candidates: The search's result.
-        provenance: Case name, input hashes, version, seed, step; stored under the key ``run`` as JSON.
+        candidates: The search's result, `Candidates`; its provenance is stored under the key ``run`` as JSON.
     """
     columns = _path_columns(candidates) | _choice_columns(candidates)
     if candidates.chances is not None:
@@ -37,17 +36,17 @@ def to_table(candidates: Candidates, provenance: Mapping[str, Any]) -> pa.Table:
             "worst_phase": candidates.breathing.worst_phase,
             "breathing_clearance_mm": candidates.breathing.clearance,
         }
-    run = {**provenance, "safe_cone_from": candidates.cone_source}
+    run = {**candidates.provenance, "safe_cone_from": candidates.cone_source}
     named = {name: one if isinstance(one, pa.Array) else column(np.asarray(one)) for name, one in columns.items()}
     table = pa.table(named)
     return table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)})
 
 
-def _path_columns(candidates: Candidates) -> dict[str, Any]:
+def _path_columns(candidates: Any) -> dict[str, Any]:
     """Direction, verdict, and the straight path with its clearances."""
     columns: dict[str, Any] = {
-        "theta_deg": np.round(np.degrees(candidates.theta), ANGLE_DIGITS),
-        "beta_deg": np.round(np.degrees(candidates.beta), ANGLE_DIGITS),
+        "theta_deg": candidates.theta_deg,
+        "beta_deg": candidates.beta_deg,
         "verdict": np.where(candidates.safe, "safe", "rejected"),
         "reason": candidates.verdict.reason,
         "reason_structure": candidates.verdict.structure,
@@ -66,7 +65,7 @@ def _path_columns(candidates: Candidates) -> dict[str, Any]:
     return {**columns, "tissue_mm": candidates.path.tissue}
 
 
-def _choice_columns(candidates: Candidates) -> dict[str, Any]:
+def _choice_columns(candidates: Any) -> dict[str, Any]:
     """Columns that compare safe directions: reach, safe cone, cost, rank and window."""
     reachable = candidates.arm.reachable
     return {
@@ -76,7 +75,7 @@ def _choice_columns(candidates: Candidates) -> dict[str, Any]:
         "cost": candidates.ranking.cost,
         "rank": candidates.ranking.rank,
         "pareto": candidates.ranking.pareto,
-        "window": find_windows(candidates).of_row,
+        "window": candidates.windows.of_row,
     }
 
 
@@ -98,9 +97,9 @@ def chance_columns(chances: Chances) -> dict[str, NDArray[Any]]:
     }
 
 
-def write_table(candidates: Candidates, provenance: Mapping[str, Any], path: Path) -> None:
+def write_table(candidates: Any, path: Path) -> None:
     """Write the table as Parquet, whole or not at all; numbers, of which most differ, without a dictionary."""
-    table = to_table(candidates, provenance)
+    table = to_table(candidates)
     repeating = [field.name for field in table.schema if not pa.types.is_floating(field.type)]
     with atomic(path) as temporary, temporary.open("wb") as stream:
         pq.write_table(table, stream, use_dictionary=repeating)

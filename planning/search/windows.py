@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.case.entry import AngleGrid
-from puncture_twin.planning.search.candidates import Candidates
 
 SQUARE_DEGREES = float(np.degrees(1.0) ** 2)
 """Square degrees in a steradian."""
@@ -18,8 +20,8 @@ MOST_WINDOWS = 10
 """Windows that are listed to people."""
 
 
-@dataclass(frozen=True)
-class Window:
+@dataclass(frozen=True, repr=False)
+class Window(Shown):
     """One connected set of safe directions.
 
     Attributes:
@@ -49,8 +51,8 @@ class Window:
         return f"{self.entry_cm2:.1f} cm2 on the skin, {self.wide_deg:.0f} deg wide"
 
 
-@dataclass(frozen=True, eq=False)
-class Windows:
+@dataclass(frozen=True, eq=False, repr=False)
+class Windows(Shown):
     """All windows of a search.
 
     Attributes:
@@ -60,6 +62,15 @@ class Windows:
 
     of_row: Ints
     windows: tuple[Window, ...]
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __iter__(self) -> Iterator[Window]:
+        return iter(self.windows)
+
+    def __getitem__(self, at: int) -> Window:
+        return self.windows[at]
 
     @property
     def largest(self) -> Window | None:
@@ -79,8 +90,8 @@ class Windows:
         return np.flatnonzero(self.of_row == number)
 
 
-def find_windows(candidates: Candidates) -> Windows:
-    """The windows of ranked candidates; without a grid every candidate is one of its own, without area."""
+def find_windows(candidates: Any) -> Windows:
+    """The windows of ranked `Candidates`; without a grid every candidate is one of its own, without area."""
     label = _connected(candidates.grid, candidates.safe)
     ranked = candidates.ranked
     firsts = ranked[np.sort(np.unique(label[ranked], return_index=True)[1])]  # best of each set, by rank
@@ -93,7 +104,7 @@ def find_windows(candidates: Candidates) -> Windows:
     return Windows(number, tuple(parts))
 
 
-def nearest_row(candidates: Candidates, outward_ct: Floats) -> int | None:
+def nearest_row(candidates: Any, outward_ct: Floats) -> int | None:
     """Row of the grid nearest to a direction, shape (3,); None where it is beyond the grid by a step."""
     row = int(np.argmax(candidates.outward_ct @ outward_ct))  # largest cosine
     near = candidates.outward_ct[row]
@@ -120,13 +131,13 @@ def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
     return label
 
 
-def _entry_area(candidates: Candidates, cell: Floats) -> Floats:
+def _entry_area(candidates: Any, cell: Floats) -> Floats:
     """Skin area of each direction's cell, mm2: the sphere's patch over the cosine of the skin angle."""
     area = cell * candidates.path.length**2 / np.cos(candidates.path.skin_angle)
     return np.asarray(np.where(candidates.safe, area, 0.0))
 
 
-def _window(number: int, candidates: Candidates, rows: Bools, best: int, cell: Floats, skin: Floats) -> Window:
+def _window(number: int, candidates: Any, rows: Bools, best: int, cell: Floats, skin: Floats) -> Window:
     return Window(
         number=number,
         best=best,

@@ -28,7 +28,7 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.reach.reach import approach_goals
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.reach.survey import ReachRequest
-from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import reason_text
 
 
@@ -91,16 +91,15 @@ def plan_sweep(
         InputError: The case does not say where the robot stands, or both directions are one.
         NoAnswerError: The first directions are not allowed, or no approach to them was found.
     """
-    if context.reach is None:
-        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
+    reach = context.require_arm()
     route = _allowed(context, _angles(start, end), progress)
-    point = apply(context.reach.T_base_ct, context.case.target_ct)
-    T_base_ct, frame = context.reach.T_base_ct, context.case.T_ct_entry[:3, :3]
+    point = apply(reach.T_base_ct, context.case.target_ct)
+    T_base_ct, frame = reach.T_base_ct, context.case.T_ct_entry[:3, :3]
     directions = outward(route.angles[:, 0], route.angles[:, 1]) @ (T_base_ct[:3, :3] @ frame).T
     q, stopped = _farthest(context, point, directions, route)
     if len(q) < 2:
         raise NoAnswerError(f"no sweep: {stopped}", code="sweep_stops")
-    speeds, checker = context.case.robot.speeds, context.reach.checker
+    speeds, checker = context.case.robot.speeds, reach.checker
     approach = plan_approach(checker, home_configuration(context.case), q[0], seed=seed, speeds=speeds)
     rotated = np.arccos(np.clip(np.vecdot(directions[1 : len(q)], directions[: len(q) - 1]), -1.0, 1.0))
     arc = route.standoff_mm * np.concatenate([[0.0], np.cumsum(rotated)])

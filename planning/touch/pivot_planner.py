@@ -15,12 +15,12 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import away_from_singularities, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.touch_planner import PLANNED_PADDING_MM, approach_checkers
 from puncture_twin.planning.touch.tour_motions import (
     ApproachCheckers,
@@ -68,8 +68,7 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
         InputError: The case has no arm.
         NoAnswerError: No place, or not this one, can be touched in so many poses, or no motion was found.
     """
-    if context.reach is None:
-        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
+    context.require_arm()
     checkers = approach_checkers(context, PLANNED_PADDING_MM)
     places, most = _places(context) if place_base is None else [place_base], 0
     for place in places:

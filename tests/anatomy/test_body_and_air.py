@@ -19,7 +19,7 @@ from puncture_twin.planning.anatomy.body.body_mask import (
 )
 from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.formats.volumes import voxels

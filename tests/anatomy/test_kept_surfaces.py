@@ -13,7 +13,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache, Memory
 from puncture_twin.planning.base.cache.entry_file import packed, unpacked
 from puncture_twin.planning.base.errors import CacheWarning
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 VESSEL = structure("vessel", "avoid", {"labelmap": "labels.nii.gz", "label": 3})

@@ -7,7 +7,7 @@ from case_world import SKIN, case_text, image_of, structure, vessel_voxels, writ
 from refusals import refused
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
 
 RULES = '{source}\ntarget = ["organ"]\n[structures.avoid]\n"vessel *" = 3.0\n'

@@ -6,7 +6,7 @@ import SimpleITK
 from case_world import write_case, write_labels
 from refusals import refused
 
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
 
 

@@ -14,8 +14,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.tool import SIDES, Tool, gantry_boxes
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.case import bed_frame
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import bed_frame, load_case
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool, home_configuration

@@ -3,44 +3,17 @@
 import base64
 import io
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 from PIL import Image
+from whole_html import Whole
 
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.reasons import css
-from puncture_twin.planning.base.text import card, never_raises
+from puncture_twin.planning.base.text import Shown, card
 
 LEGEND = (Entry("safe", (0, 158, 115)), Entry("too close", (213, 94, 0)), Entry("undecided", (255, 255, 255)))
 HOSTILE = '</td><script>alert("1")</script>&'
-
-
-class Whole(HTMLParser):
-    """Complains where a tag is closed that is not the last one opened."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.open, self.tags = [], []
-        self.feed(text)
-        self.close()
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        """No part of it comes from outside, none acts."""
-        if tag != "img":
-            self.open.append(tag)
-        self.tags.append(tag)
-        assert not any(name in ("href", "onload", "onclick") for name, _ in attrs)
-        assert all(value.startswith("data:") for name, value in attrs if name == "src")
-
-    def handle_startendtag(self, tag, attrs):
-        """An element without a content."""
-        self.tags.append(tag)
-
-    def handle_endtag(self, tag):
-        """The last one opened is closed first."""
-        assert self.open.pop() == tag
 
 
 def grid(step=5.0, last=30.0):
@@ -67,15 +40,13 @@ def test_a_card_is_whole_and_escapes_what_it_is_told():
 def test_what_cannot_be_shown_is_named():
     """The notebook gets the class and the kind of error, not a traceback."""
 
-    class Broken:
+    class Broken(Shown):
         """Fails when it is shown."""
 
-        def __str__(self):
+        def _facts(self):
             raise ValueError(HOSTILE)
 
-        __repr__ = __str__
-
-    shown = never_raises(str)(Broken())
+    shown = Broken()._repr_html_()
     assert "Broken" in shown
     assert "ValueError" in shown
     assert Whole(shown).tags == ["pre"]
@@ -84,12 +55,12 @@ def test_what_cannot_be_shown_is_named():
 def test_the_map_shows_the_verdicts_that_occur():
     """One shape for each, and a line of the legend; without cells there is no map."""
     theta, beta = grid()
-    shown = polar_map(Sectors(theta, beta, (theta[:, 0] > 0.3).astype(int)), LEGEND, np.radians(2.5))
+    shown = polar_map(Sectors(theta, beta, (theta[:, 0] > 0.3).astype(int)), LEGEND, np.radians(2.5))._repr_html_()
     assert "img" in Whole(shown).tags
     assert painted(shown) == {css(one.colour) for one in LEGEND[:2]}
     assert "too close" in shown
     assert "undecided" not in shown
-    assert polar_map(Sectors(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, int)), LEGEND) == ""
+    assert polar_map(Sectors(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, int)), LEGEND)._repr_html_() == ""
 
 
 def test_a_bin_with_anything_unsafe_in_it_is_not_safe():
@@ -100,7 +71,7 @@ def test_a_bin_with_anything_unsafe_in_it_is_not_safe():
     for order in (slice(None), slice(None, None, -1)):
         code = np.zeros(len(fine), int)
         code[3::10] = 1  # one cell in each bin of half a degree
-        shown = polar_map(Sectors(theta[order], beta[order], code[order]), LEGEND)
+        shown = polar_map(Sectors(theta[order], beta[order], code[order]), LEGEND)._repr_html_()
         assert painted(shown) == {css(LEGEND[1].colour)}
 
 
@@ -108,7 +79,7 @@ def test_a_cell_across_beta_zero_is_painted_on_both_sides():
     """Azimuths count modulo a turn."""
     theta = np.radians([[0.0, 30.0], [0.0, 30.0]])
     beta = np.radians([[-10.0, 10.0], [10.0, 350.0]])
-    shown = polar_map(Sectors(theta, beta, np.array([1, 0])), LEGEND, np.radians(10.0))
+    shown = polar_map(Sectors(theta, beta, np.array([1, 0])), LEGEND, np.radians(10.0))._repr_html_()
     assert painted(shown) == {css(one.colour) for one in LEGEND[:2]}
-    same = polar_map(Sectors(theta, beta + 2 * np.pi, np.array([1, 0])), LEGEND, np.radians(10.0))
+    same = polar_map(Sectors(theta, beta + 2 * np.pi, np.array([1, 0])), LEGEND, np.radians(10.0))._repr_html_()
     assert same == shown

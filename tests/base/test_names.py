@@ -10,7 +10,7 @@ from case_world import write_case
 from refusals import refused
 
 from puncture_twin.meshes import folder
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.labels.naming import names_for
@@ -48,7 +48,7 @@ def test_a_long_name_is_whole_in_the_verdict_and_in_the_table(long_named, tmp_pa
     assert f"too_close ({name})" in explained.text()
     assert f"  {name} avoid" in explained.text()
     assert explained.summary()["reason_structure"] == name
-    write_table(found, {"case": "carton"}, tmp_path / "candidates.parquet")
+    write_table(found, tmp_path / "candidates.parquet")
     assert pq.read_table(tmp_path / "candidates.parquet")["reason_structure"].to_pylist() == [name]
 
 
@@ -58,7 +58,7 @@ def test_a_long_sentence_is_whole(long_named):
     detail = found.verdict.detail.copy()
     detail[0] = 300 * "a" + " end"
     long = replace(found, verdict=replace(found.verdict, detail=detail))
-    assert to_table(long, {})["reason_detail"].to_pylist()[0].endswith("a end")
+    assert to_table(long)["reason_detail"].to_pylist()[0].endswith("a end")
 
 
 @pytest.mark.parametrize("name", HOSTILE)

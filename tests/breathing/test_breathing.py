@@ -6,7 +6,7 @@ from case_world import ORGAN, SKIN, case_text, structure, write_balls
 from refusals import refused
 
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within, positions
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.labels.naming import ByName
 
 BREATHING = '[breathing]\namplitude_mm = 12.0\ndirection = "feet"\n{keys}\n[breathing.weights]\n"*" = 0.0\n'

@@ -16,7 +16,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within, mean_square_within
 from puncture_twin.planning.budget.chain import Breath, chain_of, other_gauges
 from puncture_twin.planning.budget.what_if import changes, source_costs
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.needle.deflection import GAUGES, Shaft
 from puncture_twin.planning.registration.fit_uncertainty import reading_noise

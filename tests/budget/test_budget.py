@@ -13,8 +13,8 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.budget.chain import chain_of
 from puncture_twin.planning.budget.what_if import MOST_MARKERS, best_change, changes, source_costs
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.errors import ArmUncertainty
-from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 from puncture_twin.planning.registration.placement import load_placement

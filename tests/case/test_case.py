@@ -9,8 +9,8 @@ from case_world import ORGAN, SKIN, case_text, changed
 from refusals import refused
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.case_file import case_schema
-from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.geometry.spaces import Space
 
 GOOD = case_text(

@@ -15,7 +15,7 @@ import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation u
 from case_world import ORGAN, case_text, image_of, registration_section, structure, write_balls, write_markers
 
 from puncture_twin.planning.base.provenance import differing_input, inputs_document
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import CaseContext, prepare
 
 CASE = case_text(

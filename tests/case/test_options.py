@@ -4,8 +4,8 @@ import pytest
 from cohort_world import tiny_text, write_patient
 from refusals import refused
 
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.options import case_options
-from puncture_twin.planning.case.read_case import load_case
 
 
 def loaded(path, **sections):

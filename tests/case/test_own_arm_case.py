@@ -10,8 +10,8 @@ from own_arms import LENGTHS, write_own_arm
 from refusals import refused
 
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.options import case_options
-from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.plan.plan_check import arm_document, read_arm, same_arm
 

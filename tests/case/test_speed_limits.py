@@ -5,7 +5,7 @@ from refusals import refused
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from puncture_twin.planning.anatomy.default_roles import NOT_ANNOTATED, default_
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.progress import unnamed
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.init.finder import Wanted
 from puncture_twin.planning.init.start import Request, start_case

@@ -11,8 +11,8 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
 from puncture_twin.planning.anatomy.regions import USUAL, absent_organs
 from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.named_files import NOT_LAST_NOTE, TOP_COUNT_NOTE
-from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.evidence.checks import ignored_organs
 from puncture_twin.planning.formats.labels.naming import V2
 from puncture_twin.planning.search.context import prepare

@@ -38,7 +38,7 @@ def unsearched(monkeypatch):
         raise AssertionError("searched for nothing")
 
     monkeypatch.setattr(CaseContext, "search", searched)
-    monkeypatch.setattr(main_job, "_refuse_without_arm", lambda _: None)
+    monkeypatch.setattr(CaseContext, "require_arm", lambda _: None)
 
 
 @pytest.mark.parametrize("job", [main_job.plan_case, main_job.rehearse_case], ids=["plan", "rehearse"])

@@ -12,7 +12,7 @@ from export.slicer_facts import MARKUP, POINT, SCHEMA, check_attributes, check_p
 from refusals import refused
 
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.export.slicer import entry_area
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.points import read_points

@@ -9,7 +9,7 @@ from case_world import ball, case_text, structure
 from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.labels.label_sources import parse_segments
 
 SHAPE = (24, 20, 16)

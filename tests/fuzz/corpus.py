@@ -21,7 +21,7 @@ from puncture_twin.meshes import folder as embedded
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.output.manifest import Manifest, ManifestEntry
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.export.exporter import csv_text

@@ -7,7 +7,7 @@ import numpy as np
 from fuzz.output_sets import rewritten_set, whole_set
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.anatomy.unseen import BEYOND_LABELS
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.certify.certificate import read_certificate
 from puncture_twin.planning.collision_cases.checks_file import read_checks
 from puncture_twin.planning.export.exporter import read_csv

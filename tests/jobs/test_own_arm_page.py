@@ -14,7 +14,7 @@ from own_arms import JOINTS, LENGTHS, write_own_arm
 from places import ROOT
 from refusals import refused_command
 
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.run_twin import main
 
 PAGE = (ROOT / "docs" / "how-to" / "own-arm.md").read_text(encoding="utf-8")

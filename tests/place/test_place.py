@@ -23,9 +23,7 @@ from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.processes import working
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.case.case import bed_frame
-from puncture_twin.planning.case.options import CaseOptions
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import bed_frame, load_case
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import MountSection
 from puncture_twin.planning.collision.checker import CellChecker
@@ -533,4 +531,4 @@ def test_a_base_in_what_nobody_saw_is_refused_with_a_way_out(case_folder, z):
     """200 mm beyond the trunk's ends, at its own height; nothing that an image shows stands there."""
     mount = {"position_mm": [0.0, 0.0, z], "x_axis": [1.0, 0.0, 0.0], "z_axis": [0.0, -1.0, 0.0]}
     with refused("base_in_unseen", "beyond_mm"):
-        prepare(case_folder(), options=CaseOptions({"mount": mount}))
+        prepare(load_case(case_folder()).replace(mount=mount))

@@ -399,6 +399,6 @@ def test_no_safe_candidate_means_no_plan(carton, found):
         verdict=replace(found.verdict, reason=np.full(len(found), Reason.TOO_CLOSE.value)),
         ranking=Ranking.none(len(found)),
     )
-    with refused("no_plan", by=NoAnswerError) as caught:
+    with refused("no_safe_direction", by=NoAnswerError) as caught:
         make_plan(carton, none, seed=0)
     assert caught.value.counts == {"too_close": len(found)}

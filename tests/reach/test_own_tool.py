@@ -15,7 +15,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.tool import SLABS, Box, Tool, ToolBody
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.collision.bodies import arm_bodies, touch
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool

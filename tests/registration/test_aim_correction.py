@@ -13,7 +13,7 @@ from uncertainty_world import NO_ARM, declared, world
 
 from puncture_twin.planning.arm.kinematics import error_jacobian
 from puncture_twin.planning.base.provenance import differing_input
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, log_rotation, pose
 from puncture_twin.planning.registration.fits import differenced_map, fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs

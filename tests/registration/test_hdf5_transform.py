@@ -12,7 +12,7 @@ import SimpleITK
 from refusals import refused
 from registration.test_stated_transform import FLIP, POINTS, T_BASE_CT, slicer_file, stating
 
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.itk_transform import HEAP_HEAD_BYTES, parse_transform
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.placement import load_placement

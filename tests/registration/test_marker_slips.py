@@ -20,7 +20,7 @@ from refusals import refused, refused_command
 
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_NOT_KNOWN
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.itk_transform import transform_text
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare

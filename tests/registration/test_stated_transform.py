@@ -7,7 +7,7 @@ from case_world import CASE, MARKERS, changed, registration_section, write_case
 from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import load_skin
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, left_jacobian, pose
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings
 from puncture_twin.planning.registration.checks.markers import Surroundings

@@ -9,7 +9,7 @@ from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import load_skin
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.tables import other_readings
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.planning.registration.checks.checked_placement import (

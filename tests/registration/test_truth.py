@@ -11,9 +11,8 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case import Case, view_frame
+from puncture_twin.planning.case.case import Case, load_case, view_frame
 from puncture_twin.planning.case.named_files import CaseVolumes
-from puncture_twin.planning.case.read_case import load_case
 from puncture_twin.planning.case.settings import Needle, RobotSettings, SearchSettings
 from puncture_twin.planning.case.tables import MarkerSection, RankingSection, RehearsalSection
 from puncture_twin.planning.geometry.rigid import apply

@@ -8,7 +8,7 @@ from case_world import ORGAN, SKIN, ball, case_text, structure, write_balls
 from refusals import refused
 
 from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.formats.labels.naming import ByName
@@ -69,7 +69,7 @@ def test_what_lacks_the_clearance_to_bend_is_rejected_and_nothing_else(patient):
     row = np.flatnonzero(new)[0]
     assert bent.verdict.amount[row] == straight.clearance.distance[row, 1:].min()
     assert f"{bent.deflection[row]:.2f} mm" in bent.verdict.detail[row]
-    today, with_tissue = to_table(straight, {}), to_table(bent, {})
+    today, with_tissue = to_table(straight), to_table(bent)
     assert with_tissue.column_names == [*today.column_names, "deflection_bound_mm"]
     changed = {"verdict", "reason", "reason_structure", "reason_amount", "reason_detail", "window"}
     same = [name for name in today.column_names if name not in changed]

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from puncture_twin.planning.base.reasons import SAFE
-from puncture_twin.planning.search.candidates import candidates_html
+from puncture_twin.planning.search.candidates import Candidates
 
 
 class Grid(SimpleNamespace):
@@ -34,7 +34,7 @@ def grid(step_deg):
 @pytest.mark.parametrize("step_deg", [1.0, 2.0, 5.0, 12.0])
 def test_a_safe_cap_is_one_whole_disc(step_deg):
     """Every pixel of it: no other colour but white beyond, and circles and axes over both."""
-    shown = candidates_html(grid(step_deg))
+    shown = Candidates.plot_map(grid(step_deg))._repr_html_()
     data = base64.b64decode(re.search(r'base64,([^"]+)"', shown)[1])
     picture = np.asarray(Image.open(io.BytesIO(data))).astype(int)
     inside = np.hypot(*np.meshgrid(*2 * [(np.arange(640) - 319.5) / 320])) < 1

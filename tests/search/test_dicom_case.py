@@ -16,7 +16,7 @@ from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import load_anatomy
 from puncture_twin.planning.base.provenance import differing_input
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.search.context import prepare
 from tools.phantoms import supine

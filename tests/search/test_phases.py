@@ -118,7 +118,7 @@ def test_the_breath_only_takes_away_and_a_gate_gives_back(patient):
 def test_a_body_that_does_not_move_keeps_its_map(patient, breath):
     """No amplitude, one phase, or a gate at exhale, where the CT was taken: all of today's columns, to the last bit."""
     found, static = searched(patient, breath), searched(patient)
-    today, moving = to_table(static, {}), to_table(found, {})
+    today, moving = to_table(static), to_table(found)
     assert moving.select(today.column_names).equals(today)
     assert moving.column_names[len(today.column_names) :] == [
         "safe_all_phases",

@@ -75,7 +75,7 @@ def test_no_reach_is_asked_without_an_arm(found):
 def test_the_table_holds_what_was_found(carton, found, tmp_path):
     """The Parquet file has every column, in mm and degrees, and says where it comes from."""
     path = tmp_path / "candidates.parquet"
-    write_table(found, carton.provenance(), path)
+    write_table(found, path)
     table = pq.read_table(path)
     assert table.num_rows == len(found)
     wanted = {"theta_deg", "beta_deg", "verdict", "reason", "reason_structure", "reason_depth_mm", "entry_x_mm",

@@ -8,7 +8,7 @@ import pytest
 from places import ROOT
 from uncertainty_world import declared, world
 
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.uncertainty_breakdown import WISHED_HIT, chance_text, goals_of, shrinkable
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel

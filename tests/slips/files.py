@@ -13,7 +13,7 @@ import trimesh
 from puncture_twin.planning.base.cache import entry_file
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE
 from puncture_twin.planning.base.progress import unnamed
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.dicom.ct_series import read_series
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.init.finder import Wanted, find

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.text import brief
+from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.twin.plant.true_needle import NO_TISSUE_FORCE, TissueForce
+
+if TYPE_CHECKING:
+    from puncture_twin.twin.rehearsal.distribution import Distribution
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class RehearsalContact:
 
 
 @dataclass(frozen=True, eq=False)
-class Rehearsal:
+class Rehearsal(Shown):
     """Measurements of a rehearsal; m records in time, k samples of clearance. Angles in rad, lengths in mm.
 
     Attributes:
@@ -156,6 +159,7 @@ class Rehearsal:
         off_path_mm: The tip from its commanded path, by the encoders, at most from the insertion on.
         tissue_force: The greatest forces of the tissue on the needle; None where the case declares none.
         standing: Where the error stands among others; None where the case declares no errors.
+        distribution: Over many rooms; None where the plan was executed in one.
     """
 
     seed: int
@@ -182,6 +186,7 @@ class Rehearsal:
     off_path_mm: float
     tissue_force: TissueForce | None
     standing: ErrorRank | None = None
+    distribution: Distribution | None = None
 
     @brief
     def __repr__(self) -> str:

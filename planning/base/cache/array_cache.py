@@ -104,7 +104,7 @@ MOST_BYTES = 2_000_000_000
 
 LIBRARIES = (
     *("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "llvmlite", "python-fcl", "trimesh"),
-    *("fast-simplification", "pillow", "pydantic", "pydicom", "python-gdcm", "h5py"),
+    *("fast-simplification", "pillow", "pyarrow", "pydantic", "pydicom", "python-gdcm", "h5py"),
 )
 """Whose versions decide what is made."""
 

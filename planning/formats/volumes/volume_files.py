@@ -23,7 +23,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import absence, is_plain_file, read_input
-from puncture_twin.planning.base.text import brief
+from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.formats.volumes import nrrd_header
 from puncture_twin.planning.formats.volumes.nifti_header import parse_nifti_header
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_nrrd_header
@@ -39,7 +39,7 @@ SCALING_ROUNDING = float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True, eq=False)
-class Volume:
+class Volume(Shown):
     """A scalar volume in patient space.
 
     Attributes:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import ErringArm, flange_pose
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.twin.guidance.ct.pivot import check_one_place, pivot_calibration
 from puncture_twin.twin.jobs.experiment.pivot_job import PivotRun, pivot_case, pivot_text

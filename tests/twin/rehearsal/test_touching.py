@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose, link_poses
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.formats.points import NamedPoints, read_points

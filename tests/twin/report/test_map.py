@@ -9,7 +9,6 @@ from matplotlib.text import Text
 from PIL import Image
 
 from puncture_twin.planning.base.reasons import REASON_TEXT, UNSEEN_AIR_TEXT, Reason
-from puncture_twin.planning.search.choice import best_pick
 from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.twin.report.map.map_disc import RINGS_CLEAR, ring_labels
 from puncture_twin.twin.report.map.map_picture import draw_map, map_figure
@@ -84,7 +83,7 @@ def test_text_and_page_say_that_it_was_not_seen(case, candidates):
     """As the map does; the table of candidates keeps the word that programs read."""
     row = int(np.flatnonzero(candidates.verdict.reason == "unknown_region")[0])
     assert reason_text(candidates, row) == "unknown_region (not seen: image or mesh ends)"
-    data = map_data(case, candidates, best_pick(candidates))
+    data = map_data(case, candidates, candidates.best)
     assert data["structures"][data["structure"][row]] == data["not_seen"] == "not seen: image or mesh ends"
     assert candidates.verdict.structure[row] == "skin"
 

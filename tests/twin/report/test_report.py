@@ -24,7 +24,7 @@ from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import ring_weights
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report import annotate
 from puncture_twin.twin.report.map.map_picture import DISC, draw_map
 from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
@@ -568,7 +568,7 @@ def test_the_film_shows_the_patient_and_ends_with_the_result(anatomy, case, plan
 
 def test_after_a_checked_search_the_arm_is_in_the_scene(anatomy, case, candidates, plan):
     """With the joints of the search, where the base is known; none of another direction, and none without a base."""
-    best = best_pick(candidates)
+    best = candidates.best
     q = np.full((len(candidates), 6), np.nan)
     q[best.row] = plan.insertion.q[-1]
     reached = replace(candidates, arm=replace(candidates.arm, q_insertion=q))
@@ -741,7 +741,7 @@ def test_names_from_files_cannot_become_markup(case, candidates, tmp_path):
 
 def test_the_page_s_map_knows_its_rows(case, candidates):
     """The run lengths that the script unpacks give back the row under every pixel; numbers are JSON."""
-    data = map_data(case, candidates, best_pick(candidates))
+    data = map_data(case, candidates, candidates.best)
     json.dumps(data, allow_nan=False)
     runs = np.array(data["runs"]).reshape(-1, 2)
     table = np.repeat(runs[:, 0], runs[:, 1]).reshape(data["size"], data["size"])
@@ -759,7 +759,7 @@ def test_the_copied_command_works_from_any_folder(case, candidates, tmp_path, mo
     (tmp_path / "my cases").mkdir()
     (tmp_path / "my cases" / "ball.toml").write_text("schema = 1")
     monkeypatch.chdir(tmp_path / "my cases")
-    typed = map_data(case, candidates, best_pick(candidates))["file"]
+    typed = map_data(case, candidates, candidates.best)["file"]
     monkeypatch.chdir("/")
     (word,) = shlex.split(typed)
     assert FilePath(word).read_text() == "schema = 1"

@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 from PIL import Image
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, PIXELS, TONES, draw_panel, stored
 from puncture_twin.twin.report.slices.planes import capsule, ellipse, letters, needle_planes, outline
 from puncture_twin.twin.report.slices.sheet import NO_CT, draw_slices, write_sheet

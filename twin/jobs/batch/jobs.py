@@ -14,14 +14,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from puncture_twin.planning.base.errors import require_extra
 from puncture_twin.planning.base.output.manifest import MANIFEST_NAME
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.batch.cohort import read_cohort
 from puncture_twin.planning.batch.merge import (
     CASES_NAME,
     DATASET_NAME,
+    SCHEMA,
     CaseChange,
     compare,
     merged_rows,
@@ -199,8 +202,8 @@ MERGE_ENTRY = "batch merge"
 """Of the folder's manifest."""
 
 
-@dataclass(frozen=True)
-class Merged:
+@dataclass(frozen=True, repr=False)
+class Merged(Shown):
     """A merged cohort.
 
     Attributes:
@@ -212,6 +215,17 @@ class Merged:
     rows: Sequence[dict[str, Any]]
     files: tuple[Path, ...]
     changed: tuple[CaseChange, ...] | None = None
+
+    def to_pandas(self) -> Any:
+        """``cases.parquet`` as a pandas DataFrame: a row a case.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        require_extra("pandas", "to_pandas")
+        import pyarrow as pa
+
+        return pa.Table.from_pylist(list(self.rows), SCHEMA).to_pandas()
 
     @property
     def not_run(self) -> int:

@@ -15,19 +15,17 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Choice, parse_choice
+from puncture_twin.planning.search.choice import Choice, explain_choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
-from puncture_twin.planning.search.windows import Window, find_windows, nearest_row
-from puncture_twin.twin.jobs.patient.answers import explain_choice
-from puncture_twin.twin.jobs.patient.main_job import is_plan
+from puncture_twin.planning.search.windows import Window, nearest_row
+from puncture_twin.twin.jobs.patient.main_job import is_plan, read_noted_plan
 from puncture_twin.twin.jobs.patient.summaries import plan_summary
 from puncture_twin.twin.report.present import NOTHING, Block, Field, Section, Table, facts, number, text
 
@@ -104,7 +102,7 @@ def compare_source(
     if plans is None:
         choices = parse_two(*stated)
         return compare_choices(prepare(source, arm=arm, watcher=watcher), choices)
-    return compare_plans(plans, None if case is None else prepare(case, watcher=watcher))
+    return compare_plans(plans, None if case is None else prepare(case, watcher=watcher), watcher.note)
 
 
 def compare_choices(context: CaseContext, choices: tuple[Choice, Choice]) -> Comparison:
@@ -114,19 +112,38 @@ def compare_choices(context: CaseContext, choices: tuple[Choice, Choice]) -> Com
         InputError: A rank or window that there is not, or a point that is no skin entry.
         NoAnswerError: Nothing is safe, so that there are no ranks.
     """
-    found = context.search()
-    a, b = (_chosen_side(context, found, choice) for choice in choices)
+    found, space = context.search(), context.case.space
+    a, b = ((choice.text(space), explain_choice(context, choice, found)) for choice in choices)
+    return compare_paths(context, found, a, b)
+
+
+Titled = tuple[str, Explanation | Plan]
+"""A path, and how it was chosen or where its plan is."""
+
+
+def compare_paths(context: CaseContext, found: Candidates, *paths: Titled) -> Comparison:
+    """Two directions or plans of a case, beside what its search says of them; a plan is checked again.
+
+    Raises:
+        InputError: A plan that does not hold any more.
+    """
+    a, b = (
+        _planned_side(context, found, Path(title), path)
+        if isinstance(path, Plan)
+        else _explained_side(found, title, path)
+        for title, path in paths
+    )
     read = [one for side in (a, b) if side.explained is not None for one in side.explained.read]
     return Comparison(context.case.name, (*read, *context.case.inputs), a, b, tuple(context.anatomy.warnings))
 
 
-def compare_plans(paths: tuple[Path, Path], context: CaseContext | None) -> Comparison:
+def compare_plans(paths: tuple[Path, Path], context: CaseContext | None, note: Callable[[str], None]) -> Comparison:
     """Two plans; with their case each is checked again.
 
     Raises:
         InputError: A plan that cannot be used, or does not hold any more.
     """
-    read = [_read(path) for path in paths]
+    read = [read_noted_plan(path, note) for path in paths]
     inputs = tuple(source for source, _ in read)
     plans = [plan for _, plan in read]
     if context is None:
@@ -134,9 +151,9 @@ def compare_plans(paths: tuple[Path, Path], context: CaseContext | None) -> Comp
         names = sorted({plan.case_name for plan in plans})
         read_by_both = (*inputs, *plans[0].inputs, *plans[1].inputs)
         return Comparison(" and ".join(names), read_by_both, a, b, _differing(*plans))
-    found = context.search()
-    a, b = (_planned_side(context, found, path, plan) for path, plan in zip(paths, plans, strict=True))
-    return Comparison(context.case.name, (*inputs, *context.case.inputs), a, b, tuple(context.anatomy.warnings))
+    titled = zip(map(str, paths), plans, strict=True)
+    compared = compare_paths(context, context.search(), *titled)
+    return replace(compared, inputs=(*inputs, *compared.inputs))
 
 
 def _differing(a: Plan, b: Plan) -> tuple[str, ...]:
@@ -149,16 +166,10 @@ def _differing(a: Plan, b: Plan) -> tuple[str, ...]:
     return (f"the plans were not made from the same files ({', '.join(roles[:MOST_ROLES])}{more}): is it one case?",)
 
 
-def _read(path: Path) -> tuple[Input, Plan]:
-    found = read_output(path, max_bytes=MAX_PLAN_BYTES)
-    return found.input("plan"), parse_plan(found.data, path)
-
-
-def _chosen_side(context: CaseContext, candidates: Candidates, choice: Choice) -> Side:
-    explained = explain_choice(context, choice, candidates)
+def _explained_side(candidates: Candidates, title: str, explained: Explanation) -> Side:
     row = explained.candidates
     grid = _on_grid(candidates, row.outward_ct[0], safe=explained.safe)
-    return Side(choice.text(context.case.space), row.outward_ct[0], row.path.entry_ct[0], explained, grid)
+    return Side(title, row.outward_ct[0], row.path.entry_ct[0], explained, grid)
 
 
 def _stated_side(path: Path, plan: Plan) -> Side:
@@ -179,7 +190,7 @@ def _on_grid(candidates: Candidates, outward_ct: Floats, *, safe: bool) -> OnGri
     row = nearest_row(candidates, outward_ct)
     if row is None or not (safe and candidates.safe[row]):
         return OnGrid(None, float("nan"), None)
-    windows = find_windows(candidates)
+    windows = candidates.windows
     window = windows.windows[int(windows.of_row[row]) - 1]
     if np.linalg.norm(candidates.outward_ct[row] - outward_ct) > SAME_DIRECTION:
         return OnGrid(None, float("nan"), window)
@@ -256,8 +267,8 @@ class Side:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Shown):
     """Two paths.
 
     Attributes:

@@ -19,11 +19,17 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.geometry.spaces import to_lps
-from puncture_twin.planning.search.choice import BEST, Choice, Listed, ReadList, read_entries, read_targets
+from puncture_twin.planning.search.choice import (
+    BEST,
+    Choice,
+    Listed,
+    ReadList,
+    explain_choice,
+    read_entries,
+    read_targets,
+)
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, finite
-from puncture_twin.planning.search.windows import find_windows
-from puncture_twin.twin.jobs.patient.answers import explain_choice
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
 
@@ -66,7 +72,7 @@ def check_list(
 
     def aimed(row: Listed) -> CaseContext:
         point = to_lps(np.array([row.point_mm]), context.case.space)[0]
-        return prepare(path, arm=arm, target_ct=point)
+        return prepare(context.case.replace(target_ct=point), arm=arm)
 
     if entries is not None:
         checked = check_entries(context, read_entries(entries, context.case))
@@ -177,7 +183,7 @@ def check_targets(context: CaseContext, listed: ReadList, aimed: Callable[[Liste
     def outcome(row: Listed) -> Outcome:
         there = aimed(row)
         found = there.search()
-        windows = len(find_windows(found).windows)
+        windows = len(found.windows)
         counts = int(found.safe.sum()), windows
         try:
             explained = explain_choice(there, row.choice, found)

@@ -15,7 +15,6 @@ from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.formats.points import parse_coordinate
 from puncture_twin.planning.search.choice import Choice, choose, chosen_angles
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.planning.sweep.sweep_planner import SweepPlan, plan_sweep
 from puncture_twin.twin.jobs.patient.main_job import is_plan
 from puncture_twin.twin.jobs.terminal import write_result
@@ -143,7 +142,7 @@ def _ends(context: CaseContext, choice: Choice, to: Angles | None) -> tuple[Angl
     start = float(chosen.candidates.theta[row]), float(chosen.candidates.beta[row])
     if to is not None:
         return start, to
-    windows = find_windows(found)
+    windows = found.windows
     near = int(np.argmax(found.outward_ct @ chosen.candidates.outward_ct[row]))
     if not windows.of_row[near]:
         refuse("the direction lies in no window of the grid", "--sweep", "--to THETA,BETA", "no_window")

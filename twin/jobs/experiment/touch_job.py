@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,12 +13,13 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.search.choice import Choice, choose, chosen_angles
+from puncture_twin.planning.search.choice import Choice, choose
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.touch_planner import (
     TOUCHING_PADDING_MM,
@@ -69,8 +70,8 @@ def _no_use(why: str) -> dict[str, Any]:
     return {"why_not": why, "expected_tip_error_mm": None, "tip_error_mm": None, "fre_mm": None, "flags": []}
 
 
-@dataclass(frozen=True, eq=False)
-class TouchRun:
+@dataclass(frozen=True, eq=False, repr=False)
+class TouchRun(Shown):
     """What was planned, what was read, and what it is good for.
 
     Attributes:
@@ -90,6 +91,11 @@ class TouchRun:
     touched: Touched
     use: Use | str
     files: tuple[Path, ...] = ()
+
+    @property
+    def points(self) -> NamedPoints:
+        """The readings by their markers' names, base frame, mm, with the joints: what `registration` takes."""
+        return _points(self.touched)
 
     @property
     def suffices(self) -> bool:
@@ -141,15 +147,20 @@ def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> To
         NoAnswerError: Nothing is safe, or too few markers can be touched, with the reasons.
     """
     with writing(out, "touch", inputs=context.case.inputs, names=(TOUCH, SUMMARY), note=context.watcher.note) as draft:
-        planned = plan_tour(context, choice, seed)
-        touched, use = touch_once(context, planned, seed)
-        names = (TOUCH, SUMMARY) if touched.readings else (SUMMARY,)
-        files = draft.final(tuple(draft.folder / name for name in names))
-        run = TouchRun(context.case.name, context.case.inputs, seed, planned.plan, touched, use, files)
-        if touched.readings:
-            write_points(draft.folder / TOUCH, _points(touched))
+        run = touch(context, choice, seed)
+        names = (TOUCH, SUMMARY) if run.touched.readings else (SUMMARY,)
+        run = replace(run, files=draft.final(tuple(draft.folder / name for name in names)))
+        if run.touched.readings:
+            write_points(draft.folder / TOUCH, run.points)
         write_result(run.summary(), draft.folder / SUMMARY, out)
     return run
+
+
+def touch(context: CaseContext, choice: Choice, seed: int) -> TouchRun:
+    """Plan the touches and execute them in the twin; see `touch_case`."""
+    planned = plan_tour(context, choice, seed)
+    touched, use = touch_once(context, planned, seed)
+    return TouchRun(context.case.name, context.case.inputs, seed, planned.plan, touched, use)
 
 
 class Tour(NamedTuple):
@@ -214,8 +225,7 @@ def _use(context: CaseContext, tour: Tour, truth: TouchTruth, read: NamedPoints)
 def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
     """Joints (6,) with the tip on the target, and the direction outward (3,), of the best candidate of a choice."""
     with context.stages.time("search"):
-        found = context.search() if choice.of_grid else context.check(*chosen_angles(context.case, choice))
-        chosen = choose(context, found, choice)
+        chosen = choose(context, None, choice)
     rows = [row for row in chosen.rows if np.isfinite(chosen.candidates.arm.q_insertion[row]).all()]
     if not rows:
         what = "the arm reaches no such candidate: nothing to touch the markers for"

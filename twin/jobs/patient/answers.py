@@ -1,9 +1,9 @@
-"""The commands that answer without writing files: check, register, verify."""
+"""The commands that answer without writing files: register, verify."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -18,8 +18,7 @@ from puncture_twin.planning.base.errors import InputListError, Severity, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.read_case import load_case
+from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.certify.certificate import MAX_CERTIFICATE_BYTES, parse_certificate
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.formats.points import MAX_FILE_BYTES, parse_points, parse_triple
@@ -33,42 +32,12 @@ from puncture_twin.planning.registration.method import LEAST_FOUND_MM
 from puncture_twin.planning.registration.placement import OneMore, odd_branches, one_more, without_each
 from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.registration.residuals import INTERVAL
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Choice, choose, chosen_angles, refuse_other_entry, with_file_read
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.twin.jobs.patient.budget import budget_facts, correction_facts
 from puncture_twin.twin.jobs.patient.summaries import registration_summary
 from puncture_twin.twin.report import patient
 from puncture_twin.twin.report.present import Section, text, vector
-
-
-def check_candidate(context: CaseContext, choice: Choice) -> Explanation:
-    """Evaluate one direction and explain it; one of a rank or window is searched for first.
-
-    Raises:
-        InputError: See `chosen_angles`, `choose`.
-        NoAnswerError: Nothing is safe, so that there are no ranks.
-    """
-    return explain_choice(context, choice, context.search() if choice.of_grid else None)
-
-
-def explain_choice(context: CaseContext, choice: Choice, candidates: Candidates | None) -> Explanation:
-    """Explain a choice, safe or not, with the search of the case where it is of one.
-
-    Raises:
-        InputError: See `chosen_angles`, `choose`; an entry where the path does not enter.
-        NoAnswerError: Nothing is safe, so that there are no ranks.
-    """
-    if choice.of_grid:
-        assert candidates is not None
-        chosen, rows = choose(context, candidates, choice)
-        return context.explain(chosen.theta[rows[0]], chosen.beta[rows[0]])
-    choice = with_file_read(context.case, choice)
-    explained = context.explain(*chosen_angles(context.case, choice))
-    refuse_other_entry(context.case, explained.candidates, choice)
-    return replace(explained, read=choice.read)
 
 
 def register_report(

@@ -19,6 +19,7 @@ from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
 from puncture_twin.planning.base.strict_json import parse_json
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.search.candidates import ANGLE_DIGITS
 from puncture_twin.planning.search.choice import BEST, Choice
 from puncture_twin.twin.jobs.patient.main_job import is_plan
@@ -32,8 +33,8 @@ ROUNDED = ("theta_deg", "beta_deg")
 """Tables of older versions have 59.99999999999999 for 60."""
 
 
-@dataclass(frozen=True)
-class ExportedTable:
+@dataclass(frozen=True, repr=False)
+class ExportedTable(Shown):
     """What was written."""
 
     format_name: str

@@ -12,21 +12,30 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.files import atomic, check_writable
 from puncture_twin.planning.base.output.output_set import writing
-from puncture_twin.planning.base.progress import Watcher
+from puncture_twin.planning.base.progress import Silent, Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.export.exporter import Exported, format_names
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
 from puncture_twin.planning.export.slicer import NAMES, SLICER, SceneContent, entry_area, slicer_files
+from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import with_case_arm
-from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan
+from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, choose, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.twin.jobs.patient.candidates_export import CANDIDATE_FORMATS, TABLE, export_candidates, table_of
-from puncture_twin.twin.jobs.patient.main_job import case_of, export, export_case, is_plan, plan_case, search_case
+from puncture_twin.planning.search.explain import Explanation
+from puncture_twin.twin.jobs.patient.candidates_export import (
+    CANDIDATE_FORMATS,
+    TABLE,
+    ExportedTable,
+    export_candidates,
+    table_of,
+)
+from puncture_twin.twin.jobs.patient.main_job import case_of, export, is_plan, plan_case, read_noted_plan, search_case
 from puncture_twin.twin.jobs.patient.summaries import export_summary
 from puncture_twin.twin.report.present import Section, Warn, text
 
@@ -38,27 +47,14 @@ NOTES = (
 )
 
 
-def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, choice: Choice) -> Exported:
-    """Check a plan against its case again, or make it; write the four files.
-
-    Args:
-        context: The case.
-        plan_path: The plan; None plans what is chosen, into the same folder.
-        out: Where they go.
-        choice: Of the candidate, where there is no plan yet.
+def export_to_moveit(context: CaseContext, plan_path: Path, out: Path) -> Exported:
+    """Check a plan against its case again; write the four files.
 
     Raises:
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
-        NoAnswerError: No plan.
     """
     note = context.watcher.note
-    if plan_path is None:
-        plan_case(context, out, choice)
-        plan_path = out / "plan.json"
-    found = read_output(plan_path, max_bytes=MAX_PLAN_BYTES)
-    if found.note:
-        note(f"warning: {found.note}")
-    source, plan = found.input("plan"), parse_plan(found.data, plan_path)
+    source, plan = read_noted_plan(plan_path, note)
     check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     plan = with_case_arm(plan, context.case)
     names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
@@ -70,6 +66,36 @@ def export_to_moveit(context: CaseContext, plan_path: Path | None, out: Path, ch
                 temporary.write_text(text, encoding="ascii")
     path = draft.final(tuple(draft.folder / name for name in names))[0]
     return Exported(path, MOVEIT, NOTES, inputs, plan)
+
+
+def export_value(
+    source: Plan | Candidates | Explanation, format_name: str, folder: Path | str, context: CaseContext | None
+) -> Exported | ExportedTable | SlicerExport:
+    """Write what is in memory: a plan for a robot, a table of candidates, or a checked direction for 3D Slicer.
+
+    Raises:
+        InputError: A format of another source, or see the functions that write.
+    """
+    refuse_format(format_name)
+    kind = Candidates if format_name in CANDIDATE_FORMATS else Explanation if format_name == SLICER else Plan
+    if not isinstance(source, kind):
+        what = f"'{format_name}' is not written from a value of type {type(source).__name__}"
+        refuse(what, "export", f"one of type {kind.__name__}", "wrong_type")
+    if context is None and format_name in (MOVEIT, SLICER):
+        refuse(f"the scene of {format_name} is the case's", "export", "context=... beside it", "missing_option")
+    out, note = check_writable(folder), Silent().note
+    if isinstance(source, Candidates):
+        return export_candidates(source.write(out), format_name, out, note)
+    if isinstance(source, Explanation):
+        assert context is not None
+        one = source.candidates
+        return export_to_slicer(context, out, Choice(angles=(float(one.theta[0]), float(one.beta[0]))))
+    with writing(out, "plan", inputs=source.inputs, names=("plan.json",)) as draft:
+        write_plan(source, draft.folder / "plan.json")
+    if format_name == MOVEIT:
+        assert context is not None
+        return export_to_moveit(context, out / "plan.json", out)
+    return export(out / "plan.json", format_name, out, context, note)
 
 
 class Export(NamedTuple):
@@ -124,12 +150,14 @@ def export_source(
     if format_name == MOVEIT and planned_case is None:
         refuse("moveit's scene is the case's", source, "export plan.json --case CASE", "missing_option")
     context = None if planned_case is None else prepare(planned_case, watcher=watcher)
+    plan_path = source
+    if context is not None and not is_plan(source):
+        plan_case(context, out, choice)
+        plan_path = out / "plan.json"
     if format_name == MOVEIT and context is not None:
-        done = export_to_moveit(context, source if is_plan(source) else None, out, choice)
-    elif context is None or is_plan(source):
-        done = export(source, format_name, out, context, watcher.note)
+        done = export_to_moveit(context, plan_path, out)
     else:
-        done = export_case(context, format_name, out, choice)
+        done = export(plan_path, format_name, out, context, watcher.note)
     return Export(done, export_summary(done, context is not None), export_text(done, context is not None))
 
 
@@ -145,8 +173,8 @@ def export_text(done: Exported, case_checked: bool) -> str:
 NO_APPROACH = "the directions were checked; no approach of the arm was planned"
 
 
-@dataclass(frozen=True)
-class SlicerExport:
+@dataclass(frozen=True, repr=False)
+class SlicerExport(Shown):
     """What was written.
 
     Attributes:

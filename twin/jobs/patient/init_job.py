@@ -14,8 +14,8 @@ from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.toml_file import parse_toml
+from puncture_twin.planning.case.case import ALLOWED_CASE
 from puncture_twin.planning.case.case_file import CaseFile, Region
-from puncture_twin.planning.case.read_case import ALLOWED_CASE
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.case_text import with_image_seen
 from puncture_twin.planning.init.overrides import WAYS, with_keys

@@ -24,8 +24,9 @@ from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
-from puncture_twin.planning.search.choice import BEST, Choice, Pick, choose, choose_stated, with_file_read
-from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE, CaseContext
+from puncture_twin.planning.search.candidates import Pick
+from puncture_twin.planning.search.choice import BEST, Choice, choose_stated, with_file_read
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
 
@@ -97,7 +98,7 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
     """
-    _refuse_without_arm(context)
+    context.require_arm()
     choice = _stated(context, out, choice)
     with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES), read=choice.read) as draft:
         run = Run(context, context.search(), (), read=choice.read)
@@ -123,7 +124,7 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
     from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
 
-    _refuse_without_arm(context)
+    context.require_arm()
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names, read=choice.read) as draft, two_stages() as begin:
@@ -155,11 +156,6 @@ def demo_case(context: CaseContext, out: Path) -> Run:
     """`rehearse_case`, in `DEMO_ROOMS` rooms where the case declares errors and has markers."""
     rooms = None if context.chance is None else RoomCount(DEMO_ROOMS)
     return rehearse_case(context, out, rooms)
-
-
-def _refuse_without_arm(context: CaseContext) -> None:
-    if context.reach is None:
-        refuse(NO_BASE, context.case.path, ALLOWED_BASE, "no_base")
 
 
 def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
@@ -231,7 +227,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
-    source, plan = _read_plan(plan_path, context.watcher.note)
+    source, plan = read_noted_plan(plan_path, context.watcher.note)
     with context.stages.time("plan"):
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     plan = with_case_arm(plan, context.case)
@@ -244,24 +240,13 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     return _final(run, draft)
 
 
-def _read_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
+def read_noted_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
     """A plan of a whole set, or with a warning from outside of any, and the hash of the bytes that it was read from."""
     found = read_output(path, max_bytes=MAX_PLAN_BYTES)
     plan = parse_plan(found.data, path)
     if found.note:
         note(f"warning: {found.note}")
     return found.input("plan"), plan
-
-
-def export_case(context: CaseContext, format_name: str, out: Path, choice: Choice) -> Exported:
-    """Plan what is chosen, write everything that `plan_case` writes, and the plan for a robot beside it.
-
-    Raises:
-        InputError: See `plan_case`, `export`.
-        NoAnswerError: No plan.
-    """
-    plan_case(context, out, choice)
-    return export(out / "plan.json", format_name, out, context, context.watcher.note)
 
 
 def export(
@@ -275,7 +260,7 @@ def export(
     from puncture_twin.planning.export.exporter import export_name, export_plan
     from puncture_twin.planning.plan.recheck import check_plan
 
-    source, plan = _read_plan(plan_path, note)
+    source, plan = read_noted_plan(plan_path, note)
     if context is not None:
         check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
     checker = None if context is None or context.reach is None else context.reach.checker
@@ -284,6 +269,13 @@ def export(
     with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
         done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
     return replace(done, path=draft.final((done.path,))[0], inputs=inputs)
+
+
+def report_case(run: Run, out: Path) -> Run:
+    """Write the pictures and the page of what is known."""
+    with _writing(out, "report", run.context, PICTURES) as draft:
+        run = _with_pictures(run, draft.folder)
+    return _final(run, draft)
 
 
 def _certified(run: Run, wanted: CertifyOptions, out: Path) -> Run:
@@ -308,8 +300,7 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
     context = run.context
     try:
         with context.stages.time("plan"):
-            chosen = choose(context, run.candidates, choice)
-            plan, found, row = make_plan(context, chosen.candidates, seed=context.case.rehearsal.seed, rows=chosen.rows)
+            plan, found, row = make_plan(context, run.candidates, choice)
     except NoAnswerError as error:
         return replace(run, refusal=str(error).removeprefix(NO_PLAN))
     write_plan(plan, out / "plan.json")
@@ -320,7 +311,7 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
 def _with_table(run: Run, out: Path) -> Run:
     path = out / "candidates.parquet"
     with run.context.stages.time("table"):
-        write_table(run.candidates, run.context.provenance(), path)
+        write_table(run.candidates, path)
     return run.with_files(path)
 
 

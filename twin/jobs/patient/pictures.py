@@ -14,7 +14,7 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.checks.places import touchable_points
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.twin.jobs.patient.budget import budget_facts
@@ -54,7 +54,7 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
         T_base_ct = _checked_base(run)
         draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, T_base_ct, failed=bool(run.refusal))
     with stages.time("slices"):
-        pick = run.pick or best_pick(found)
+        pick = run.pick or found.best
         subject = None if pick is None else _subject(context, pick, run.plan)
         if subject is not None:
             write_sheet(draw_slices(subject), out / SLICES)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from puncture_twin.planning.place.search import (
     write_place_document,
     write_placements,
 )
-from puncture_twin.planning.search.candidates import ARM_CHECKED
+from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.constraints import with_answers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
@@ -129,8 +129,25 @@ def place_case(
     return replace(run, files=draft.final(run.files))
 
 
-def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: float) -> PlaceRun:
-    """Search, and write everything into a folder."""
+class Places(NamedTuple):
+    """The directions that the organs allow, and where the arm should stand to reach them."""
+
+    candidates: Candidates
+    found: PlaceSearch
+
+
+def find_places(context: CaseContext, jobs: int, until: float = np.inf) -> Places:
+    """Search for a place to stand the arm.
+
+    Args:
+        context: The case, whose own arm need not be checked.
+        jobs: Processes.
+        until: `time.perf_counter` at which it ends with what is known then; infinite for a search to its end.
+
+    Raises:
+        InputError: Bounds that contradict the case.
+        NoAnswerError: No direction is safe for the organs.
+    """
     case, stages = context.case, context.stages
     with stages.time("organs"):
         candidates = organ_candidates(case, context.anatomy, context.engine, case.directions())
@@ -141,9 +158,16 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: f
             candidates,
             context.placement,
             jobs=jobs,
-            goes_on=_Clock(context, until - PICTURES_S * pictures),
+            goes_on=_Clock(context, until),
             first=lambda one: context.watcher.note(_first_text(one)),
         )
+    return Places(candidates, found)
+
+
+def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: float) -> PlaceRun:
+    """Search, and write everything into a folder."""
+    case, stages = context.case, context.stages
+    candidates, found = find_places(context, jobs, until - PICTURES_S * pictures)
     document = place_document(found, context.provenance() | {"arm": ARM_CHECKED})
     if not found.complete:
         document["warnings"] = [*document["warnings"], _ended_text(found)]

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.anatomy.anatomy import Anatomy
     from puncture_twin.planning.case.case import Case
     from puncture_twin.planning.plan.plan import Plan
+    from puncture_twin.planning.search.context import CaseContext
     from puncture_twin.twin.plant.truth import Truth
     from puncture_twin.twin.rehearsal.result import Rehearsal, Scale
 
@@ -58,6 +59,20 @@ def _execute(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
     from puncture_twin.twin.rehearsal.rehearsal import rehearse
 
     return rehearse(plan, case, anatomy, truth)
+
+
+def rehearse_once(context: CaseContext, plan: Plan, rooms: RoomCount | None, seed: int | None) -> Rehearsal:
+    """A plan executed where the truth differs: the drawn one, or the median one of many rooms.
+
+    Raises:
+        InputError: See `plan_truth`, `in_rooms`.
+    """
+    found = None if rooms is None else in_rooms(context, plan, rooms, seed)
+    truth = plan_truth(context, plan, seed) if found is None else median_truth(found)
+    scale = error_scale(context, plan.insertion.q[-1], found)
+    rehearsal = _execute(plan, context.case, context.anatomy, truth)
+    standing = None if scale is None else scale.of(rehearsal.tip_error_mm)
+    return replace(rehearsal, standing=standing, distribution=found)
 
 
 def _film(rehearsal: Rehearsal, plan: Plan, case: Case, anatomy: Anatomy, path: Path) -> Path:
@@ -125,23 +140,26 @@ def begin_rehearsal(run: Run, rooms: RoomCount | None, begin: Begin) -> PendingR
     """
     assert run.plan is not None
     context, plan = run.context, run.plan
-    run = run if rooms is None else replace(run, distribution=_distribution(run, rooms))
+    run = run if rooms is None else replace(run, distribution=in_rooms(context, plan, rooms))
     found = run.distribution
     truth = plan_truth(context, plan) if found is None else median_truth(found)
     scale = error_scale(context, plan.insertion.q[-1], found)
     return PendingRehearsal(run, begin, begin(_execute, plan, context.case, context.anatomy, truth), scale)
 
 
-def _distribution(run: Run, count: RoomCount) -> Distribution:
-    assert run.plan is not None
-    context = run.context
+def in_rooms(context: CaseContext, plan: Plan, count: RoomCount, seed: int | None = None) -> Distribution:
+    """A plan's tip errors over many rooms, each with a truth of its own; the case's seed by default.
+
+    Raises:
+        InputError: The case declares no errors, or has no markers.
+    """
+    seed = context.case.rehearsal.seed if seed is None else seed
     with context.stages.time("rooms"):
-        q = run.plan.insertion.q[-1]
-        found = rehearse_trials(context, run.plan.outward_ct, q, count.rooms, context.case.rehearsal.seed)
+        found = rehearse_trials(context, plan.outward_ct, plan.insertion.q[-1], count.rooms, seed)
     if not (count.physics and len(found)):
         return found
     from puncture_twin.twin.rehearsal.plan_truth import physics_trials
 
     with context.stages.time("physics"):
         again = partial(context.watcher.count, "rooms in the simulator")
-        return replace(found, physics=physics_trials(context, run.plan, found, count.physics, again))
+        return replace(found, physics=physics_trials(context, plan, found, count.physics, again))

@@ -14,13 +14,12 @@ from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.bedside import EntryFacts
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import needle_warnings, reason_text
 from puncture_twin.planning.search.sides import sides_text
-from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
+from puncture_twin.planning.search.windows import MOST_WINDOWS
 from puncture_twin.twin.jobs.patient.summaries import (
     plan_summary,
     rehearsal_failures,
@@ -92,7 +91,7 @@ class Run:
         """The path of the plan, else of the best direction, for whoever stands at the patient; None without either."""
         if self.plan is not None:
             return self.context.entry_facts(self.plan.entry_ct, self.plan.outward_ct)
-        pick = self.pick or best_pick(self.candidates)
+        pick = self.pick or self.candidates.best
         if pick is None:
             return None
         found, row = pick
@@ -113,7 +112,7 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees."""
         found, provenance = self.candidates, self.context.provenance()
-        found_windows = find_windows(found)
+        found_windows = found.windows
         windows, largest = found_windows.windows, found_windows.largest
         at_patient = {} if self.facts is None else self.facts.summary()
         return {
@@ -172,7 +171,7 @@ class Run:
         looked = f", looked from: {sides_text(sides, searched=True)}" if sides else ""
         warned = (*needle_warnings(self.context.case, found), *(one.sentence for one in found.findings))
         return [
-            Section(f"case {self.context.case.name}: {find_windows(found).headline}", []),
+            Section(f"case {self.context.case.name}: {found.windows.headline}", []),
             Section(f"{len(found)} direction{'s' if len(found) != 1 else ''}{looked}", patient.counts(found)),
             *(Section(one, []) for one in warned),
             Section("the best of each window", patient.windows(found)) if found.safe.any() else self._nothing_safe(),

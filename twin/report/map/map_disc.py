@@ -19,8 +19,7 @@ from scipy import ndimage
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.search.candidates import Candidates, Verdict
-from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.candidates import Candidates, Pick, Verdict
 from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.figures import halo
 from puncture_twin.twin.report.map.map_raster import MapRaster, shown_front

@@ -18,8 +18,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
 from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, Reason, Rgb, css
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.report.figures import figure_of, write_png
 from puncture_twin.twin.report.map.map_disc import (
@@ -86,7 +85,7 @@ def draw_map(
 
 def map_figure(candidates: Candidates, case: Any, pick: Pick | None = None, raster: MapRaster | None = None) -> Figure:
     """The map, arguments as of `draw_map`; the disc is the first of its axes, the column the second."""
-    pick = pick or best_pick(candidates)
+    pick = pick or candidates.best
     view = map_view(case, candidates)
     figure = figure_of(WIDTH, HEIGHT, dpi=DPI)
     raster = map_raster(candidates, view) if raster is None else raster
@@ -267,7 +266,7 @@ def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> 
         box |= {"facecolor": "#ffe9e0", "edgecolor": "#b03000"}
         look |= {"fontsize": 13, "weight": "bold", "color": "#a02000"}
     else:
-        word = "Best" if pick == best_pick(candidates) else "Chosen"
+        word = "Best" if pick == candidates.best else "Chosen"
         found, row = pick
         theta, beta = np.degrees(found.theta[row]), np.degrees(found.beta[row])
         text = (

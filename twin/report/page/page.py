@@ -19,8 +19,7 @@ from puncture_twin.planning.base.errors import Severity
 from puncture_twin.planning.formats.dicom.storage import is_dicom_file
 from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.bedside import EntryFacts
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, chance_text
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.twin.report import patient
@@ -122,7 +121,7 @@ class Shown:
     @property
     def chosen(self) -> Pick | None:
         """The pick, or the best direction."""
-        return self.pick or best_pick(self.candidates)
+        return self.pick or self.candidates.best
 
 
 def write_page(shown: Shown, path: Path) -> None:
@@ -230,7 +229,7 @@ def _cards(shown: Shown) -> list[Card]:
     cards = [] if breakdown is None else [chance_card(breakdown)]
     cards.append(_window_card(candidates))
     if shown.chosen is not None:
-        cards.append(_direction_card(*shown.chosen, best=shown.chosen == best_pick(candidates)))
+        cards.append(_direction_card(*shown.chosen, best=shown.chosen == candidates.best))
     if not candidates.arm_checked:
         cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
     if shown.plan is None:

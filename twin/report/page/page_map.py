@@ -12,8 +12,7 @@ from PIL import Image
 
 from puncture_twin.planning.base.arrays import Ints
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
-from puncture_twin.planning.search.candidates import NOT_SEEN, Candidates
-from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.candidates import NOT_SEEN, Candidates, Pick
 from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
 from puncture_twin.twin.report.map.map_raster import PIXELS as FINE, MapRaster, map_raster, shown_front

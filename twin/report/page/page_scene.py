@@ -20,8 +20,7 @@ from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report.map_view import body_directions
 from puncture_twin.twin.report.raster.render import Layer
 from puncture_twin.twin.report.scene.scene_parts import (

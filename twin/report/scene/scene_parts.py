@@ -22,8 +22,7 @@ from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.geometry.containment import hit_fraction
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.raster.render import Layer, Surface
 from puncture_twin.twin.report.scene.shapes import ball, bar, corridor_mouth, corridor_walls, ring

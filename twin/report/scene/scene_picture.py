@@ -12,8 +12,7 @@ from PIL import Image, ImageDraw
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import SAFE, Rgb
-from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.choice import Pick, best_pick
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report import annotate, palette
 from puncture_twin.twin.report.numbers import nearest_text, target_text
 from puncture_twin.twin.report.present import number
@@ -76,7 +75,7 @@ def draw_scene(
         T_base_ct: Shape (4, 4), mm, of a search whose arm was checked.
         failed: Whether a plan was requested, and there is none.
     """
-    pick = pick or best_pick(candidates)
+    pick = pick or candidates.best
     T_base_ct = T_base_ct if plan is None else plan.T_base_ct
     bodies = [*patient(anatomy, case), *safe_region(candidates, case), *room(case, T_base_ct)]
     direction = chosen_direction(pick, plan)

@@ -13,7 +13,7 @@ from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.search.bending import insertion_along
-from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.numbers import clearance_text
 from puncture_twin.twin.report.palette import OUTSIDE, organ_colours
 from puncture_twin.twin.report.present import number

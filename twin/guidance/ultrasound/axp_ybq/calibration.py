@@ -9,7 +9,7 @@ from scipy.stats import chi2, f
 
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import Finding, Severity
-from puncture_twin.planning.base.text import brief
+from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.geometry.rigid import log_rotation, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
@@ -41,7 +41,7 @@ NO_NOISE = Noise(0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(Shown):
     """X, Y and the needle in its flange frame, from A X P = Y B Q.
 
     Attributes:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.base.text import brief
+from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from puncture_twin.planning.formats.points import joint_readings
 
@@ -52,7 +52,7 @@ SPEC_NOISE = Noise(robot_mm=0.1, robot_rad=np.radians(0.03), image_mm=0.3, direc
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class Recording(Shown):
     """Poses of both arms with the needle seen in the image. Checked when made; the arrays are read-only.
 
     Attributes:

@@ -1,0 +1,201 @@
+"""What the functions of the public API take and give: everything shows itself, nothing foreign is raised."""
+
+import inspect
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from case_world import coarse_carton
+from cohort_world import write_cohort
+from refusals import refused
+from whole_html import Whole
+
+import puncture_twin as pt
+from puncture_twin.meshes import folder
+from puncture_twin.planning.place.search import PlaceSearch
+from puncture_twin.twin.guidance.ultrasound.recording_file import write_recording
+from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
+from puncture_twin.twin.jobs.patient import place_job
+
+FUNCTIONS = {name: getattr(pt, name) for name in pt.__all__ if inspect.isfunction(getattr(pt, name))}
+CARTON = folder() / "carton"
+TARGET = (50.0, 130.0, 63.0)
+
+
+@pytest.fixture(scope="module")
+def context():
+    """The carton, organs alone."""
+    return pt.prepare(CARTON / "case_m.toml", arm=False)
+
+
+@pytest.fixture(scope="module")
+def given(context, tmp_path_factory):
+    """Something good for each argument, by its name."""
+    tmp = tmp_path_factory.mktemp("values")
+    recorded = simulate_recording(np.random.default_rng(1), 24)[0]
+    write_recording(recorded, tmp / "recording.csv")
+    armed = pt.prepare(coarse_carton(tmp / "carton"))
+    candidates = pt.search(context)
+    plan = pt.plan(armed)
+    pt.write_plan(plan, tmp / "plan.json")
+    certificate = pt.certify(context, size_deg=10.0)
+    markers = [pt.read_points(CARTON / name) for name in ("markers_ct.csv", "touch.csv")]
+    return {
+        "tmp": tmp, "armed": armed, "context": context, "candidates": candidates, "plan": plan,
+        "certificate": certificate, "markers_ct": markers[0], "markers_base": markers[1], "points": markers[0],
+        "recording": pt.read_recording(tmp), "case": CARTON / "case_m.toml", "cost": candidates.path.length,
+        "theta_deg": 10.0, "beta_deg": 20.0, "one": candidates.best, "other": candidates.pick(0),
+        "target_ct": TARGET, "format_name": "csv", "source": plan, "folder": tmp / "folder", "path": tmp / "nothing",
+        "cohort": tmp / "no_cohort", "target": TARGET,
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def values(given):
+    """What each function gives."""
+    tmp, armed, context, candidates = (given[name] for name in ("tmp", "armed", "context", "candidates"))
+    found, plan = pt.search(armed), given["plan"]
+    rehearsal = pt.rehearse(armed, plan, seeds=3)
+    return {
+        "init_case": context.case,
+        "load_case": context.case,
+        "prepare": armed,
+        "search": candidates,
+        "check": pt.check(context, candidate=candidates.best),
+        "check_many": pt.check_many(context, [10.0], [20.0]),
+        "rerank": pt.rerank(candidates, given["cost"]),
+        "plan": plan,
+        "read_plan": pt.read_plan(tmp / "plan.json", armed),
+        "register": pt.register(given["markers_ct"], given["markers_base"], target_ct=TARGET, method="triad"),
+        "certify": given["certificate"],
+        "verify": pt.verify(given["certificate"], context),
+        "rehearse": rehearsal,
+        "place": PlaceSearch(np.eye(4), (), 0, 1.0, (), None),
+        "touch": pt.touch(armed),
+        "compare": pt.compare(context, candidates.best, candidates.pick(0), candidates=candidates),
+        "export": pt.export(plan, "csv", tmp / "export"),
+        "batch": pt.batch(write_cohort(tmp / "cohort"), tmp / "results"),
+        "read_points": given["points"],
+        "read_mesh": pt.read_mesh(CARTON / "skin.ply"),
+        "read_recording": given["recording"],
+        "calibrate": pt.calibrate(given["recording"]),
+        "report": pt.report(armed, found, tmp / "report", plan=plan, rehearsal=rehearsal),
+        "check_folder": pt.check_folder(tmp / "report"),
+        "windows": candidates.windows,
+        "window": candidates.windows[0],
+        "of a table": pt.export(candidates, "candidates-json", tmp / "table"),
+    }
+
+
+WITHOUT = {"write_plan", "write_points", "read_certificate", "read_volume"}
+"""They return nothing, or what another one of the list returns; a volume is shown below."""
+
+
+def test_everything_that_a_function_returns_shows_itself(values):
+    """In a notebook: HTML that needs nothing from outside, with at least one fact; at a prompt: one short line."""
+    assert set(FUNCTIONS) - set(values) == WITHOUT
+    for name, value in values.items():
+        if isinstance(value, Path | tuple):
+            continue
+        shown = value._repr_html_()
+        assert "<td" in shown and "<pre>" not in shown, f"{name}: {shown[:200]}"
+        Whole(shown)
+        assert len(repr(value)) < 1600 and len(repr(value).splitlines()) == 1, name
+        assert repr(value).startswith(f"<{type(value).__name__}: "), repr(value)[:80]
+
+
+def test_what_they_return_is_what_the_commands_make(values, given):
+    """The rehearsal has its rooms, the cohort a row a case, the page and its set are whole, the readings register."""
+    assert len(values["rehearse"].distribution) == 3
+    frame = values["batch"].to_pandas()
+    assert list(frame["exit_code"]) == [0, 0, 2] and values["batch"].summary()["refused"] == 1
+    assert values["report"].name == "report.html" and values["check_folder"] == ()
+    assert values["export"].path.read_text().startswith("#")
+    assert set(values["touch"].points.names) == {"A", "B", "C"}
+    assert values["compare"].safe == bool(given["candidates"].safe[0])
+    assert values["verify"].safe == given["certificate"].summary()["safe_cells"]
+
+
+def test_where_the_arm_should_stand_goes_into_a_case(given, monkeypatch):
+    """What `place` finds is a mount as `replace` takes it; the search itself is tested with the planner."""
+    armed = given["armed"]
+    seen = []
+    monkeypatch.setattr(place_job, "search_placements", lambda *_, **keys: seen.append(keys["jobs"]) or "found")
+    assert pt.place(armed, jobs=1) == "found" and seen == [1]
+
+
+def test_an_export_that_is_not_of_its_source_is_refused(given):
+    """And one whose scene is the case's needs the case."""
+    wrong = ((given["plan"], "candidates-csv"), (given["candidates"], "urscript"), (given["plan"], "slicer"))
+    for source, name in wrong:
+        with refused("wrong_type"):
+            pt.export(source, name, given["folder"], context=given["armed"])
+    with refused("missing_option"):
+        pt.export(given["plan"], "moveit", given["folder"])
+    with refused("unknown_format"):
+        pt.export(given["plan"], "gcode", given["folder"])
+    assert not given["folder"].exists()
+
+
+HOSTILE = {
+    "nan": float("nan"),
+    "inf": float("inf"),
+    "complex": 1.0 + 2.0j,
+    "negative": -1,
+    "huge": 10**30,
+    "text": "x",
+    "null": "a\0b",
+    "surrogate": "\ud800",
+    "long": 5000 * "a",
+    "bytes": b"x",
+    "list": [],
+    "dict": {},
+    "ragged": [[1], [1, 2]],
+    "object": object(),
+    "array": np.zeros((2, 2)),
+    "nan array": np.full(3, np.nan),
+    "complex array": np.zeros(3, complex),
+    "texts": np.array(["a", "b", "c"]),
+    "truth": True,
+    "none": None,
+    "type": int,
+    "points": {"a": "b"},
+    "keys": {1: (0, 0, 0)},
+}
+
+
+@pytest.mark.parametrize("name", sorted(FUNCTIONS))
+def test_no_foreign_exception_leaves_a_function(name, given):
+    """Whatever one argument is, beside good ones: an answer, or one line; never an error of NumPy's or Python's."""
+    function, parameters = FUNCTIONS[name], inspect.signature(FUNCTIONS[name]).parameters
+    context = given["armed"] if name in ("touch", "rehearse", "read_plan") else given["context"]
+    good = given | {"context": context, **({"theta_deg": [10.0], "beta_deg": [20.0]} if name == "check_many" else {})}
+    required = {key: good[key] for key, one in parameters.items() if one.default is inspect.Parameter.empty}
+    for key, one in parameters.items():
+        for label, value in HOSTILE.items():
+            if value is one.default:
+                continue
+            call = partial(function, **{**required, key: value})
+            try:
+                call()
+            except pt.PlanningError as error:
+                assert str(error).isprintable() and len(str(error)) < 1600, f"{key} {label}"
+            except Exception as error:
+                pytest.fail(f"{name}({key}={label}): {type(error).__name__}: {error}")
+
+
+@pytest.mark.parametrize("label", HOSTILE)
+def test_no_foreign_exception_leaves_a_case_or_its_candidates(label, given):
+    """What is called on a value keeps the same promise."""
+    value, case, candidates = HOSTILE[label], given["context"].case, given["candidates"]
+    calls = [partial(case.replace, **{key: value}) for key in ("target_ct", "target", "mount", "needle", "search", "x")]
+    calls += [partial(case.replace, needle={"length_mm": value}), partial(candidates.pick, value)]
+    calls += [] if isinstance(value, str) and label == "text" else [partial(candidates.write, value)]
+    for call in calls:
+        try:
+            call()
+        except pt.PlanningError as error:
+            assert str(error).isprintable()
+        except Exception as error:
+            pytest.fail(f"{call}: {type(error).__name__}: {error}")
