@@ -52,10 +52,10 @@ def read_inputs(document: Any) -> tuple[Input, ...]:
         TypeError, KeyError, ValueError: It is no such list, or an input has two hashes in it.
     """
     if not isinstance(document, list):
-        raise TypeError("inputs is no list")
+        raise TypeError("inputs is not a list")
     inputs = tuple(Input(*(text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
     if len({_place(one) for one in inputs}) != len({(_place(one), one.sha256) for one in inputs}):
-        raise ValueError("an input stands twice, with two hashes")
+        raise ValueError("an input appears twice, with two hashes")
     return inputs
 
 
@@ -137,7 +137,7 @@ class InputFiles:
         known = self.sha256(name)
         content = read_input(self._folder / name, max_bytes=1 << 40, where=str(self._folder / name))
         if content_input("", name, content).sha256 != known:
-            refuse("has changed since it was read", self._folder / name, "start again", "input_changed")
+            refuse("has changed since it was read", self._folder / name, "run again", "input_changed")
         return content
 
     def sha256(self, name: str) -> str:

@@ -13,7 +13,7 @@ from puncture_twin.planning.base.arrays import Bools, Columns, Floats, Ints, Int
 from puncture_twin.planning.base.errors import Finding
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
-from puncture_twin.planning.base.text import Facts, brief, card, never_raises
+from puncture_twin.planning.base.text import Facts, brief, card, never_raises, plural
 from puncture_twin.planning.case.entry import AngleGrid
 from puncture_twin.planning.uncertainty.chance_model import Chances
 
@@ -207,7 +207,7 @@ class Candidates(Columns):
     @brief
     def __repr__(self) -> str:
         best = "" if not len(self.ranked) else "; best " + self._direction(int(self.ranked[0]))
-        return f"{len(self):,} directions, {int(self.safe.sum()):,} {self.safe_text}{best}; arm {self.arm_note}"
+        return f"{plural(len(self), 'direction')}, {int(self.safe.sum()):,} {self.safe_text}{best}; arm {self.arm_note}"
 
     def _direction(self, row: int) -> str:
         return f"theta {np.degrees(self.theta[row]):g} deg, beta {np.degrees(self.beta[row]):g} deg"
@@ -277,7 +277,7 @@ MOST_ROWS = 200_000
 @never_raises
 def candidates_html(candidates: Any) -> str:
     """A table of facts, and the map of the directions by verdict."""
-    title = f"{len(candidates):,} candidates, {int(candidates.safe.sum()):,} {candidates.safe_text}"
+    title = f"{plural(len(candidates), 'candidate')}, {int(candidates.safe.sum()):,} {candidates.safe_text}"
     return card(title, _facts(candidates), _map(candidates))
 
 

@@ -127,7 +127,7 @@ def test_a_declaration_that_is_too_small_is_a_warning(done, tmp_path, capsys):
     assert main(arguments) == OK
     summary = json.loads(capsys.readouterr().out)
     assert summary["arms"]["chi2_per_freedom"] > 1.5
-    assert any("declared too small" in warning for warning in summary["warnings"])
+    assert any("probably too small" in warning for warning in summary["warnings"])
 
 
 def test_a_recording_that_ends_within_a_line_is_a_warning(done, tmp_path, capsys):
@@ -135,7 +135,7 @@ def test_a_recording_that_ends_within_a_line_is_a_warning(done, tmp_path, capsys
     (tmp_path / "cut.csv").write_text((done / "recording.csv").read_text().rstrip("\n"))
     arguments = ["selfcal", "--recording", str(tmp_path / "cut.csv"), "--out", str(tmp_path / "out"), "--json"]
     assert main(arguments) == OK
-    said = "cut.csv: its last line does not end with a line break; was the file cut?"
+    said = "cut.csv: its last line has no line break at its end; was the file cut?"
     assert json.loads(capsys.readouterr().out)["warnings"] == [said]
 
 

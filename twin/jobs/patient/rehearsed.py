@@ -143,5 +143,5 @@ def _distribution(run: Run, count: RoomCount) -> Distribution:
     from puncture_twin.twin.rehearsal.plan_truth import physics_trials
 
     with context.stages.time("physics"):
-        again = partial(context.watcher.count, "rooms in the simulator")
+        again = partial(context.watcher.count, "trials in the simulator")
         return replace(found, physics=physics_trials(context, run.plan, found, count.physics, again))

@@ -32,7 +32,7 @@ TARGETS = 6
 UNSEEN = 60
 """Candidates per seed at which prediction and truth are compared."""
 
-NO_JOINTS = "{file}: no joints (columns A_q1_deg to B_q6_deg): the arms' errors that the case declares are not counted"
+NO_JOINTS = "{file}: no joints (columns A_q1_deg to B_q6_deg): the declared arm errors of the case are not counted"
 
 RANDOM_SETS = 50
 """Random choices that the informative one is compared with."""
