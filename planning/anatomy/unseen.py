@@ -180,10 +180,7 @@ def _finding(view: FieldOfView, what: Assumed, own: str) -> Finding:
     names = ", ".join(name for name, (axis, end) in SIDES.items() if view.cut[axis, end])
     everything = bool(np.isinf(what.wider_mm))
     wide = "all space beyond it" if everything else f"the body extended, {what.wider_mm:g} mm wider on each side,"
-    said = (
-        f"the body is cut at its {names} side: the skin is not known there, and {wide} counts as unknown for needle "
-        "and arm"
-    )
+    said = f"the body is cut at its {names} side: the skin is not known there, and {wide} is unknown to needle and arm"
     way_out = '; [ct] arms = "none" if no arm is there, or beyond_mm' if everything else ""
     numbers = {"beyond_mm": "all" if everything else what.wider_mm}
     return Finding(BEYOND_IMAGE, Severity.WARNING, f"{said} ({BEYOND_IMAGE}; {what.because}{way_out}{own})", numbers)

@@ -196,10 +196,7 @@ def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[Tr
         next_low, next_high = following.transformed(T_link_next).bounds[:, 2]
         gaps = [(a, b) for a, b in ((high, next_low), (next_high, low)) if b >= a - FLUSH_MM]
         if not model.shipped and (widest := max((b - a for a, b in gaps), default=0.0)) > MOST_GAP_MM:
-            what = (
-                f"the shapes of {LINK_NAMES[link]} and {LINK_NAMES[link + 1]} have a gap of {widest:.4g} mm between "
-                "them"
-            )
+            what = f"the shapes of {LINK_NAMES[link]} and {LINK_NAMES[link + 1]} are {widest:.4g} mm apart"
             allowed = (
                 f"shapes that touch along their joint's axis, within {MOST_GAP_MM:g} mm: check unit, scale and origin"
             )

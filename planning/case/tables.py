@@ -414,9 +414,7 @@ class PlaceSection(Section):
         if self.mounts is not None and (not self.mounts or len(set(self.mounts)) < len(self.mounts)):
             raise SchemaError(f"mounts {list(self.mounts)}: must have at least one, each once", "duplicate_name")
         if self.rail.across_mm is not None:
-            raise SchemaError(
-                "rail.across_mm: a rail is next to the table; rail_gap_mm is its distance", "key_not_of_it"
-            )
+            raise SchemaError("rail.across_mm: a rail is next to the table; use rail_gap_mm", "key_not_of_it")
         return self
 
 
@@ -450,9 +448,7 @@ class RegistrationSection(Section):
     @model_validator(mode="after")
     def _corrected(self) -> Self:
         if self.correct_joints_deg is not None and not self.correct:
-            raise SchemaError(
-                "correct_joints_deg needs correct = true: it is the insertion to correct for", "keys_together"
-            )
+            raise SchemaError("correct_joints_deg needs correct = true, the correction for it", "keys_together")
         if self.correct and self.method not in {None, "weighted"}:
             what = f'correct = true has its own fit; method "{self.method}" has another'
             raise SchemaError(what, "conflicting_keys")
@@ -478,7 +474,7 @@ class RegistrationSection(Section):
             raise SchemaError(what, "key_not_of_it")
         if self.transform_maps is None:
             raise SchemaError(
-                'transform needs transform_maps = "base_to_ct" (as Slicer saves a transform of the CT to the '
+                'transform needs transform_maps = "base_to_ct" (as Slicer saves a transform from the CT to the '
                 'robot) or "ct_to_base": the file does not state its direction',
                 "missing_key",
             )

@@ -58,10 +58,7 @@ NEVER_TESTED: Mapping[tuple[str, str], str] = MappingProxyType(
 
 NEVER_TOUCHING: Mapping[tuple[str, str], str] = MappingProxyType(
     {
-        (
-            "wrist_2",
-            "holder",
-        ): "the holder starts at the flange, beyond wrist 2, and points away from it at every angle",
+        ("wrist_2", "holder"): "the holder starts at the flange, beyond wrist 2, and points away at every angle",
         ("wrist_2", "needle"): "as the holder",
     }
 )

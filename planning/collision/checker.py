@@ -346,10 +346,7 @@ def _check_hanging(model: UrModel, links: Sequence[Link], solids: Solids, joined
                 low, high = shape.bounds
                 size = " x ".join(f"{edge:.4g}" for edge in high - low)
                 what = f"a shape of {body.name}, {size} mm, is not connected"
-                allowed = (
-                    f"connected shapes of one body, within {APART_MM:g} mm: check unit, scale and origin; or use one "
-                    "mesh"
-                )
+                allowed = f"connected shapes, within {APART_MM:g} mm: check unit, scale and origin; or use one mesh"
                 refuse(what, model_urdf(model).where, allowed, "shape_detached")
 
 

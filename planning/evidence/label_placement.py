@@ -33,7 +33,7 @@ from puncture_twin.planning.anatomy.structure import label_grids
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import Finding, Severity
-from puncture_twin.planning.base.text import first_few, plural
+from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.evidence.edges import (
     LEAST_SEEN,
@@ -398,11 +398,7 @@ def _findings(case: Case, scan: Scan, source: Source, found: Assessed) -> Iterat
     count = len(source.meshes)
     numbers: dict[str, Any] = {"source": source.name, "structures": float(count)}
     numbers |= {"z": round(found.z, 2)} if np.isfinite(found.z) else {}
-    of = (
-        f"{source.name} ({plural(count, 'structure')})"
-        if count > 1
-        else f"{source.name} ('{next(iter(source.meshes))}')"
-    )
+    of = f"{source.name} ({count} structures)" if count > 1 else f"{source.name} ('{next(iter(source.meshes))}')"
     if found.doubtful:
         slip = None if found.T is None else slip_of(found.T, found.middle_ct)
         place = "elsewhere" if slip is None else slip.text(own_grid=found.kind == "grid")

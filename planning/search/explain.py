@@ -27,10 +27,7 @@ NEAREST = 8
 COARSE_VOXEL_MM = 1.0
 """A surface drawn around voxels of this size is somewhere within half of it."""
 
-NO_CHANCES = (
-    "no chances to hit and to touch: they need markers, the arm, and a direction that is safe for the organs and the "
-    "arm"
-)
+NO_CHANCES = "no chances to hit and to touch: they need markers, the arm, and a direction safe for organs and arm"
 
 UNITS = {
     Reason.SKIN_ANGLE.value: "deg",
@@ -239,8 +236,7 @@ class Explanation:
         return [
             f"  breathing      {found.clearance[0]:8.2f} mm least clearance, at "
             f"{breathing.phase_text(float(found.worst_phase[0]))}",
-            "                 an inserted needle moves with the organ and bends: the verdict does not cover leaving "
-            "it in place",
+            "                 an inserted needle moves with the organ and bends: the verdict does not cover that",
         ]
 
     def _scan(self) -> list[str]:
@@ -315,9 +311,8 @@ def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
     lengths = candidates.path.length[freed]
     return [
         f"the needle is too short for {short.sum()} of {len(candidates)} directions: its longest path is "
-        f"{case.needle.longest_path_mm:g} mm; only its length rejects {freed.sum()} of them, of {lengths.min():.0f} "
-        "to "
-        f"{lengths.max():.0f} mm"
+        f"{case.needle.longest_path_mm:g} mm. {freed.sum()} of them, of {lengths.min():.0f} to "
+        f"{lengths.max():.0f} mm, are rejected for nothing else"
     ]
 
 

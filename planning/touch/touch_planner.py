@@ -218,13 +218,8 @@ def _task(context: CaseContext, q_insertion: Floats) -> _Task:
         refuse("no touches can be planned", context.case.path, ALLOWED, "no_markers")
     found = placement.registration.markers
     if len(found) > MOST_MARKERS:
-        what = plural(len(found), "marker")
-        refuse(
-            what,
-            f"{context.case.path}: registration",
-            f"at most {MOST_MARKERS}; choose with registration.use",
-            "too_many",
-        )
+        allowed = f"at most {MOST_MARKERS}; choose with registration.use"
+        refuse(plural(len(found), "marker"), f"{context.case.path}: registration", allowed, "too_many")
     believed = MarkerPairs(found.names, found.points_ct, apply(placement.T_base_ct, found.points_ct))
     return _Task(context, believed, cast(Method, placement.registration.method), q_insertion)
 

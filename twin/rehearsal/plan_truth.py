@@ -103,9 +103,7 @@ def median_truth(found: Distribution) -> Truth:
     """
     count = len(found) + found.unreached
     row = int(spread_rows(found, 1)[0]) if len(found) else 0
-    return _of_drawn(
-        found, row, f"the median of {plural(count, 'trial')}, seed {found.seed}, drawn from {_declared(found)}"
-    )
+    return _of_drawn(found, row, f"the median of {plural(count, 'trial')}, seed {found.seed}, from {_declared(found)}")
 
 
 def spread_rows(found: Distribution, count: int) -> Ints:

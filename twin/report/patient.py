@@ -220,9 +220,7 @@ def rooms(found: Mapping[str, Any] | None) -> list[Block]:
     if found is None:
         return []
     if found["realised_rms_mm"] is None:
-        return [
-            Warn((f"{plural(found['rooms'], 'trial')}: in none did the arm reach the pose that its registration gave",))
-        ]
+        return [Warn((f"{plural(found['rooms'], 'trial')}: the arm reached the pose of its registration in none",))]
     touched = (
         (f"touched {name.replace('_', ' ')}", fraction, found["p_touch_by_structure"][name])
         for name, fraction in found["touch_share_by_structure"].items()
@@ -354,8 +352,7 @@ def _advice(report: Mapping[str, Any]) -> list[Block]:
     if "one_insertion_95_mm" in report:
         said.append(
             f"one insertion ends within {report['one_insertion_95_mm']:.3f} mm in 95 of 100 cases, counting the "
-            "markers and the "
-            f"target, read {report['target_read']}; arm, needle and tissue add to it"
+            f"markers and the target, read {report['target_read']}; arm, needle and tissue add to it"
         )
     if "declaration" in report:
         said.append(report["declaration"]["text"])

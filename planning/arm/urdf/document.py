@@ -178,9 +178,7 @@ def _by_name(parts: Sequence[Named], what: str, where: Path) -> Mapping[str, Nam
 def _link(element: Element, where: Path) -> UrdfLink:
     name = _plain(element, "a link", where)
     if name in TAKEN:
-        refuse(
-            f"a link called '{name}'", where, f"any name except {', '.join(TAKEN)}, used by the tool", "reserved_name"
-        )
+        refuse(f"a link called '{name}'", where, f"any name except {', '.join(TAKEN)} (the tool)", "reserved_name")
     here = f"{where}: link '{name}'"
     shapes = tuple(_shape(one, here) for one in element.findall("collision"))
     return UrdfLink(name, shapes, element.find("visual") is not None, _weighs(element, here))
@@ -253,12 +251,7 @@ def _origin(element: Element, here: str) -> Floats:
     if not origins:
         return np.eye(4)
     if len(origins) > 1 or not set(origins[0].attrib) <= {"xyz", "rpy"}:
-        refuse(
-            "an <origin> with more than xyz and rpy, or two <origin>",
-            here,
-            "one <origin> with xyz and rpy",
-            "duplicate_element",
-        )
+        refuse("an <origin> with more than xyz and rpy, or two of them", here, "one <origin>", "duplicate_element")
     xyz, rpy = (
         _numbers(origins[0], key, 3, here) if key in origins[0].attrib else np.zeros(3) for key in ("xyz", "rpy")
     )

@@ -71,8 +71,8 @@ class CtSeries:
         notes = list(self.aside)
         if (tilt := self._series.grid.tilt_deg) > 0:
             notes.append(
-                f"{self.path.name}: scanned with the gantry tilted by {tilt:.1f} degrees; its slices were resampled "
-                "to a rectangular grid, and the part that they do not cover counts as not scanned"
+                f"{self.path.name}: scanned with the gantry tilted by {tilt:.1f} degrees; its slices were moved to "
+                "a rectangular grid, and the part that they do not cover counts as not scanned"
             )
         return (*notes, *self._series.notes)
 
@@ -170,12 +170,7 @@ def _filled(image: NDArray[np.float32]) -> NDArray[np.float32]:
 def _one(stated: set[tuple[str, str]], path: Path) -> tuple[str, str]:
     if len(stated) != 1:
         series, frames = (len({one[at] for one in stated}) for at in (0, 1))
-        refuse(
-            f"files of {series} series and {frames} frames of reference",
-            path,
-            "one series and one frame of reference",
-            "several_series",
-        )
+        refuse(f"files of {series} series and {frames} frames of reference", path, "one of each", "several_series")
     return next(iter(stated))
 
 

@@ -221,10 +221,7 @@ def choose_series(path: Path) -> SeriesFiles:
     read = {one.name: Entry(one.name, FILE) for one in found}
     left = unaccounted(folder, (*others, *read.values()), lambda path: path.name in read)
     if lost := [one for one in left if _may_be_slice(one, names)]:
-        what = (
-            "the folder has other files, which may be slices and cannot be read: "
-            f"{first_few([one.line for one in lost])}"
-        )
+        what = f"other files, possibly slices, cannot be read: {first_few([one.line for one in lost])}"
         allowed = "every slice of the series as a complete DICOM file (download or copy it again, or move it elsewhere)"
         refuse(what, path, allowed, "slices_not_read")
     aside = [one for one in found if one.name not in set(names)]

@@ -107,9 +107,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
         called: MaskVolume(path, files, (called,), placed.grid, partial(_mask, data, frames, placed, segment, path))
         for segment, called in names.items()
     }
-    notes = (
-        [] if ct else [f"{where}: the case's CT is not a DICOM series, so it is not known whether this was drawn on it"]
-    )
+    notes = [] if ct else [f"{where}: the case's CT is not a DICOM series, so this may belong to another CT"]
     if kind == "FRACTIONAL":
         notes.append(f"{where}: fractional segments; voxels of {HALF:g} or more count")
     return NamedMasks(masks, tuple(notes))
@@ -184,12 +182,7 @@ def _regular(planes: list[Plane], stated_mm: float | None, path: Path) -> tuple[
         if np.abs(other.axes_ct - first.axes_ct).max() > AXES_TOLERANCE or not np.allclose(
             other.spacing_mm, first.spacing_mm, rtol=SPACING_TOLERANCE
         ):
-            refuse(
-                "its frames have several orientations or pixel sizes",
-                path,
-                "one orientation and one pixel size",
-                "mixed_geometry",
-            )
+            refuse("its frames have several orientations or pixel sizes", path, "one of each", "mixed_geometry")
     origins = np.array([plane.origin_ct for plane in planes])
     along = origins @ first.normal_ct
     order = np.argsort(along, kind="stable")

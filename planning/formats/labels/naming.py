@@ -344,12 +344,8 @@ class ByName(Generic[T]):
         """
         names, known = list(names), [*names, *others]
         if missing := [name for name in names if self.of(name) is None]:
-            refuse(
-                f"{key}: no pattern for {first_few(missing)}",
-                where,
-                'a pattern for each; "*" matches the rest',
-                "no_rule",
-            )
+            allowed = 'a pattern for each; "*" matches the rest'
+            refuse(f"{key}: no pattern for {first_few(missing)}", where, allowed, "no_rule")
         for pattern in self.of_pattern:
             if not any(fnmatchcase(name, pattern) for name in known):
                 near = did_you_mean(pattern.strip("*?"), known)

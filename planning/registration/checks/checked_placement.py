@@ -146,11 +146,7 @@ def _reading(case: Case, skin: TriangleMesh, keys: str, T_base_ct: Floats) -> Re
 def _better(others: Sequence[Reading]) -> str:
     """Which other readings nothing speaks against, as the end of a sentence."""
     plausible = [one for one in others if one.plausible]
-    return (
-        f"; plausible alternatives: {_named(plausible)}"
-        if plausible
-        else "; no other reading of these keys is plausible"
-    )
+    return f"; alternatives: {_named(plausible)}" if plausible else "; no other reading of these keys is plausible"
 
 
 def _named(readings: Sequence[Reading]) -> str:
@@ -190,7 +186,7 @@ def _alike(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[Fi
         named = ", ".join(f"{one.keys} ({mm:.0f} mm away)" for one, mm in zip(alike, away, strict=True))
         said = (
             "registration: the stated transform cannot be distinguished from other readings, which place the target "
-            "elsewhere:  "
+            "elsewhere: "
             f"{named}{BOX_TELLS}"
         )
         yield Finding("transform_alike", Severity.WARNING, said)

@@ -83,12 +83,8 @@ def refuse_of_twin(*options: object) -> None:
         InputError: One of them is stated.
     """
     if any(option is not None for option in options):
-        refuse(
-            "twin options with recorded touches",
-            "pivot",
-            "JOINTS.csv, or the options of the twin",
-            "conflicting_options",
-        )
+        allowed = "JOINTS.csv, or the options of the twin"
+        refuse("twin options with recorded touches", "pivot", allowed, "conflicting_options")
 
 
 def pivot_case(case: Case, joints: Path) -> PivotRun:
