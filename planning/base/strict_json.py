@@ -142,7 +142,7 @@ def number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{_shown(value)} is not a number")
     if not abs(value) <= MAX_NUMBER:
-        raise ValueError(f"{_shown(value)} is beyond {MAX_NUMBER:g}")
+        raise ValueError(f"{_shown(value)} is beyond {MAX_NUMBER:,.0f}")
     return float(value)
 
 
@@ -162,9 +162,11 @@ def array(value: Any, shape: tuple[int, ...]) -> Floats:
     try:
         found = np.array(value, dtype=np.float64)
     except OverflowError as error:
-        raise ValueError(f"a number beyond {MAX_NUMBER:g}") from error
-    if found.shape != shape or not np.all(np.abs(found) <= MAX_NUMBER):
-        raise ValueError(f"an array of shape {found.shape}; expected {shape}, numbers within {MAX_NUMBER:g}")
+        raise ValueError(f"a number beyond {MAX_NUMBER:,.0f}") from error
+    if found.shape != shape:
+        raise ValueError(f"an array of shape {found.shape} instead of {shape}")
+    if not np.all(np.abs(found) <= MAX_NUMBER):
+        raise ValueError(f"a number beyond {MAX_NUMBER:,.0f}")
     found.setflags(write=False)
     return found
 
