@@ -80,7 +80,7 @@ def test_an_expected_error_says_of_what_it_is(carton, rehearsed, capfd):
     )
     assert abs(tre - tip) > 0.1  # else they may be mixed up here
     assert f"expected TRE at the target (rms), from the markers alone</th><td><b>{tre:.2f} mm" in page
-    assert f"expected tip error (rms), in the plan&#39;s configuration of the arm</th><td>{tip:.2f} mm" in page
+    assert f"expected tip error (rms), in the arm configuration of the plan</th><td>{tip:.2f} mm" in page
     assert main(["register", str(carton)]) == OK
     said = capfd.readouterr().out
     assert re.search(rf"expected TRE at the target \(rms\), from the markers alone +{tre:.2f} mm", said)
